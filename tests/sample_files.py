@@ -82,10 +82,7 @@ def easy_handeye2(path: Path, hands: Array, B: Array, calibration_type: str) -> 
 def easy_handeye(path: Path, hands: Array, B: Array) -> Path:
     """The answer of easy_handeye's service take_sample, as ``rosservice`` prints it: two lists."""
     content = {
-        "samples": {
-            "hand_world_samples": [message(T) for T in hands],
-            "camera_marker_samples": [message(b) for b in B],
-        }
+        "samples": {"hand_world_samples": [message(T) for T in hands], "camera_marker_samples": [message(b) for b in B]}
     }
     path.write_text(block(content))
     return path

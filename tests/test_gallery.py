@@ -17,10 +17,7 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 
 @pytest.mark.parametrize(
     ("name", "images", "verdict", "words"),
-    [
-        ("millimetres", 4, "refused", "Write length: mm"),
-        ("upside_down", 8, "care", "1 of the 8 images of camera"),
-    ],
+    [("millimetres", 4, "refused", "Write length: mm"), ("upside_down", 8, "care", "1 of the 8 images of camera")],
 )
 def test_a_fault_is_named_with_its_cure(
     name: str, images: int, verdict: str, words: str, monkeypatch: pytest.MonkeyPatch

@@ -16,14 +16,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.folds import Fold, Split, folds_of
 from gtsam_rwhec.calibration.prediction_errors import HoldOutError, PredictionError, prediction_errors
-from gtsam_rwhec.errors import (
-    CountError,
-    OptionError,
-    OutlierError,
-    RwhecWarning,
-    ScaleError,
-    UnderdeterminedError,
-)
+from gtsam_rwhec.errors import CountError, OptionError, OutlierError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread

@@ -107,11 +107,7 @@ class CalibrateOptions:
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
                 "sensors' names: ('cam_0',)"
             )
-        for name, kind in (
-            ("carrier_noise", CarrierNoise),
-            ("carrier_path", Trajectory),
-            ("corners", CornerOptions),
-        ):
+        for name, kind in (("carrier_noise", CarrierNoise), ("carrier_path", Trajectory), ("corners", CornerOptions)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise OptionError(f"CalibrateOptions.{name} is a {type(value).__name__}; give a {kind.__name__}")

@@ -181,14 +181,7 @@ def shifted(shift: int) -> Reading:
 
 
 #: The simple mistakes, the more common first.
-SINGLE: tuple[Reading, ...] = (
-    *_quaternions(),
-    *_INVERTED,
-    _ROLES,
-    _BOTH_INVERTED,
-    *_TRANSPOSED,
-    HANDEDNESS,
-)
+SINGLE: tuple[Reading, ...] = (*_quaternions(), *_INVERTED, _ROLES, _BOTH_INVERTED, *_TRANSPOSED, HANDEDNESS)
 
 
 def _joined(first: Reading, second: Reading) -> Reading:

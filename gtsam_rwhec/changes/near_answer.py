@@ -76,11 +76,7 @@ class NearAnswer:
 
 
 def near(
-    old: RefinedPoses,
-    problem: Problem,
-    how: RefineOptions,
-    noise: NoiseOptions,
-    progress: Progress | None = None,
+    old: RefinedPoses, problem: Problem, how: RefineOptions, noise: NoiseOptions, progress: Progress | None = None
 ) -> NearAnswer:
     """The estimate of a problem's measurements near an old answer that has all its frames.
 

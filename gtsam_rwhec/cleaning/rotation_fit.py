@@ -89,11 +89,7 @@ class RotationProblem:
 
     @staticmethod
     def of(
-        carrier: Trajectory,
-        smooth: SmoothPath,
-        tracks: Sequence[tuple[np.ndarray, Array]],
-        max_gap_s: float,
-        most: int,
+        carrier: Trajectory, smooth: SmoothPath, tracks: Sequence[tuple[np.ndarray, Array]], max_gap_s: float, most: int
     ) -> RotationProblem:
         """The problem with at most ``most`` detections, taken evenly."""
         total = sum(len(stamps) for stamps, _ in tracks)

@@ -44,12 +44,7 @@ def thin(
 
 
 def without_fast(
-    turning_rad_s: Array,
-    moving_m_s: Array,
-    stamps_ns: np.ndarray,
-    *,
-    max_turning_rad_s: float,
-    max_moving_m_s: float,
+    turning_rad_s: Array, moving_m_s: Array, stamps_ns: np.ndarray, *, max_turning_rad_s: float, max_moving_m_s: float
 ) -> Kept:
     """Keep the measurements at low speed: fast motion blurs images, and errors of stamps count more.
 

@@ -56,7 +56,7 @@ OF_SOLVE = frozenset({"method", "initial"})
 # The options that each input refuses, by the reason and what to do.
 NOT_FOR_A_LOG = {
     "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
-    "file, or leave the option out.": (OF_FOLDER | OF_CHOICES | OF_SOLVE) - OF_LOG,
+    "file, or leave the option out.": (OF_FOLDER | OF_CHOICES | OF_SOLVE) - OF_LOG
 }
 NOT_FOR_ODOMETRIES = {
     "counts only for images, and every sensor of the rig file has odometry. Leave it out.": frozenset(
@@ -65,18 +65,16 @@ NOT_FOR_ODOMETRIES = {
 }
 NOT_FOR_A_FOLDER = {
     "only for a log. A folder of CSV files has no images, and its result is one file, which is replaced: leave the "
-    "option out.": OF_LOG - OF_FOLDER,
+    "option out.": OF_LOG - OF_FOLDER
 }
 NOT_FOR_SAMPLES = {
     "not for samples of a hand-eye tool, which are of one camera and one target. Leave the option out.": frozenset(
         {"scale", "sigma", "kappa", "targets", "sensors"}
     )
 }
-NOT_WITH_ALL = NOT_FOR_A_FOLDER | {
-    "only with --certified-only. Add it, or leave the option out.": OF_SOLVE,
-}
+NOT_WITH_ALL = NOT_FOR_A_FOLDER | {"only with --certified-only. Add it, or leave the option out.": OF_SOLVE}
 NOT_CERTIFIED_ONLY = NOT_FOR_A_FOLDER | {
-    "not with --certified-only, which neither looks for outliers nor refines. Leave one of them out.": OF_CHOICES,
+    "not with --certified-only, which neither looks for outliers nor refines. Leave one of them out.": OF_CHOICES
 }
 
 

@@ -28,12 +28,10 @@ def watch(
         ),
     ],
     nights_between_false_alarms: Annotated[
-        float,
-        typer.Option(help="A robot that nothing happens to has a false alarm in so many nights: 50 to 100,000."),
+        float, typer.Option(help="A robot that nothing happens to has a false alarm in so many nights: 50 to 100,000.")
     ] = NIGHTS,
     since: Annotated[
-        str | None,
-        typer.Option(help="Only alarms from this day (UTC) on count: 2026-11-23.", show_default="all count"),
+        str | None, typer.Option(help="Only alarms from this day (UTC) on count: 2026-11-23.", show_default="all count")
     ] = None,
     stream: Annotated[
         str | None,

@@ -17,16 +17,13 @@ from gtsam_rwhec.files.terminal_text import say, shown_path
 def report(
     result: Annotated[Path, typer.Argument(help="Output folder of a calibration, or its result file (JSON).")],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="The HTML file.", show_default="report.html beside the result"),
+        Path | None, typer.Option("--output", "-o", help="The HTML file.", show_default="report.html beside the result")
     ] = None,
     images: Annotated[
-        bool,
-        typer.Option("--images/--no-images", help="Whether the page shows images. They may be confidential."),
+        bool, typer.Option("--images/--no-images", help="Whether the page shows images. They may be confidential.")
     ] = True,
     figures: Annotated[
-        Path | None,
-        typer.Option("--figures", help="Folder that gets every figure of the page as SVG and PNG too."),
+        Path | None, typer.Option("--figures", help="Folder that gets every figure of the page as SVG and PNG too.")
     ] = None,
 ) -> ExitStatus:
     """Write the report of a finished calibration as one HTML file, which needs no network.

@@ -54,9 +54,7 @@ def utias_files() -> tuple[RemoteFile, ...]:
 
 
 def fetch_utias(
-    destination: str | Path,
-    base_url: str = UTIAS_URL,
-    progress: Callable[[int, int, str], None] | None = None,
+    destination: str | Path, base_url: str = UTIAS_URL, progress: Callable[[int, int, str], None] | None = None
 ) -> Fetched:
     """Download the dataset into a folder, or complete an earlier download.
 

@@ -24,10 +24,7 @@ ROBUST = "robust estimation"
 
 
 def seen_in_problem(
-    problem: Problem,
-    refined: Refined | None,
-    rows: Mapping[Pair, MeasuredRows],
-    carrier_path: Trajectory | None = None,
+    problem: Problem, refined: Refined | None, rows: Mapping[Pair, MeasuredRows], carrier_path: Trajectory | None = None
 ) -> SeenEvidence:
     """What was seen, of a problem and its measurements; corners are there where there is a refined calibration."""
     used = sum(int(measured.used.sum()) for measured in rows.values())

@@ -11,14 +11,7 @@ from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.fleet.running import ROWS_FILE, FleetRun
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import (
-    STYLES,
-    print_heading,
-    print_list,
-    print_sentence,
-    print_tables,
-    report_console,
-)
+from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, print_tables, report_console
 from gtsam_rwhec.solver.certificate import Basis
 
 #: So many robots and failures are named.
@@ -35,11 +28,7 @@ OF_MOMENTS = (
     "The answers are those of the moments: optimal for the cleaned measurements, with the noise of B estimated. "
     "Outliers that cleaning left, noise of the carriers' poses and corners are not looked at: --refine does."
 )
-_WORDS = {
-    Verdict.USE: "may be used",
-    Verdict.CARE: "to be used with care",
-    Verdict.DO_NOT_USE: "not to be used",
-}
+_WORDS = {Verdict.USE: "may be used", Verdict.CARE: "to be used with care", Verdict.DO_NOT_USE: "not to be used"}
 
 
 def print_fleet(run: FleetRun) -> None:

@@ -233,9 +233,7 @@ def _joined(places: list[tuple[int, int]]) -> list[_Request]:
     return found
 
 
-def _together(
-    requests: list[_Request],
-) -> Iterator[list[_Request]]:
+def _together(requests: list[_Request]) -> Iterator[list[_Request]]:
     """Requests that travel together, of few bytes, so that memory is bounded."""
     group: list[_Request] = []
     size = 0

@@ -138,12 +138,7 @@ def _chart(number: int, name: str, robot: RobotChart) -> Chart:
             for change in changes:
                 axes.axvline(change - 0.5, color=VERMILLION, linewidth=1.0)
 
-    return Chart(
-        name=f"drift-{number}",
-        title=shown(name),
-        says=str(alarm),
-        svg=svg_figure(draw, 3.4),
-    )
+    return Chart(name=f"drift-{number}", title=shown(name), says=str(alarm), svg=svg_figure(draw, 3.4))
 
 
 def _signs(axes: Axes, days: np.ndarray, moved: np.ndarray, alarmed: np.ndarray) -> None:

@@ -150,12 +150,7 @@ class PairNoise:
 
 
 def pair_noise(
-    part: Part,
-    poses: PairPoses,
-    pairs: PairInformation,
-    noise: PartVarianceFactors,
-    in_target: Array,
-    in_sensor: Array,
+    part: Part, poses: PairPoses, pairs: PairInformation, noise: PartVarianceFactors, in_target: Array, in_sensor: Array
 ) -> PairNoise:
     """What noise alone would create, all pairs at once; ``in_target`` and ``in_sensor`` are ``common_axes``.
 

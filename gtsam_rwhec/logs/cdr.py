@@ -228,10 +228,7 @@ class _Walk:
     """One pass over one message."""
 
     def __init__(
-        self,
-        fields: dict[str, tuple[Field, ...]],
-        least_bytes: Callable[[str], int],
-        message: bytes | memoryview,
+        self, fields: dict[str, tuple[Field, ...]], least_bytes: Callable[[str], int], message: bytes | memoryview
     ) -> None:
         # The first four bytes name the encoding: 0 and 1 are CDR (big and little endian), 6 and 7 are XCDR2, which
         # aligns to 4 bytes at most. Alignment counts from the byte after them.

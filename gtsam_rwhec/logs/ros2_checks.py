@@ -14,11 +14,7 @@ from typing import Any
 import zstandard
 
 from gtsam_rwhec.errors import BudgetError, FileFormatError, LogError
-from gtsam_rwhec.files.budgets import (
-    BAG_METADATA,
-    BAG_METADATA_SHARE,
-    Spending,
-)
+from gtsam_rwhec.files.budgets import BAG_METADATA, BAG_METADATA_SHARE, Spending
 from gtsam_rwhec.files.yaml_lines import read_yaml
 from gtsam_rwhec.logs.bag_definitions import check_definitions
 

@@ -50,10 +50,7 @@ class Descent(Generic[Point]):
 
 
 def descend(
-    linearised: Callable[[Point], Linearised],
-    moved: Callable[[Point, Array], Point],
-    start: Point,
-    max_iterations: int,
+    linearised: Callable[[Point], Linearised], moved: Callable[[Point, Array], Point], start: Point, max_iterations: int
 ) -> Descent[Point]:
     """Find a local minimum from ``start``; ``moved`` takes a step (k,) from a point to the next point."""
     point, here, damping = start, linearised(start), FIRST_DAMPING

@@ -129,12 +129,7 @@ class _Effects:
 
 
 def graph_of(
-    model: NoiseModel,
-    sigma: dict[C, float],
-    data: list[PairData],
-    variables: Variables,
-    state: State,
-    problem: Problem,
+    model: NoiseModel, sigma: dict[C, float], data: list[PairData], variables: Variables, state: State, problem: Problem
 ) -> NoiseGraph:
     """The graph of a model whose rows were made at ``state``, at standard deviations of its components."""
     if model.drift is not None:

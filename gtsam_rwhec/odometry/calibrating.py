@@ -7,14 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gtsam_rwhec.cleaning.removed import RemovalReason, Removed
-from gtsam_rwhec.errors import (
-    CountError,
-    FrameError,
-    OptionError,
-    OutlierError,
-    ScaleError,
-    UnderdeterminedError,
-)
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array

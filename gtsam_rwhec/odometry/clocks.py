@@ -55,11 +55,7 @@ def first_offset(reference: OdometryTrack, track: OdometryTrack, options: Odomet
             continue
         try:
             found = estimate_time_offset(
-                carrier,
-                pieces,
-                search_s=options.search_s,
-                max_gap_s=options.max_gap_s,
-                where=track.sensor,
+                carrier, pieces, search_s=options.search_s, max_gap_s=options.max_gap_s, where=track.sensor
             )
         except StampError as error:
             unknown = str(error)

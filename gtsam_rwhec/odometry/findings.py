@@ -51,11 +51,7 @@ def residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[fl
 
 
 def findings_of(
-    answer: Answer,
-    task: Task,
-    tracks: Sequence[OdometryTrack],
-    clocks: Sequence[Clock],
-    sigmas: dict[str, float],
+    answer: Answer, task: Task, tracks: Sequence[OdometryTrack], clocks: Sequence[Clock], sigmas: dict[str, float]
 ) -> tuple[str, ...]:
     """The sentences; none where all is well. ``sigmas``: standard deviations of the clocks, s."""
     said: list[str] = []

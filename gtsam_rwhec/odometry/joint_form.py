@@ -109,11 +109,7 @@ class JointForm:
 
 
 def joint_form(
-    windows: WindowMotions,
-    state: State,
-    variances: Array,
-    scaled: np.ndarray,
-    prior_rows: Array | None = None,
+    windows: WindowMotions, state: State, variances: Array, scaled: np.ndarray, prior_rows: Array | None = None
 ) -> JointForm:
     """The form at given turns and ways of the windows, those of ``state.motion``.
 

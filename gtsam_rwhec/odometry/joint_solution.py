@@ -25,12 +25,7 @@ from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
 from gtsam_rwhec.solver.interior_point import solve_by_blocks
 from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.relaxation import round_to_rotations
-from gtsam_rwhec.solver.rotations import (
-    CONSTRAINTS,
-    constraint_values,
-    kkt_multipliers,
-    random_rotations,
-)
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, constraint_values, kkt_multipliers, random_rotations
 from gtsam_rwhec.solver.small_dual import improve, stationary_multipliers
 
 #: Descents from so many random rotations, beside the given starts.

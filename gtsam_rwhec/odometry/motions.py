@@ -95,12 +95,4 @@ def odometry_motions(track_a: OdometryTrack, track_b: OdometryTrack, options: Od
     A, B = windows.M
     for M in (A, B):  # products of many rotations are off by their rounding
         M[:, :3, :3] = project(M[:, :3, :3])
-    return Motions(
-        A,
-        B,
-        np.sqrt(of_translation),
-        1.0 / (2.0 * of_rotation),
-        stamps[0],
-        stamps[1],
-        clock.offset_s,
-    )
+    return Motions(A, B, np.sqrt(of_translation), 1.0 / (2.0 * of_rotation), stamps[0], stamps[1], clock.offset_s)

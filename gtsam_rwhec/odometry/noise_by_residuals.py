@@ -34,12 +34,7 @@ def groups_of(stated: np.ndarray) -> np.ndarray:
 
 
 def found_variances(
-    windows: WindowMotions,
-    linear: Linear,
-    variances: Array,
-    stated: np.ndarray,
-    scale: Array,
-    unknowns: int,
+    windows: WindowMotions, linear: Linear, variances: Array, stated: np.ndarray, scale: Array, unknowns: int
 ) -> Array:
     """Variances a second (m, 2), of rotation (rad^2/s) and translation (m^2/s), from residuals at an answer.
 

@@ -18,13 +18,7 @@ from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_inputs import inputs_of
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.earlier_output import (
-    OutputFolder,
-    list_written,
-    log_name,
-    output_folder,
-    remove_unchanged,
-)
+from gtsam_rwhec.pipeline.earlier_output import OutputFolder, list_written, log_name, output_folder, remove_unchanged
 from gtsam_rwhec.pipeline.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.pipeline.image_detections import image_count
 from gtsam_rwhec.pipeline.image_options import check_image_options
@@ -226,13 +220,7 @@ def _from_stage(
 
 
 def _calibrate_files(
-    source: Path,
-    rig: Rig,
-    out: str | Path,
-    choices: _Choices,
-    *,
-    replace: bool,
-    progress: Progress | None,
+    source: Path, rig: Rig, out: str | Path, choices: _Choices, *, replace: bool, progress: Progress | None
 ) -> Calibrated:
     """As `calibrate_log`, by way of a log of a folder's images or of samples, which is removed at the end."""
     has_images = source.is_dir()

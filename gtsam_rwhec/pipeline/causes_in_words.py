@@ -108,10 +108,7 @@ def _family_of(family: str, target: Target) -> str:
 
 
 def of_rejections(
-    rig: Rig,
-    target: Target,
-    found: Mapping[str, SensorDetections],
-    images: Mapping[str, Mapping[int, Gray]],
+    rig: Rig, target: Target, found: Mapping[str, SensorDetections], images: Mapping[str, Mapping[int, Gray]]
 ) -> list[str]:
     """What the rejected detections say themselves, with their figures and limits."""
     records = [(sensor, r) for sensor, of in found.items() for r in of.records if r.id == target.name]

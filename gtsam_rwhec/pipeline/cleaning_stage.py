@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.cleaning import (
-    ConsensusOptions,
-    find_consensus,
-    synchronise,
-    thin,
-    without_fast,
-)
+from gtsam_rwhec.cleaning import ConsensusOptions, find_consensus, synchronise, thin, without_fast
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError, LogWarning, StampError
 from gtsam_rwhec.files.progress import Progress, silent

@@ -11,12 +11,7 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.pipeline.seen_corners import seen_corners
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.intrinsics_evidence import (
-    LEAST_CORNERS,
-    IntrinsicsEvidence,
-    View,
-    evidence_of_intrinsics,
-)
+from gtsam_rwhec.vision.intrinsics_evidence import LEAST_CORNERS, IntrinsicsEvidence, View, evidence_of_intrinsics
 
 #: Fitted numbers over the stated ones are a half or two within this share: of an image of another resolution.
 RESOLUTION_SHARE = 0.1

@@ -15,11 +15,7 @@ from gtsam_rwhec.report.page.written import write_html
 
 
 def write_report(
-    calibrated: Calibrated,
-    out: Path,
-    sources: Sequence[Path],
-    pictures: Pictures,
-    progress: Progress | None = None,
+    calibrated: Calibrated, out: Path, sources: Sequence[Path], pictures: Pictures, progress: Progress | None = None
 ) -> list[Path]:
     """Write ``evidence.json`` and ``report.html`` beside ``result.json`` and ``clean.mcap``; return their paths.
 

@@ -95,10 +95,7 @@ def poses_used(pairs: Iterable[MeasuredPairs]) -> dict[str, int]:
 
 
 def problem_of(
-    pairs: Mapping[Pair, MeasuredPairs],
-    rig: Rig,
-    offsets_s: Mapping[str, float],
-    free_sizes: Collection[str] = (),
+    pairs: Mapping[Pair, MeasuredPairs], rig: Rig, offsets_s: Mapping[str, float], free_sizes: Collection[str] = ()
 ) -> Problem:
     """The problem that the used pairs state, with stamps on the carriers' clock.
 

@@ -189,9 +189,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         )
         + tuple(
             TimeOffsetFields(
-                sensor=name,
-                offset_s=cleaning.time_offsets_s[name],
-                sigma_s=cleaning.coarse_sigma_s.get(name),
+                sensor=name, offset_s=cleaning.time_offsets_s[name], sigma_s=cleaning.coarse_sigma_s.get(name)
             )
             for name in rig.odometries
             if name in cleaning.time_offsets_s

@@ -26,13 +26,7 @@ from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.corner_answer import with_intrinsics
 from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.pipeline.folder_log import is_folder_of_images, write_folder_log
-from gtsam_rwhec.pipeline.log_contract import (
-    CLEAN_LOG,
-    CLEANING_METADATA,
-    DETECTED_LOG,
-    RECORDED_LOG,
-    is_from_stage,
-)
+from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, CLEANING_METADATA, DETECTED_LOG, RECORDED_LOG, is_from_stage
 from gtsam_rwhec.pipeline.log_corners import LogCorners
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import problem_of, read_pairs

@@ -32,11 +32,7 @@ def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
     return reweighted(problem, masks)
 
 
-def reweighted(
-    problem: Problem,
-    weights: ByPair[ArrayLike],
-    factors: VarianceFactors = AS_STATED,
-) -> Problem:
+def reweighted(problem: Problem, weights: ByPair[ArrayLike], factors: VarianceFactors = AS_STATED) -> Problem:
     """The problem with each measurement's squared residual multiplied by a weight.
 
     Parameters

@@ -40,11 +40,7 @@ class FreeSpace:
 
 
 def free_space_of(
-    parts: list[Part],
-    variables: Variables,
-    state: State,
-    data: list[PairData],
-    fitted: FactorsByPair | None = None,
+    parts: list[Part], variables: Variables, state: State, data: list[PairData], fitted: FactorsByPair | None = None
 ) -> FreeSpace:
     """The free directions, by the certified solution's test (``identifiability``), at the refined answer.
 

@@ -172,11 +172,7 @@ class GeodesicModel:
         return components
 
     def _median_factors(
-        self,
-        at: dict[Pair, Linearization],
-        factors: FactorsByPair,
-        groups: NoiseGroups,
-        components: VarianceComponents,
+        self, at: dict[Pair, Linearization], factors: FactorsByPair, groups: NoiseGroups, components: VarianceComponents
     ) -> FactorsByPair:
         """Variance factors that withstand outliers: medians of squared residuals over a chi-square's, 3 dimensions."""
         squares: dict[tuple[Group, int], list[Array]] = {}

@@ -32,12 +32,7 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.truncated_least_squares import (
-    Iteration,
-    NoiseScale,
-    TruncatedLeastSquares,
-    inlier_count,
-)
+from gtsam_rwhec.refinement.truncated_least_squares import Iteration, NoiseScale, TruncatedLeastSquares, inlier_count
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
@@ -78,11 +73,7 @@ class Graduated:
 
 @one_blas_thread()
 def graduated(
-    problem: Problem,
-    *,
-    confidence: float = 0.997,
-    noise_scale: NoiseScale = "given",
-    progress: Progress | None = None,
+    problem: Problem, *, confidence: float = 0.997, noise_scale: NoiseScale = "given", progress: Progress | None = None
 ) -> Graduated:
     """Reject outliers and calibrate from the inliers.
 

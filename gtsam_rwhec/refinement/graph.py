@@ -23,11 +23,7 @@ from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.options import ResidualKind, Robust
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import Variables, carrier_key
-from gtsam_rwhec.refinement.weighting import (
-    Component,
-    FactorsByPair,
-    measurement_covariance,
-)
+from gtsam_rwhec.refinement.weighting import Component, FactorsByPair, measurement_covariance
 from gtsam_rwhec.solver.parts import Part
 
 #: GTSAM's losses and their tuning constants, with 95 % efficiency for Gaussian noise in six dimensions. (GTSAM weighs a
@@ -129,10 +125,7 @@ def add_summary(graph: gtsam.NonlinearFactorGraph, variables: Variables, pair: P
 
 
 def add_batches(
-    graph: gtsam.NonlinearFactorGraph,
-    variables: Variables,
-    data: list[PairData],
-    roots: dict[Pair, Array],
+    graph: gtsam.NonlinearFactorGraph, variables: Variables, data: list[PairData], roots: dict[Pair, Array]
 ) -> None:
     """One geodesic factor for each pair, in which every measurement has its own weight."""
     for item in data:

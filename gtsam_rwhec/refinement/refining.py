@@ -10,13 +10,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.errors import (
-    NotConvergedWarning,
-    NotUniqueWarning,
-    OptionError,
-    RwhecWarning,
-    WeightsWarning,
-)
+from gtsam_rwhec.errors import NotConvergedWarning, NotUniqueWarning, OptionError, RwhecWarning, WeightsWarning
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.pairs import Pair

@@ -11,14 +11,7 @@ from gtsam_rwhec.files.terminal_text import shown_path
 from gtsam_rwhec.odometry.odometry_file import OdometryResult, SensorRecord
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
-from gtsam_rwhec.report.printing import (
-    STYLES,
-    print_heading,
-    print_list,
-    print_sentence,
-    print_tables,
-    report_console,
-)
+from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, print_tables, report_console
 
 #: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.
 FREE_SHARE = 0.1

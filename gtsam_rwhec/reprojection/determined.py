@@ -86,10 +86,7 @@ def check_clocks(options: CornerOptions, observations: Observations) -> None:
 
 def check_names(start: object, names: tuple[str, ...], *, letter: str) -> None:
     """FrameError where a start X or Y lacks a frame that was seen, or that saw; OptionError where it is no dict."""
-    what, pose = {
-        "X": ("target", "T_targetcarrier_target"),
-        "Y": ("sensor", "T_sensorcarrier_sensor"),
-    }[letter]
+    what, pose = {"X": ("target", "T_targetcarrier_target"), "Y": ("sensor", "T_sensorcarrier_sensor")}[letter]
     if not isinstance(start, Mapping):
         raise OptionError(f"{letter}={brief(start)} is not a dict; give {pose} of each {what} by its name")
     missing = [name for name in names if name not in start]

@@ -66,10 +66,7 @@ class CornerOptions:
 
     def __post_init__(self) -> None:
         every = self.stated.values() if isinstance(self.stated, Mapping) else (self.stated,)
-        for value, words, choices in (
-            *((each, "stated", Stated) for each in every),
-            (self.about, "about", About),
-        ):
+        for value, words, choices in (*((each, "stated", Stated) for each in every), (self.about, "about", About)):
             if not is_one_of(value, get_args(choices)):
                 raise OptionError(
                     f"CornerOptions.{words}={brief(value)} is not one of {', '.join(map(repr, get_args(choices)))}"

@@ -26,11 +26,7 @@ from gtsam_rwhec.reprojection.as_refined import as_refined, intrinsics_of
 from gtsam_rwhec.reprojection.in_numbers import numbers_of
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
-from gtsam_rwhec.reprojection.problem_corners import (
-    check_corners_can_hold,
-    check_corners_everywhere,
-    observations_of,
-)
+from gtsam_rwhec.reprojection.problem_corners import check_corners_can_hold, check_corners_everywhere, observations_of
 from gtsam_rwhec.reprojection.refined import CornersRefined
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.solving.solution import Solution

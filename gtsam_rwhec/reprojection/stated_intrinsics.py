@@ -74,8 +74,7 @@ def deviations_of(probability: float) -> float:
 def innovation_of(off: Array, prior: Array, posterior: Array) -> Innovation:
     """The test of estimated less stated parameters (m,), with the prior's deviations (m,) and the posterior (m, m)."""
     return Innovation(
-        off,
-        {part: chance_of(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])},
+        off, {part: chance_of(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])}
     )
 
 

@@ -132,12 +132,7 @@ def _content(
             parts["calibration"] = to_json(calibration, "$.calibration")
         if log is not None:
             parts["log"] = log.model_dump(mode="json")
-        tree = {
-            **_heading(judgement),
-            **poses,
-            "conventions": CONVENTIONS,
-            **parts,
-        }
+        tree = {**_heading(judgement), **poses, "conventions": CONVENTIONS, **parts}
         content = json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         encoded = content.encode("utf-8")  # a name may have half a character
         checked_file(json.loads(content), FORMAT_VERSION)

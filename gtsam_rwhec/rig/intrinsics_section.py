@@ -31,9 +31,7 @@ class Intrinsics(Section):
         default=None, description="a topic of CameraInfo or CameraCalibration", examples=["/cam_left/camera_info"]
     )
     kalibr: Text | None = Field(
-        default=None,
-        description="Kalibr's camchain: the same as file",
-        examples=["camchain.yaml"],
+        default=None, description="Kalibr's camchain: the same as file", examples=["camchain.yaml"]
     )
     camera: Text | None = Field(
         default=None,

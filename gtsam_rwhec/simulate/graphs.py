@@ -15,11 +15,7 @@ Edge = tuple[int, int]
 
 
 def bipartite_edges(
-    graph: GraphKind | Iterable[Edge],
-    targets: int,
-    sensors: int,
-    seed: Seed,
-    edge_probability: float = 0.3,
+    graph: GraphKind | Iterable[Edge], targets: int, sensors: int, seed: Seed, edge_probability: float = 0.3
 ) -> list[Edge]:
     """List the edges of a graph between targets and sensors, as (target index, sensor index).
 

@@ -189,11 +189,7 @@ def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
         np.add.at(products_error, places, error)
         for pair, of_pair in zip(places.tolist(), square, strict=True):
             products.setdefault(pair, []).append(of_pair)
-        new = (
-            np.matmul(front.transpose(0, 2, 1), flat),
-            np.matmul(back.transpose(0, 2, 1), flat),
-            one,
-        )
+        new = (np.matmul(front.transpose(0, 2, 1), flat), np.matmul(back.transpose(0, 2, 1), flat), one)
         reaches = [front_reach[:, :, None] * one_error[:, None], back_reach[:, :, None] * one_error[:, None], one_error]
         reaches[int(measured.is_swapped)] += of_size
         for table, bound, size, value, reach in zip(tables, errors, sizes, new, reaches, strict=True):

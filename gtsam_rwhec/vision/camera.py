@@ -26,11 +26,7 @@ MODELS: dict[str, Model] = {
 #: OpenCV takes these numbers of distortion coefficients for each model.
 COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,), "unified": (5,)}
 #: Names of the coefficients.
-NAMES = {
-    "radtan": "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4",
-    "equidistant": "k1 k2 k3 k4",
-    "unified": "xi k1 k2 p1 p2",
-}
+NAMES = {"radtan": "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4", "equidistant": "k1 k2 k3 k4", "unified": "xi k1 k2 p1 p2"}
 #: The unified model of a pinhole has xi = 0, of a parabolic mirror 1, of fisheye lenses up to about 3.
 XI_RANGE = (-0.9, 20.0)
 #: The focal length over the image's larger side must be within this range. For a pinhole, 0.05 is a field of view of

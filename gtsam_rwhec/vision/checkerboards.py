@@ -15,14 +15,7 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_evidence import (
-    LEAST_KEPT,
-    Evidence,
-    FoundBoard,
-    evidence,
-    plane_through,
-    smallest_step,
-)
+from gtsam_rwhec.vision.board_evidence import LEAST_KEPT, Evidence, FoundBoard, evidence, plane_through, smallest_step
 from gtsam_rwhec.vision.boards import refined_corners
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray

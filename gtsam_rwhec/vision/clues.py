@@ -21,14 +21,7 @@ from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.checkerboards import OF_SQUARE
 from gtsam_rwhec.vision.codes import identified, quadrangles, unlike
 from gtsam_rwhec.vision.detection import Detection, Detector
-from gtsam_rwhec.vision.image_quality import (
-    brightened,
-    brightest_value,
-    edge_blur_px,
-    folded,
-    resized,
-    saturated_share,
-)
+from gtsam_rwhec.vision.image_quality import brightened, brightest_value, edge_blur_px, folded, resized, saturated_share
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.saddles import regions

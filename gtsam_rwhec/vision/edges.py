@@ -271,7 +271,5 @@ def _by_model(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, 
     widest = np.maximum(MOST_BLUR * np.median(module, axis=2), LEAST_BLUR_PX)
     height = median(np.where(good, fitted.step, np.inf).reshape(len(step), -1), good.sum(axis=(1, 2)))
     return _Edges(
-        refined,
-        np.clip(edges.blur_px + change, LEAST_BLUR_PX, widest),
-        np.where(np.isfinite(height), height, step),
+        refined, np.clip(edges.blur_px + change, LEAST_BLUR_PX, widest), np.where(np.isfinite(height), height, step)
     )

@@ -34,10 +34,7 @@ def check(name: str, family: str | None, ids: tuple[int, ...], lengths: dict[str
         if family not in FAMILIES:
             raise TargetError(f"there is no family {family!r}; there are {', '.join(FAMILIES)}", name)
         if min(ids) < 0 or max(ids) >= FAMILIES[family]:
-            raise TargetError(
-                f"ids {min(ids)} to {max(ids)} are not in {family}: 0 to {FAMILIES[family] - 1}",
-                name,
-            )
+            raise TargetError(f"ids {min(ids)} to {max(ids)} are not in {family}: 0 to {FAMILIES[family] - 1}", name)
     for word, length in lengths.items():
         if not 0.0 < length < LARGEST_M:
             raise TargetError(f"{word} = {length!r}; give metres, above 0 and below {LARGEST_M:g}", name)

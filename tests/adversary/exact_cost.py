@@ -30,12 +30,7 @@ def exact_cost(rows: Rows, form: str, centre: Array, answer: RationalPoses) -> F
     """The documented formula in fractions, one measurement after another."""
     total = Fraction(0)
     for n in range(len(rows.sigma)):
-        R_X, t_X, R_Y, t_Y = (
-            answer.R[rows.X[n]],
-            answer.t[rows.X[n]],
-            answer.R[rows.Y[n]],
-            answer.t[rows.Y[n]],
-        )
+        R_X, t_X, R_Y, t_Y = (answer.R[rows.X[n]], answer.t[rows.X[n]], answer.R[rows.Y[n]], answer.t[rows.Y[n]])
         alpha = answer.alpha[rows.owners[rows.owner[n]]]
         R_A, t_A, R_B, t_B = (_fractions(a[n]) for a in (rows.R_A, rows.t_A, rows.R_B, rows.t_B))
         if form == "direct":

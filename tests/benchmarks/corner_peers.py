@@ -144,7 +144,4 @@ def errors(stack: Stack, B: Array) -> tuple[Array, Array]:
     by_p = (by_P.reshape(len(B), -1, 3) @ B[:, :3, :3]).reshape(*by_P.shape)
     by_B = np.concatenate([np.cross(stack.points[:, None], by_p), by_p], axis=-1)
     seen = stack.known[..., None]
-    return (
-        np.where(seen, pixels - stack.pixels, 0.0),
-        np.where(seen[..., None], by_B, 0.0).reshape(len(B), -1, 6),
-    )
+    return (np.where(seen, pixels - stack.pixels, 0.0), np.where(seen[..., None], by_B, 0.0).reshape(len(B), -1, 6))

@@ -19,11 +19,7 @@ from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from gtsam.symbol_shorthand import S, X, Y
 from interleaved import in_words
-from rwhec_factors import (
-    EdgeSummary,
-    edge_summary_factor,
-    robot_world_hand_eye_factor,
-)
+from rwhec_factors import EdgeSummary, edge_summary_factor, robot_world_hand_eye_factor
 
 import gtsam_rwhec as rw
 

@@ -101,10 +101,7 @@ class NeutralSequence:
         if len(B) < 3:
             return None
         chosen = motions.select_keyframes(
-            T_base_hand,
-            benchmark.KEYFRAME_MIN_ROT_DEG,
-            benchmark.KEYFRAME_MIN_TRANS_M,
-            benchmark.MAX_KEYFRAMES,
+            T_base_hand, benchmark.KEYFRAME_MIN_ROT_DEG, benchmark.KEYFRAME_MIN_TRANS_M, benchmark.MAX_KEYFRAMES
         )
         if len(chosen) < 3:
             chosen = np.arange(len(B))

@@ -38,16 +38,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from paper_tables import (
-    BAR,
-    Experiment,
-    Runs,
-    in_parallel,
-    largest_difference,
-    print_table,
-    simulated,
-    wide_console,
-)
+from paper_tables import BAR, Experiment, Runs, in_parallel, largest_difference, print_table, simulated, wide_console
 from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.methods.local_on_manifold import LomOptions, LomWeights, local_on_manifold

@@ -178,10 +178,7 @@ def rows_of(case: Case, results: list[Result]) -> list[Row]:
         ),
         Row("    rms ratio", figures),
         Row("    median of the runs' ratios", middle),
-        Row(
-            "    breaks",
-            f"at {100 * min(broken):.0f} %" if broken else f"not up to {100 * results[-1].share:.0f} %",
-        ),
+        Row("    breaks", f"at {100 * min(broken):.0f} %" if broken else f"not up to {100 * results[-1].share:.0f} %"),
     ]
 
 

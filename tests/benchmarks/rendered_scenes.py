@@ -200,10 +200,7 @@ def _undistorted(camera: Camera, pixels: Array) -> Array:
     for _ in range(12):
         r2, ab = (x * x).sum(axis=-1), x.prod(axis=-1)
         off = np.stack(
-            [
-                2.0 * p1 * ab + p2 * (r2 + 2.0 * x[..., 0] ** 2),
-                p1 * (r2 + 2.0 * x[..., 1] ** 2) + 2.0 * p2 * ab,
-            ],
+            [2.0 * p1 * ab + p2 * (r2 + 2.0 * x[..., 0] ** 2), p1 * (r2 + 2.0 * x[..., 1] ** 2) + 2.0 * p2 * ab],
             axis=-1,
         )
         x = (x0 - off) / (1.0 + k1 * r2 + k2 * r2 * r2)[..., None]

@@ -38,10 +38,7 @@ def test_tracks_of_several_targets_add_up() -> None:
     [
         (lambda t: se3.expmap(t[:, None] * np.array([0, 0, 0.5, 0.1, 0, 0])), "."),  # turns evenly
         (lambda t: se3.expmap(t[:, None] * np.array([0, 0, 0, 0.1, 0, 0])), "."),  # does not turn
-        (
-            lambda t: se3.expmap(np.sin(2 * np.pi * t)[:, None] * np.array([0.5, 0.2, 0.1, 0, 0, 0])),
-            "repeats itself",
-        ),
+        (lambda t: se3.expmap(np.sin(2 * np.pi * t)[:, None] * np.array([0.5, 0.2, 0.1, 0, 0, 0])), "repeats itself"),
     ],
 )
 def test_motions_that_do_not_tell_are_refused(road: object, words: str) -> None:

@@ -30,14 +30,7 @@ def command(*arguments: str) -> str:
     )
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import gtsam_rwhec",
-        "import gtsam_rwhec; dir(gtsam_rwhec)",
-        command("--help"),
-    ],
-)
+@pytest.mark.parametrize("code", ["import gtsam_rwhec", "import gtsam_rwhec; dir(gtsam_rwhec)", command("--help")])
 def test_starting_brings_in_nothing_heavy(code: str) -> None:
     assert brought_in(code) == set()
 

@@ -14,13 +14,7 @@ from exported_rigs import ONE, POSES, camera
 from hypothesis import given, settings
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.export import (
-    camchain_yaml,
-    camera_info_yaml,
-    colmap_cameras_txt,
-    export_all,
-    opencv_yaml,
-)
+from gtsam_rwhec.export import camchain_yaml, camera_info_yaml, colmap_cameras_txt, export_all, opencv_yaml
 from gtsam_rwhec.rig import RigFrames
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.colmap_cameras import read_colmap_cameras

@@ -17,10 +17,7 @@ from rwhec_factors import (
 )
 
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.1, 0.1, 0.1, 0.3, 0.3, 0.3]))
-SIGMAS = {
-    "geodesic": np.repeat([0.1, 0.3], 3),
-    "chordal": np.repeat([np.sqrt(2.0) * 0.1, 0.3], [9, 3]),
-}
+SIGMAS = {"geodesic": np.repeat([0.1, 0.3], 3), "chordal": np.repeat([np.sqrt(2.0) * 0.1, 0.3], [9, 3])}
 INVERSE, STRAIGHT = "sensorcarrier_in_targetcarrier", "targetcarrier_in_sensorcarrier"
 Make = Callable[..., gtsam.CustomFactor]
 #: Factor from (B, noise, options), its pose keys in order, and B as those poses have it in true metres.

@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import D, S, X, Y
 from numeric_jacobians import check_jacobians, values_of
-from rwhec_factors import (
-    EdgeSummary,
-    edge_summary_factor,
-    robot_world_hand_eye_factor,
-)
+from rwhec_factors import EdgeSummary, edge_summary_factor, robot_world_hand_eye_factor
 
 SIGMAS = np.repeat([0.1, 0.3], 3)
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)

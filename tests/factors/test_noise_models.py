@@ -61,8 +61,7 @@ def test_chordal_rows_have_root_two_of_the_rotations_sigma() -> None:
 
 
 @pytest.mark.parametrize(
-    "covariance",
-    [np.diag([1.0, 1.0, 2.0, 1.0, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1.0, 2.0, 1.0]), np.eye(6) + 0.1],
+    "covariance", [np.diag([1.0, 1.0, 2.0, 1.0, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1.0, 2.0, 1.0]), np.eye(6) + 0.1]
 )
 def test_anisotropic_noise_is_refused_by_the_chordal_residual(covariance: np.ndarray) -> None:
     with pytest.raises(ValueError, match="anisotropic"):

@@ -316,11 +316,7 @@ def test_arguments_that_are_not_valid_are_refused() -> None:
         ),
         (lambda: rotation_prior_factor(X(0), T.rotation(), unit6), ValueError, "dimension 6"),
         (lambda: rotation_prior_factor(X(0), T, unit3), TypeError, "Rot3"),
-        (
-            lambda: rotation_prior_factor(X(0), T.rotation(), anisotropic, residual="chordal"),
-            ValueError,
-            "anisotropic",
-        ),
+        (lambda: rotation_prior_factor(X(0), T.rotation(), anisotropic, residual="chordal"), ValueError, "anisotropic"),
         (lambda: position_prior_factor(X(0), [1.0, 2.0], unit3), ValueError, "three finite numbers"),
         (lambda: position_prior_factor(X(0), [1.0, 2.0, np.nan], unit3), ValueError, "three finite numbers"),
         (lambda: position_along_prior_factor(X(0), [0.0, 0.0, 0.0], 1.0, 1.0), ValueError, "no direction"),

@@ -33,10 +33,7 @@ def test_left_is_what_samples_say() -> None:
 
 
 def test_inverse_is_what_samples_say() -> None:
-    close(
-        sampled(lambda x: gtsam.Pose3.Logmap(T.compose(T.retract(x).inverse()))),
-        convert.of_inverse(T, COVARIANCE),
-    )
+    close(sampled(lambda x: gtsam.Pose3.Logmap(T.compose(T.retract(x).inverse()))), convert.of_inverse(T, COVARIANCE))
 
 
 def test_composition_is_what_samples_say() -> None:

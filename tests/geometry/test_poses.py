@@ -72,10 +72,7 @@ def test_single_precision_and_integers_are_read() -> None:
     assert np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < 1e-15 * 4
 
 
-@given(
-    st.integers(0, 2**32 - 1),
-    st.floats(0.0, 0.3 * ROTATION_TOLERANCE),
-)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.3 * ROTATION_TOLERANCE))
 def test_rotations_slightly_off_are_projected_to_the_nearest(seed: int, size: float) -> None:
     generator = np.random.default_rng(seed)
     T = random_poses(3, 1.0, generator)

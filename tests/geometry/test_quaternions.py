@@ -12,10 +12,7 @@ from gtsam_rwhec.simulate.transforms import random_poses
 
 def product(q: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Hamilton's product, xyzw, written out."""
-    return np.append(
-        q[3] * p[:3] + p[3] * q[:3] + np.cross(q[:3], p[:3]),
-        q[3] * p[3] - q[:3] @ p[:3],
-    )
+    return np.append(q[3] * p[:3] + p[3] * q[:3] + np.cross(q[:3], p[:3]), q[3] * p[3] - q[:3] @ p[:3])
 
 
 def test_quaternions_are_gtsams_up_to_sign() -> None:

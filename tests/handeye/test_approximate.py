@@ -77,10 +77,7 @@ def _lambda_series(relaxed: RelaxedCost, sign: float) -> tuple[float, float, np.
     mu1 = 1.0 / Z1[0, 0]
     q1 = np.append(0.0, mu1 * Z1[1:, 0] / gap)
     mu2 = -(mu1 * Z1[0] @ q1 + sign * mu1**2 * Z2[0, 0]) / Z1[0, 0]
-    q2 = np.append(
-        -0.5 * q1 @ q1,
-        (Z1[1:] @ (mu1 * q1) + mu2 * Z1[1:, 0] + sign * mu1**2 * Z2[1:, 0] - q1[1:]) / gap,
-    )
+    q2 = np.append(-0.5 * q1 @ q1, (Z1[1:] @ (mu1 * q1) + mu2 * Z1[1:, 0] + sign * mu1**2 * Z2[1:, 0] - q1[1:]) / gap)
     return mu1, mu2, q1, q2
 
 

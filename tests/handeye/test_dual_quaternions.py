@@ -8,19 +8,12 @@ from scipy.spatial.transform import Rotation
 from simulated import poses
 
 from gtsam_rwhec.geometry.quaternions import right
-from gtsam_rwhec.handeye.dual_quaternions import (
-    from_transforms,
-    times_vectors,
-    to_transform,
-)
+from gtsam_rwhec.handeye.dual_quaternions import from_transforms, times_vectors, to_transform
 
 
 def product(q: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Hamilton's product, xyzw, written out."""
-    return np.append(
-        q[3] * p[:3] + p[3] * q[:3] + np.cross(q[:3], p[:3]),
-        q[3] * p[3] - q[:3] @ p[:3],
-    )
+    return np.append(q[3] * p[:3] + p[3] * q[:3] + np.cross(q[:3], p[:3]), q[3] * p[3] - q[:3] @ p[:3])
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-12, 1e-6, 1.0, np.pi - 1e-9, np.pi]))

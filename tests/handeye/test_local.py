@@ -11,14 +11,7 @@ from simulated import distance, hand_held, planar
 
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
-from gtsam_rwhec.handeye.local import (
-    chvecopt,
-    dqnlopt,
-    dqnlopt_random,
-    quatvecopt,
-    root,
-    rotation_slopes,
-)
+from gtsam_rwhec.handeye.local import chvecopt, dqnlopt, dqnlopt_random, quatvecopt, root, rotation_slopes
 from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt

@@ -19,9 +19,7 @@ def test_rows_are_sums_and_differences() -> None:
     rows = motions_of(s.C, s.H).rows
     q_C, dual_C = from_transforms(s.C)
     q_H, dual_H = from_transforms(s.H)
-    expected = np.vstack(
-        [(q_C + q_H).T[:3], (q_C - q_H).T, (dual_C + dual_H).T[:3], (dual_C - dual_H).T],
-    )
+    expected = np.vstack([(q_C + q_H).T[:3], (q_C - q_H).T, (dual_C + dual_H).T[:3], (dual_C - dual_H).T])
     clear = q_C[:, 3] + q_H[:, 3] > 0.2
     assert clear.sum() > 15
     assert np.abs(rows - expected)[:, clear].max() < 1e-14

@@ -53,10 +53,7 @@ def test_easy_handeye2_looks_the_robot_up_the_other_way_for_a_fixed_camera(tmp_p
     [
         ("a: [1, 2]", "has no hand-eye samples. Samples have, with names of MoveIt: effector_wrt_world and object"),
         ("- {effector_wrt_world: [1], object_wrt_sensor: [1]}", r"line 1: \[0\].effector_wrt_world: .* is no pose"),
-        (
-            "- {effector_wrt_world: [1], object_wrt_sensor: [1]}\n- {effector_wrt_world: [1]}",
-            r"line 2: \[1\]: no obj",
-        ),
+        ("- {effector_wrt_world: [1], object_wrt_sensor: [1]}\n- {effector_wrt_world: [1]}", r"line 2: \[1\]: no obj"),
         ("samples:\n- {robot: 1}\n- {robot: 1, tracking: 2}", r"line 2: samples\[0\]: no tracking; a sample of easy"),
         ("samples: {hand_world_samples: [], camera_marker_samples: []}", "0 poses of the robot .* and 0 of the target"),
         ("samples: {hand_world_samples: 1, camera_marker_samples: []}", "hand_world_samples: 1; a list of poses"),

@@ -12,10 +12,7 @@ from ros_messages import FIRST_APRILTAG, bag, header
 
 from gtsam_rwhec.logs import DetectionRecord, IntrinsicsRecord, convert_ros_bag
 
-POSE = {
-    "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-    "orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8},
-}
+POSE = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}}
 STAMPED = {"header": header(T0, "cam"), "pose": {"pose": POSE, "covariance": np.eye(6).ravel()}}
 CORNERS = [[10.0, 40.0], [40.0, 41.0], [42.0, 11.0], [9.0, 10.0]]
 POINTS = [{"x": x, "y": y} for x, y in CORNERS]

@@ -12,14 +12,7 @@ from refinement_problems import rig
 from rwhec_factors.se3 import pose
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import (
-    FrameError,
-    MeasurementsNotKeptError,
-    NoiseError,
-    OptionError,
-    PriorError,
-    ScaleError,
-)
+from gtsam_rwhec.errors import FrameError, MeasurementsNotKeptError, NoiseError, OptionError, PriorError, ScaleError
 from gtsam_rwhec.methods.local_on_manifold import (
     FrameKeys,
     LomOptions,

@@ -89,10 +89,7 @@ def test_stages_that_cannot_write_to_the_end(tmp_path: Path) -> None:
     with largest_file(1000), pytest.raises(FileFormatError, match=r"result\.json cannot be written: File too large"):
         solve_into(clean, None, out)
     assert list(out.iterdir()) == []
-    with (
-        largest_file(len(content)),
-        pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"),
-    ):
+    with largest_file(len(content)), pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"):
         solve_into(clean, None, out)
     assert {path.name for path in out.iterdir()} == {"result.json"}
     check_whole(out)

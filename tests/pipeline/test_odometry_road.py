@@ -91,9 +91,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, Path, subproce
     return driven, folder, run("calibrate", log, "--rig", folder / "rig.yaml", "-o", folder / "out")
 
 
-def test_six_odometries_through_the_command(
-    six: tuple[Drive, Path, subprocess.CompletedProcess[str]],
-) -> None:
+def test_six_odometries_through_the_command(six: tuple[Drive, Path, subprocess.CompletedProcess[str]]) -> None:
     driven, folder, done = six
     assert done.returncode == ExitStatus.CERTIFIED, done.stdout + done.stderr
     assert done.stdout.startswith("Use these poses")

@@ -58,10 +58,7 @@ def test_measurements_of_one_stamp_share_a_pose() -> None:
         return CarrierVariables.of([PairData.of(problem, pair, options, None) for pair in problem.pairs])
 
     assert len(variables(simulation.problem).A) == 8
-    apart = copied(
-        simulation.problem,
-        stamps_ns=lambda pair, raw: raw.stamps_ns + (7 if pair[1] == "sensor1" else 0),
-    )
+    apart = copied(simulation.problem, stamps_ns=lambda pair, raw: raw.stamps_ns + (7 if pair[1] == "sensor1" else 0))
     assert len(variables(apart).A) == 16
     assert not variables(apart).is_shared
     unstamped = rw.Problem()
@@ -106,11 +103,7 @@ def test_motions_take_propagated_noise() -> None:
         (lambda: rw.CarrierNoise(), rw.errors.NoiseError, "rotation_rad is 0.0"),
         (lambda: rw.CarrierNoise(0.01, np.nan), rw.errors.NoiseError, "translation_m is nan"),
         (lambda: rw.CarrierNoise(0.01, 0.01, about="world"), rw.errors.OptionError, "about='world'"),
-        (
-            lambda: rw.CarrierNoise(0.01, covariances={}),
-            rw.errors.NoiseError,
-            "standard deviations, not both",
-        ),
+        (lambda: rw.CarrierNoise(0.01, covariances={}), rw.errors.NoiseError, "standard deviations, not both"),
         (lambda: rw.CarrierNoise(covariances={}), rw.errors.NoiseError, "lacks"),
         (
             lambda: rw.CarrierNoise(covariances={("target0", "sensor0"): np.tile(np.eye(6), (3, 1, 1))}),

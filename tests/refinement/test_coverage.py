@@ -51,8 +51,7 @@ def squares(noise: str, scale: str, noisy_A: bool) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize(
-    ("noise", "scale", "noisy_A"),
-    [("given", "shared", False), ("estimate", "known", False), ("given", "known", True)],
+    ("noise", "scale", "noisy_A"), [("given", "shared", False), ("estimate", "known", False), ("given", "known", True)]
 )
 def test_mean_squared_errors_agree_with_the_covariances(noise: str, scale: str, noisy_A: bool) -> None:
     for name, values in squares(noise, scale, noisy_A).items():

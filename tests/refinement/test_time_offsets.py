@@ -82,10 +82,7 @@ def test_offsets_of_the_named_sensors_only() -> None:
 
 def test_robust_losses_and_carrier_noise_go_with_offsets() -> None:
     problem = problem_with({"cam0": 0.03}, count=80)
-    for options in (
-        {"robust": "huber"},
-        {"carrier_noise": rw.CarrierNoise(rotation_rad=1e-3, translation_m=1e-3)},
-    ):
+    for options in ({"robust": "huber"}, {"carrier_noise": rw.CarrierNoise(rotation_rad=1e-3, translation_m=1e-3)}):
         r = refined(problem, time_offsets=True, **options)
         assert r.time_offsets_s["cam0"] == pytest.approx(0.03, abs=0.003)
 
@@ -256,10 +253,7 @@ def test_offset_with_carrier_poses_that_targets_share() -> None:
     for seed in range(12):
         path = fast_path(noise, seed)
         r = refined(
-            slow_problem(path, 0.003, seed),
-            time_offsets=True,
-            carrier_path=path,
-            carrier_noise=rw.CarrierNoise(*noise),
+            slow_problem(path, 0.003, seed), time_offsets=True, carrier_path=path, carrier_noise=rw.CarrierNoise(*noise)
         )
         xi = se3.logmap(np.linalg.inv(Y["cam0"])[None] @ r.Y["cam0"].matrix())[0]
         off = r.time_offsets_s["cam0"] - 0.003

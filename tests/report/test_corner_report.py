@@ -15,12 +15,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.reprojection_found import Consequence, Intrinsics
 from gtsam_rwhec.report import print_corners, print_refined
-from gtsam_rwhec.report.corner_report import (
-    consequences_table,
-    errors_table,
-    intrinsics_sentences,
-    intrinsics_table,
-)
+from gtsam_rwhec.report.corner_report import consequences_table, errors_table, intrinsics_sentences, intrinsics_table
 from gtsam_rwhec.report.covariance_report import (
     FROM_POSES,
     NOT_FROM_CORNERS,

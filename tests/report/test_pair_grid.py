@@ -21,11 +21,7 @@ def lines_of(grid: PairGrid, width: int = 80, encoding: str = "utf-8", *, color:
     """What is printed."""
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
     console = Console(
-        file=stream,
-        width=width,
-        force_terminal=color,
-        color_system="truecolor" if color else None,
-        highlight=False,
+        file=stream, width=width, force_terminal=color, color_system="truecolor" if color else None, highlight=False
     )
     console.print(grid)
     stream.flush()
@@ -33,11 +29,7 @@ def lines_of(grid: PairGrid, width: int = 80, encoding: str = "utf-8", *, color:
     return stream.read().splitlines()
 
 
-THREE_STATES = {
-    ("tag_2", "cam_0"): True,
-    ("tag_10", "cam_0"): False,
-    ("tag_10", "cam_1"): True,
-}
+THREE_STATES = {("tag_2", "cam_0"): True, ("tag_10", "cam_0"): False, ("tag_10", "cam_1"): True}
 
 
 def test_three_states_aligned_under_their_targets_in_natural_order() -> None:

@@ -242,8 +242,7 @@ def test_counts_cannot_be_negative(counts: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"axis": (0.0, 0.0, 0.0)}, {"max_angle_rad": -1.0}, {"extent_m": float("nan")}, {"wobble_m": -0.1}],
+    "options", [{"axis": (0.0, 0.0, 0.0)}, {"max_angle_rad": -1.0}, {"extent_m": float("nan")}, {"wobble_m": -0.1}]
 )
 def test_bad_motions_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(OptionError, match=next(iter(options))):

@@ -6,17 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from small_problems import (
-    GROSS_NOISE,
-    dense_full,
-    flat,
-    optimum,
-    part_of,
-    reduced,
-    searched,
-    simulated,
-    whole,
-)
+from small_problems import GROSS_NOISE, dense_full, flat, optimum, part_of, reduced, searched, simulated, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OptionError, ScaleError
@@ -25,12 +15,7 @@ from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.cause import Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import cost_of, descend
-from gtsam_rwhec.solver.nonnegative import (
-    run_with_nonnegative_scale,
-    scale_row,
-    scale_spread,
-    without_scale,
-)
+from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale, scale_row, scale_spread, without_scale
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations

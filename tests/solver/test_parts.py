@@ -16,10 +16,7 @@ SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 @pytest.mark.parametrize("scale", ["known", "per_target"])
 def test_unconnected_parts_come_apart(scale: ScaleMode) -> None:
     parts = parts_of(simulated(3, 3, graph=[(0, 0), (1, 0), (1, 1), (2, 2)], scale=scale).problem)
-    assert [part.names for part in parts] == [
-        ("target0", "target1", "sensor0", "sensor1"),
-        ("target2", "sensor2"),
-    ]
+    assert [part.names for part in parts] == [("target0", "target1", "sensor0", "sensor1"), ("target2", "sensor2")]
     assert [part.pairs for part in parts] == [
         (("target0", "sensor0"), ("target1", "sensor0"), ("target1", "sensor1")),
         (("target2", "sensor2"),),

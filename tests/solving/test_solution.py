@@ -67,8 +67,7 @@ def test_stages_are_told_and_timed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "said"),
-    [("known", "A X = Y B"), ("shared", "A X = Y B"), ("per_target", "B X^-1 = Y^-1 A")],
+    ("mode", "said"), [("known", "A X = Y B"), ("shared", "A X = Y B"), ("per_target", "B X^-1 = Y^-1 A")]
 )
 def test_the_certificate_says_which_cost_it_is_about(mode: str, said: str) -> None:
     certificate = rw.solve(simulated(mode).problem).certificate

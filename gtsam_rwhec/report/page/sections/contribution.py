@@ -65,10 +65,7 @@ def _fewer(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterat
                 "lead",
             )
     rows = tuple(
-        (
-            (shown.evident(*at, i, "growth", times=100.0, spec=".0f"), " %"),
-            shown.evident(*at, i, "bundles", spec=".0f"),
-        )
+        ((shown.evident(*at, i, "growth", times=100.0, spec=".0f"), " %"), shown.evident(*at, i, "bundles", spec=".0f"))
         for i in range(len(found.fewer))
     )
     chosen = what if found.bundle == 1 else "bundles"

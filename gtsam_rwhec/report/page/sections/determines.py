@@ -7,17 +7,7 @@ from collections.abc import Iterator, Mapping
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.report.page.blocks import (
-    Block,
-    Folded,
-    Listing,
-    Number,
-    Paragraph,
-    Section,
-    Table,
-    Words,
-    significant,
-)
+from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Number, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.sections.weak_directions import weak_blocks
 from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol

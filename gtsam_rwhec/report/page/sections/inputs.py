@@ -16,12 +16,7 @@ from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 #: The kind of each text, before the name of its file.
-KINDS = {
-    "static_tf.launch.py": "ROS 2 launch file",
-    "rig.urdf.xacro": "URDF",
-    "tf.yaml": "YAML",
-    "poses.py": "Python",
-}
+KINDS = {"static_tf.launch.py": "ROS 2 launch file", "rig.urdf.xacro": "URDF", "tf.yaml": "YAML", "poses.py": "Python"}
 #: Of more files a table is folded.
 FEW_FILES = 12
 

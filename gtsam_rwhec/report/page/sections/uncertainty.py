@@ -148,11 +148,7 @@ def _clocks(shown: ShownResult) -> Iterator[Block]:
 
 
 def _moved(
-    title: str,
-    legend: str,
-    of: str,
-    rows: list[tuple[int, str, str]],
-    number: Callable[[int, str], Number],
+    title: str, legend: str, of: str, rows: list[tuple[int, str, str]], number: Callable[[int, str], Number]
 ) -> Iterator[Block]:
     """The frame that each cause moves most, and turns most; folded, what it does to every frame.
 

@@ -1,0 +1,84 @@
+"""How heavy the repository is: lines, code, files, packages, names. ``--check`` fails above the budget.
+
+    python .ci/weight.py            the figures
+    python .ci/weight.py --packages each package's
+    python .ci/weight.py --check    exit status 1 where a figure is above its budget
+
+Code is what is left without docstrings, comments, blank lines and imports.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import sys
+import tokenize
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+#: What the sources may weigh. Lower a number when they become lighter; raise it only with a reason in the commit.
+BUDGET = {
+    "lines": 98_290,
+    "code": 56_940,
+    "files": 776,
+    "packages": 30,
+    "names that occur twice": 42,
+    "lines of tests and benchmarks": 71_064,
+}
+NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+
+
+def main(arguments: list[str]) -> int:
+    """Print the figures beside their budget; the exit status."""
+    sources = [path for folder in ("gtsam_rwhec", "factors") for path in _python_files(ROOT / folder)]
+    if "--packages" in arguments:
+        for package in sorted({path.relative_to(ROOT).parts[:2] for path in sources if len(path.parts) > 2}):
+            inside = [path for path in sources if path.relative_to(ROOT).parts[:2] == package]
+            print(f"{'/'.join(package):32} {_lines(inside):7,} lines {_code(inside):7,} code {len(inside):4} files")
+    names = Counter(path.name for path in sources if path.name not in ("__init__.py", "__init__.pyi"))
+    checks = [path for folder in ("tests", "benchmarks") for path in _python_files(ROOT / folder)]
+    figures = {
+        "lines": _lines(sources),
+        "code": _code(sources),
+        "files": len(sources),
+        "packages": sum(1 for path in (ROOT / "gtsam_rwhec").iterdir() if (path / "__init__.py").is_file()),
+        "names that occur twice": sum(1 for count in names.values() if count > 1),
+        "lines of tests and benchmarks": _lines(checks),
+    }
+    for name, value in figures.items():
+        print(f"{name:30} {value:7,}   budget {BUDGET[name]:7,}{'   ABOVE IT' if value > BUDGET[name] else ''}")
+    return int("--check" in arguments and any(value > BUDGET[name] for name, value in figures.items()))
+
+
+def _python_files(folder: Path) -> list[Path]:
+    found = sorted([*folder.rglob("*.py"), *folder.rglob("*.pyi")])
+    return [path for path in found if not {"build", "dist", ".venv"} & set(path.relative_to(ROOT).parts)]
+
+
+def _lines(paths: list[Path]) -> int:
+    return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
+
+
+def _code(paths: list[Path]) -> int:
+    return sum(len(_code_lines(path.read_text(encoding="utf-8"))) for path in paths)
+
+
+def _code_lines(text: str) -> set[int]:
+    """The numbers of the lines that hold code."""
+    lines: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in NO_CODE:
+            lines.update(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(text)):
+        # A string that stands alone is a docstring, or a text in its place.
+        alone = (
+            isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        )
+        if alone or isinstance(node, ast.Import | ast.ImportFrom):
+            lines.difference_update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
