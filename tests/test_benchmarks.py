@@ -19,7 +19,7 @@ from places import REPOSITORY
 
 from gtsam_rwhec.vision.camera import Camera
 
-BENCHMARKS = REPOSITORY / "tests" / "benchmarks"
+BENCHMARKS = REPOSITORY / "benchmarks"
 #: Their imports need what is only in the extra `bench`.
 OF_BENCH = {"scs_relaxation", "real_dataset", "run_all", "own_code_against_libraries"}
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 from places import REPOSITORY
 
-sys.path.insert(0, str(REPOSITORY / "tests" / "benchmarks"))
+sys.path.insert(0, str(REPOSITORY / "benchmarks"))
 import gallery
 import gallery_scene
 from gallery_faults import FAULTS, Fault

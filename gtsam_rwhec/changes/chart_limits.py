@@ -1,4 +1,4 @@
-"""The limits of the control chart, from a table that ``tests/benchmarks/chart_limits.py`` counts by Monte Carlo.
+"""The limits of the control chart, from a table that ``benchmarks/chart_limits.py`` counts by Monte Carlo.
 
 The statistic of a night is the smallest of many chances, of all moments and frames. Its limit is the rate of false
 alarms over the number of independent moments that the search is worth: one at the second night, some five at the

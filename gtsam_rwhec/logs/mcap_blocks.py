@@ -5,7 +5,7 @@ compares checksums. It reads a file once from front to back where the file has n
 truncated file as far as the file goes; `losses` says what is missing. ``files/budgets.py`` has the limits.
 
 The `mcap` library reads single records. Finding, opening and cutting blocks stays here: the library is slower and loses
-more messages of damaged files. Measured on 2026-11-21 with mcap 1.6.0 (tests/benchmarks/own_code_against_libraries.py):
+more messages of damaged files. Measured on 2026-11-21 with mcap 1.6.0 (benchmarks/own_code_against_libraries.py):
 a message takes 1.0 us, with mcap's reader 8 us. Of 20,000 messages in a file with one damaged chunk mcap's reader loses
 all, this module 4,100. In a file that breaks off at 70 % the reader loses all, this module 3,600. mcap opens LZ4 chunks
 without a limit on their size.

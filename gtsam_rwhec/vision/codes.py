@@ -6,7 +6,7 @@ read here, once in each image for all families; a few of them may be missed. Ope
 of a tag and the outline of its white margin OpenCV returns only one.
 
 Measured on 2026-11-21 with OpenCV 5.0.0 on the shipped log's images of 640 x 480, two families, one core
-(tests/benchmarks/own_code_against_libraries.py): finding and reading every quadrangle takes 6 ms an image as here, 38
+(benchmarks/own_code_against_libraries.py): finding and reading every quadrangle takes 6 ms an image as here, 38
 ms with ``Dictionary.identify`` for each quadrangle, and 255 ms with ``ArucoDetector`` and whole families. Detection of
 the targets takes 13 ms. All three ways read the same tags.
 """

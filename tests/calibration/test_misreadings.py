@@ -20,7 +20,7 @@ from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solving.solution import Solution
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
-#: One of each mistake; tests/benchmarks/misreadings.py has all, on real and simulated rigs.
+#: One of each mistake; benchmarks/misreadings.py has all, on real and simulated rigs.
 TRIED = [
     kind
     for kind in (*KINDS, *KINDS_OF_GRAPHS)

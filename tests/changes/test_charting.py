@@ -35,7 +35,7 @@ def moved(first: int, size: float, nights: int = 20, seed: int = 0, rows: slice 
 def test_false_alarms_are_as_many_as_stated(robots: int, fewest: int, most: int) -> None:
     x = np.random.default_rng(7).standard_normal((robots, 26, 6))
     alarms = sum(not alarm.is_back for robot in x for _, alarm in alarms_of(robot, 0.01, {"cam": slice(0, 6)}))
-    assert fewest <= alarms <= most  # 15 are expected of 1,500 nights; tests/benchmarks/fleet_drift.py counts many more
+    assert fewest <= alarms <= most  # 15 are expected of 1,500 nights; benchmarks/fleet_drift.py counts many more
 
 
 def test_a_step_has_its_date_its_frame_and_its_size() -> None:

@@ -1,4 +1,4 @@
-"""What starting does not bring in. How long it takes is in tests/benchmarks/start_time.py."""
+"""What starting does not bring in. How long it takes is in benchmarks/start_time.py."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.simulate import Motion, Noise, general, perturb
 
-#: `tests/benchmarks/few_measurements.py` counts thousands.
+#: `benchmarks/few_measurements.py` counts thousands.
 RUNS = 30
 
 

@@ -1,4 +1,4 @@
-"""Covariances against the truth in a few runs; the benchmark tests/benchmarks/coverage.py makes thousands."""
+"""Covariances against the truth in a few runs; the benchmark benchmarks/coverage.py makes thousands."""
 
 from __future__ import annotations
 

@@ -1,0 +1,117 @@
+"""Refinement from corners: do 95 % ellipsoids hold the truth, and how efficient is it?
+
+    python benchmarks/corner_coverage.py [--runs 2000] [--workers 2] [--kinds WORD ...] [--seed 0]
+
+Simulated cells (`tests/reprojection/simulated_cells.py`): two fixed cameras, a board of 7 x 5 corners on the hand, 30
+instants, corners with 0.1 pixels of noise. Intrinsics are known; or drawn from the prior of a calibration, or of
+nominal intrinsics; or unknown, and started by homographies. A is exact, or noisy by 1 mrad and 0.5 mm, which is
+estimated; or the board is warped too. Each run has its own cell. Shares have their 99 % intervals. The ratio is the
+mean of the squared deviations over their number: 1 where covariances are right.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from bars import Row, benchmark_parser, print_rows
+from binomial import Share
+from loky import ProcessPoolExecutor
+from rwhec_factors import se3
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
+import simulated_cells
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
+from gtsam_rwhec.reprojection.intrinsics import Stated
+from gtsam_rwhec.reprojection.lens import parameters_of
+
+LEVEL, LEAST, MOST = 0.95, 0.935, 0.965
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How cells are made, and what is told of them."""
+
+    drawn: Stated | None
+    told: Stated
+    carrier: tuple[float, float] = (0.0, 0.0)
+    warp_m: float = 0.0
+
+
+KINDS = {
+    "known intrinsics, A exact": Kind(None, "exact"),
+    "known intrinsics, A noisy": Kind(None, "exact", (1e-3, 5e-4)),
+    "drawn from a calibration's prior, A exact": Kind("calibration", "calibration"),
+    "drawn from the nominal prior, A exact": Kind("nominal", "nominal"),
+    "drawn from a calibration's prior, A noisy": Kind("calibration", "calibration", (1e-3, 5e-4)),
+    "drawn from the nominal prior, A noisy": Kind("nominal", "nominal", (1e-3, 5e-4)),
+    "unknown intrinsics, A exact": Kind(None, "unknown"),
+    "unknown intrinsics, A noisy": Kind(None, "unknown", (1e-3, 5e-4)),
+    "drawn from the nominal prior, A noisy, a warped board": Kind("nominal", "nominal", (1e-3, 5e-4), 1e-3),
+}
+
+
+def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
+    """Squared deviations of the errors, over the ellipsoid's and over their number, by what is estimated."""
+    kind = KINDS[name]
+    seed += 100_000 * list(KINDS).index(name)
+    given = simulated_cells.cell(seed, stated=kind.drawn, carrier=kind.carrier, shape=(0.0, kind.warp_m, kind.warp_m))
+    exact = kind.carrier == (0.0, 0.0)
+    options = rw.CornerOptions(stated=kind.told, carrier_noise="exact" if exact else "estimate", warp_m=kind.warp_m)
+    X, Y = given.near(np.random.default_rng(seed))
+    observations = given.observations
+    if kind.told == "unknown":
+        cameras = {sensor: first_intrinsics(observations, sensor) for sensor in observations.sensors}
+        observations = replace(observations, cameras=cameras)
+    result = rw.refine_corners(observations, X, Y, options)
+    errors = {
+        "target": ("board", se3.logmap((se3.inverse(result.X["board"].matrix()) @ given.X["board"])[None])[0]),
+        "sensor": ("cam_0", se3.logmap((se3.inverse(result.Y["cam_0"].matrix()) @ given.Y["cam_0"])[None])[0]),
+    }
+    if kind.told != "exact":
+        found = parameters_of(result.intrinsics["cam_0"].camera)
+        truth = parameters_of(given.cameras["cam_0"])
+        errors["intrinsics"] = ("intrinsics:cam_0", np.pad(truth, (0, len(found) - len(truth))) - found)
+    if kind.warp_m:
+        errors["board's warp"] = ("shape:board", (given.shape - result.shapes["board"])[1:])
+    squares = {}
+    for what, (unknown, error) in errors.items():
+        covariance = result.covariance(unknown)
+        squared = float(error @ np.linalg.solve(covariance, error))
+        squares[what] = (squared / result.squared_radius(unknown, LEVEL), squared / len(error))
+    return squares
+
+
+def main() -> int:
+    """Run, and print a table."""
+    parser = benchmark_parser(__doc__)
+    parser.add_argument("--runs", type=int, default=2000)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0, help="the first run's")
+    parser.add_argument("--kinds", nargs="*", default=[""], help="only kinds that have one of these words")
+    given = parser.parse_args()
+    rows = []
+    with ProcessPoolExecutor(given.workers) as pool:
+        for name in KINDS:
+            if not any(word in name for word in given.kinds):
+                continue
+            squares = defaultdict(list)
+            for found in pool.map(one, [name] * given.runs, range(given.seed, given.seed + given.runs), chunksize=10):
+                for what, each in found.items():
+                    squares[what].append(each)
+            for what, each in squares.items():
+                share = Share.of([radius < 1.0 for radius, _ in each])
+                low, high = share.interval()
+                ratio = np.mean([ratio for _, ratio in each])
+                figure = f"{100 * share.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}], ratio {ratio:.2f}"
+                rows.append(Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
+    return print_rows("95 % ellipsoids of a refinement from corners", rows, store=given.store)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,136 @@
+"""Refinement from corners of images that do not tell the intrinsics: is it said, and are no more claims made than held?
+
+    python benchmarks/corner_undetermined.py [--runs 60] [--workers 2] [--kinds WORD ...] [--seed 0]
+
+Simulated cells (`tests/reprojection/placements.py`): boards that face their camera almost straight, at one depth, or in
+a corner of the image only; stated intrinsics are drawn from the prior of a calibration, or of nominal ones. Parameters
+that the images do not tell must be named as held by the prior (or as doubted, with a prior that was widened), and
+ellipsoids must hold the truth. Boards that face
+their camera straight leave a place free, which must be refused.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from bars import Row, benchmark_parser, print_rows
+from binomial import Share
+from loky import ProcessPoolExecutor
+from rwhec_factors import se3
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
+import placements
+import simulated_cells
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.reprojection.intrinsics import Stated
+from gtsam_rwhec.reprojection.lens import parameters_of
+
+LEVEL, LEAST = 0.95, 0.93
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Where the boards are, what is told of intrinsics, which parameters must be named, and whether it is refused."""
+
+    placement: placements.Placement
+    told: Stated
+    noisy: bool
+    named: tuple[str, ...] = ()
+    is_refused: bool = False
+
+
+def _kinds() -> dict[str, Kind]:
+    every = {}
+    named = {
+        ("nearly fronto-parallel at one depth", "calibration"): ("fx", "fy", "cx", "cy"),
+        ("nearly fronto-parallel at one depth", "nominal"): ("fx", "fy"),
+        ("in a corner of the image", "calibration"): ("cx", "cy"),
+    }
+    for told in ("calibration", "nominal"):
+        for noisy in (False, True):
+            words = f"{told}, A {'noisy' if noisy else 'exact'}"
+            every[f"fronto-parallel, {words}"] = Kind(placements.Placement(tilt=0.0), told, noisy, is_refused=True)
+            for name, placement in placements.UNDETERMINED.items():
+                every[f"{name}, {words}"] = Kind(placement, told, noisy, named.get((name, told), ()))
+    return every
+
+
+KINDS = _kinds()
+
+
+def one(name: str, seed: int) -> dict[str, bool]:
+    """One run: what is so."""
+    kind = KINDS[name]
+    seed += 100_000 * list(KINDS).index(name)
+    given = simulated_cells.cell(
+        seed, facing=kind.placement, stated=kind.told, carrier=(1e-3, 5e-4) if kind.noisy else (0.0, 0.0)
+    )
+    X, Y = given.near(np.random.default_rng(seed))
+    options = rw.CornerOptions(stated=kind.told, carrier_noise="estimate" if kind.noisy else "exact")
+    try:
+        result = rw.refine_corners(given.observations, X, Y, options)
+    except rw.errors.UnderdeterminedError:
+        return {"refused": True}
+    found = {"refused": False}
+    errors = {
+        "target": ("board", se3.logmap((se3.inverse(result.X["board"].matrix()) @ given.X["board"])[None])[0]),
+        "sensor": ("cam_0", se3.logmap((se3.inverse(result.Y["cam_0"].matrix()) @ given.Y["cam_0"])[None])[0]),
+        "intrinsics": (
+            "intrinsics:cam_0",
+            parameters_of(simulated_cells.CAMERA) - parameters_of(result.intrinsics["cam_0"].camera),
+        ),
+    }
+    for what, (unknown, error) in errors.items():
+        squared = float(error @ np.linalg.solve(result.covariance(unknown), error))
+        found[what] = squared < result.squared_radius(unknown, LEVEL)
+    if kind.named:  # a prior that was widened, and said to be, holds less
+        found["named"] = all(
+            camera.widened > 1.0 or set(kind.named) <= set(camera.held_by_prior)
+            for camera in result.intrinsics.values()
+        )
+    found["no deviation above the prior's"] = all(
+        (np.sqrt(np.diagonal(camera.covariance)) <= (1.0 + 1e-6) * camera.stated_deviations).all()
+        for camera in result.intrinsics.values()
+    )
+    return found
+
+
+def rows_of(name: str, found: list[dict[str, bool]]) -> list[Row]:
+    """What a kind has in the table."""
+    refused = Share.of([each["refused"] for each in found])
+    if KINDS[name].is_refused:
+        return [Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
+    rows = [Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
+    for what in [what for what in found[0] if what != "refused"]:
+        share = Share.of([each[what] for each in found if not each["refused"]])
+        is_coverage = what in ("target", "sensor", "intrinsics")
+        bar, met = (">= 93 %", share.meets(LEAST, 1.0)) if is_coverage else ("100 %", share.value == 1.0)
+        if what == "named":
+            what = f"{', '.join(KINDS[name].named)} named as held by the prior, or widened"
+        rows.append(Row(f"  {what}", str(share), bar, met))
+    return rows
+
+
+def main() -> int:
+    """Run, and print a table."""
+    parser = benchmark_parser(__doc__)
+    parser.add_argument("--runs", type=int, default=60)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0, help="the first run's")
+    parser.add_argument("--kinds", nargs="*", default=[""], help="only kinds that have one of these words")
+    given = parser.parse_args()
+    rows = []
+    with ProcessPoolExecutor(given.workers) as pool:
+        for name in KINDS:
+            if any(word in name for word in given.kinds):
+                seeds = range(given.seed, given.seed + given.runs)
+                rows += rows_of(name, list(pool.map(one, [name] * given.runs, seeds, chunksize=5)))
+    return print_rows("intrinsics that the images do not tell", rows, store=given.store)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,137 @@
+"""Boards of a real workcell that are read right and wrong, and how long it takes.
+
+    python benchmarks/workcell.py [--repetitions 3]
+
+39 images of 1080p of a checkerboard of 3 x 4 corners on an arm, five of them without it (davidea97's
+Multi-Camera-Hand-Eye-Calibration, Apache-2.0, ``shared/data/workcell_camera2``; GTSAM_RWHEC_DATA names another folder).
+A board is read right if each corner is within a pixel of where the joint solution of A X = Y B has it, with all hand
+poses. The peer is OpenCV's classic detector with its fast check, in turns with ours, on one thread.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from bars import Row, benchmark_parser, print_rows
+from interleaved import in_words, interleaved
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.files.yaml_lines import read_yaml
+from gtsam_rwhec.logs.records import ImageRecord
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.detection import Detector
+from gtsam_rwhec.vision.many_images import detect_in_images
+from gtsam_rwhec.vision.targets import Checkerboard
+
+DATA = Path(os.environ.get("GTSAM_RWHEC_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+FOLDER = DATA / "workcell_camera2"
+BOARD = Checkerboard("board", columns=3, rows=4, square_m=0.05)
+#: A corner further than this from the joint solution's is wrong, pixels.
+WRONG_PX = 1.0
+#: The images are taken this often, so that processes are worth their start.
+TIMES_OVER = 12
+#: Images that show no board (looked at).
+WITHOUT_A_BOARD = ("0001", "0020", "0140", "0150", "0160")
+
+Gray = npt.NDArray[np.uint8]
+
+
+def the_camera() -> Camera:
+    """The intrinsics that the data set states."""
+    fields = read_yaml(FOLDER / "intrinsic_pars_file.yaml").data
+    K = np.array([[fields["fx"], 0.0, fields["cx"]], [0.0, fields["fy"], fields["cy"]], [0.0, 0.0, 1.0]])
+    return Camera.of(fields["img_width"], fields["img_height"], "none", K, np.zeros(0), "camera2")
+
+
+def off_the_joint_solution(camera: Camera, images: dict[str, Gray]) -> dict[str, float]:
+    """By the image's name, the largest distance of a corner from where the joint solution has it; inf if not read."""
+    (*found,) = Detector(camera, [BOARD])(list(images.values()))
+    read = {name: one.detections[0] for name, one in zip(images, found, strict=True) if one.detections}
+    read = {name: one for name, one in read.items() if one.rejection is None}
+    hand = {name: np.loadtxt(FOLDER / "pose" / f"{name}.csv") for name in read}
+    problem = rw.Problem()
+    problem.add("board", "camera", np.array(list(hand.values())), np.array([one.T[0] for one in read.values()]))
+    solved = rw.solve(problem)
+    X, Y = solved.X["board"].matrix(), solved.Y["camera"].matrix()
+    off = dict.fromkeys(images, np.inf)
+    for name, one in read.items():
+        T = np.linalg.inv(Y) @ hand[name] @ X
+        corners = BOARD.corners()[one.indices]
+        pixels = cv2.projectPoints(corners, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], camera.K, np.zeros(4))[0][:, 0]
+        off[name] = float(np.linalg.norm(pixels - one.corners_px, axis=1).max())
+    return off
+
+
+def classic(gray: Gray) -> object:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    return cv2.findChessboardCorners(gray, (BOARD.columns, BOARD.rows), flags=flags)
+
+
+def decoded(data: bytes) -> Gray:
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+
+
+def rows(repetitions: int) -> list[Row]:
+    """What is read, and times."""
+    cv2.setNumThreads(1)
+    files = {path.stem: path.read_bytes() for path in sorted((FOLDER / "image").glob("*.png"))}
+    camera, images = the_camera(), {name: decoded(data) for name, data in files.items()}
+    off = off_the_joint_solution(camera, images)
+    shown = [name for name in images if name not in WITHOUT_A_BOARD]
+    right = [name for name in shown if off[name] <= WRONG_PX]
+    wrong = [name for name in images if np.isfinite(off[name]) and name not in right]
+    result = [
+        Row("boards read right", f"{len(right)} of {len(shown)}", "all 34", len(right) == len(shown) == 34),
+        Row("boards read wrong", f"{len(wrong)} {wrong or ''}", "0", not wrong),
+        Row(" largest distance of a corner", f"{max(off[name] for name in right):.2f} px", "<= 1 px", not wrong),
+    ]
+    detector = Detector(camera, [BOARD])
+    for words, names, bar in (("whose board is seen", shown, 3.0), ("without a board", WITHOUT_A_BOARD, 3.0)):
+        times = interleaved(
+            repetitions,
+            {
+                "ours": lambda names=names: [detector([images[name]]) for name in names],  # type: ignore[misc]
+                "classic": lambda names=names: [classic(images[name]) for name in names],  # type: ignore[misc]
+                "decode": lambda names=names: [decoded(files[name]) for name in names],  # type: ignore[misc]
+            },
+        )
+        ratio = times.ratio("ours", "classic")
+        each = {name: times.median(name) / len(names) for name in times.of}
+        result += [
+            Row(
+                f"time of images {words} over classic",
+                f"{ratio:.2f}x ({in_words(each['ours'])} over {in_words(each['classic'])})",
+                f"<= {bar:g}x",
+                ratio <= bar,
+            ),
+            Row(
+                " images a second on one thread, decoded",
+                f"{1.0 / (each['decode'] + each['ours']):.0f} (classic {1.0 / (each['decode'] + each['classic']):.0f})",
+            ),
+        ]
+    many = [
+        ImageRecord(k, k, "camera2", "camera2", "png", data) for k, data in enumerate(TIMES_OVER * list(files.values()))
+    ]
+    makers = {"camera2": partial(Detector, camera, [BOARD])}
+    times = interleaved(1, {"ours": lambda: sum(1 for _ in detect_in_images(many, makers, workers=2))})
+    rate = len(many) / times.median("ours")
+    return [*result, Row("images a second, two workers, from files' bytes", f"{rate:.0f}", ">= 20", rate >= 20.0)]
+
+
+def main() -> int:
+    """Run it; 0 if the bars are met."""
+    parser = benchmark_parser(__doc__)
+    parser.add_argument("--repetitions", type=int, default=3)
+    arguments = parser.parse_args()
+    if not FOLDER.is_dir():
+        parser.error(f"{FOLDER} does not exist: set GTSAM_RWHEC_DATA to the folder that holds workcell_camera2")
+    return print_rows("Workcell", rows(arguments.repetitions), store=arguments.store)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
