@@ -68,6 +68,10 @@ class OptionError(RwhecError):
     """An option, a method or a starting point cannot be used."""
 
 
+class MissingPackageError(ModuleNotFoundError, RwhecError):
+    """A package that an extra of this package installs is missing; the message has the command that installs it."""
+
+
 class MeasurementsNotKeptError(RwhecError):
     """Raw measurements are needed, but the problem was made with ``keep_measurements=False``."""
 

@@ -1,5 +1,5 @@
 """Data to try the library on: the demo's log, which is shipped, and public data to download."""
 
-import lazy_loader
+from gtsam_rwhec.files.optional_packages import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -5,6 +5,6 @@ paper it is from. The DQ paper is Dekel, Harenstam-Nielsen, Caccamo: Optimal lea
 calibration problem (CVPR 2020).
 """
 
-import lazy_loader
+from gtsam_rwhec.files.optional_packages import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -1,5 +1,5 @@
 """Every published method for A X = Y B behind one call: ``run(name, problem)``, and what each is in ``METHODS``."""
 
-import lazy_loader
+from gtsam_rwhec.files.optional_packages import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

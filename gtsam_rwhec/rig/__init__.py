@@ -1,5 +1,5 @@
 """Rig files: the sensors and targets, what carries them, and where the log has the data of each."""
 
-import lazy_loader
+from gtsam_rwhec.files.optional_packages import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

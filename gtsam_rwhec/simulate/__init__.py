@@ -5,6 +5,6 @@ so there the camera is the ``target`` (their modules say more). :func:`general` 
 motion and scale, with the noise on the sensors' measurements. Each returns a :class:`Simulation`.
 """
 
-import lazy_loader
+from gtsam_rwhec.files.optional_packages import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
