@@ -32,8 +32,10 @@ def answers(folder: Path, out: Path, place: str) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(("data", "others"), [("demo", ["two", "four", "four on one core"]), ("utias", ["four"])])
-def test_threads_cores_and_workers(data: str, others: list[str], utias_folder: Path, tmp_path: Path) -> None:
-    folder = DEMO if data == "demo" else utias_folder
+def test_threads_cores_and_workers(
+    data: str, others: list[str], request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    folder = DEMO if data == "demo" else request.getfixturevalue("utias_folder")
     found = {
         place: answers(folder, tmp_path / f"{number}.npz", place)
         for number, place in enumerate(["one thread", *others])

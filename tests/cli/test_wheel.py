@@ -23,35 +23,39 @@ CELL = REPOSITORY / "data" / "cell"
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sdist, and the wheel that is built of the sdist, not of the checkout."""
+    """A folder with both sdists, and the wheels that are built of the sdists, not of the checkout."""
     folder = tmp_path_factory.mktemp("built")
-    subprocess.run(
-        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(REPOSITORY)],
-        capture_output=True,
-        check=True,
-    )
+    for source in (REPOSITORY, REPOSITORY / "factors"):
+        command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)]
+        subprocess.run(command, capture_output=True, check=True)
     return folder
 
 
 @pytest.fixture(scope="module")
 def unpacked_wheel(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel as pip would unpack it."""
-    (wheel,) = built.glob("*.whl")
+    """Both wheels as pip would unpack them."""
     unpacked = tmp_path_factory.mktemp("site-packages")
-    zipfile.ZipFile(wheel).extractall(unpacked)
+    for wheel in built.glob("*.whl"):
+        zipfile.ZipFile(wheel).extractall(unpacked)
     return unpacked
 
 
-def test_one_wheel_for_all_systems_and_a_package_index_takes_it(built: Path) -> None:
-    wheel, sdist = sorted(built.iterdir(), key=lambda path: path.suffix, reverse=True)
-    assert (wheel.name, sdist.name) == (
-        f"gtsam_rwhec-{version('gtsam-rwhec')}-py3-none-any.whl",
-        f"gtsam_rwhec-{version('gtsam-rwhec')}.tar.gz",
-    )
+@pytest.mark.parametrize("distribution", ["gtsam_rwhec", "rwhec_factors"])
+def test_one_wheel_for_all_systems_and_a_package_index_takes_it(built: Path, distribution: str) -> None:
+    wheel, sdist = (built / f"{distribution}-{version('gtsam-rwhec')}{end}" for end in ("-py3-none-any.whl", ".tar.gz"))
     done = subprocess.run(
         [sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist)], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_no_file_is_in_both_wheels(built: Path) -> None:
+    ours, factors = (set(zipfile.ZipFile(wheel).namelist()) for wheel in sorted(built.glob("*.whl")))
+    assert not ours & factors
+    assert {Path(name).parts[0] for name in factors} == {
+        "rwhec_factors",
+        f"rwhec_factors-{version('gtsam-rwhec')}.dist-info",
+    }
 
 
 def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> None:
