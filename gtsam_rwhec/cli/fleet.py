@@ -14,7 +14,6 @@ from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say
 
 Each = Literal["robot", "day", "log"]
-EngineName = Literal["dask", "ray"]
 WORK_PANEL = "Who does the work"
 
 
@@ -50,10 +49,8 @@ def run(
             help="Processes of this machine. 0: this process alone.",
         ),
     ] = None,
-    engine: Annotated[EngineName, typer.Option(rich_help_panel=WORK_PANEL, help="What spreads the work.")] = "dask",
     scheduler: Annotated[
-        str | None,
-        typer.Option(rich_help_panel=WORK_PANEL, help="Address of a Dask scheduler, or of a Ray cluster, that runs."),
+        str | None, typer.Option(rich_help_panel=WORK_PANEL, help="Address of a Dask scheduler that runs.")
     ] = None,
     memory_per_worker: Annotated[
         str, typer.Option(rich_help_panel=WORK_PANEL, help="Memory that a worker may take, such as 2GB.")
@@ -74,7 +71,7 @@ def run(
         stage(f"reading {rw.fleet.shown(manifest)}")
         fleet = rw.fleet.manifest_of_pattern(manifest, rig) if rig is not None else rw.fleet.read_manifest(manifest)
         options = rw.fleet.FleetOptions(each=each, refine=refine)
-        with rw.fleet.StartedLate(lambda: rw.fleet.engine_of(engine, count, memory_bytes, scheduler), stage) as started:
+        with rw.fleet.StartedLate(lambda: rw.fleet.engine_of(count, memory_bytes, scheduler), stage) as started:
             done = rw.fleet.run(fleet, output, options, started, stage)
     rw.fleet.print_fleet(done)
     say(f"The page of all robots: {rw.fleet.shown(rw.fleet.put_summary(done.rows, output))}", to_errors=True)

@@ -30,7 +30,6 @@ from .tasks import Failed as Failed
 from .tasks import Receipt as Receipt
 from .tasks import Task as Task
 from .dask_engine import DaskEngine as DaskEngine
-from .ray_engine import RayEngine as RayEngine
 from .in_process import InProcess as InProcess
 from .without_secrets import shown as shown
 

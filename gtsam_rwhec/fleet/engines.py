@@ -5,14 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from importlib import import_module
-from typing import Literal
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.progress import Progress, Remark, silent
 from gtsam_rwhec.fleet.tasks import Engine, Failed, Receipt, Task
 
-EngineName = Literal["dask", "ray"]
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) *([kMGT]?)(i?)B?", re.IGNORECASE)
 _POWERS = {"": 0, "k": 1, "m": 2, "g": 3, "t": 4}
 
@@ -55,33 +52,30 @@ class StartedLate:
         self.close()
 
 
-def engine_of(name: EngineName, workers: int, memory_bytes: int, scheduler: str | None) -> Engine:
+def engine_of(workers: int, memory_bytes: int, scheduler: str | None) -> Engine:
     """Start an engine.
 
     Parameters
     ----------
-    name : "dask" or "ray"
     workers : int
         Processes of this machine; 0: this process does everything, one task after another.
     memory_bytes : int
         Of each worker.
     scheduler : str, optional
-        The address of a scheduler, or of a Ray cluster, that runs already.
+        The address of a Dask scheduler that runs already.
 
     Raises
     ------
     OptionError
-        The library of the engine is not installed.
+        Dask is not installed.
     """
     if workers == 0 and scheduler is None:
         from gtsam_rwhec.fleet.in_process import InProcess
 
         return InProcess()
-    # By name: neither library is asked for where the other one is meant.
-    module, kind = ("dask_engine", "DaskEngine") if name == "dask" else ("ray_engine", "RayEngine")
-    start = getattr(import_module(f"gtsam_rwhec.fleet.{module}"), kind)
-    engine: Engine = start(workers=workers, memory_bytes=memory_bytes, scheduler=scheduler)
-    return engine
+    from gtsam_rwhec.fleet.dask_engine import DaskEngine
+
+    return DaskEngine(workers=workers, memory_bytes=memory_bytes, scheduler=scheduler)
 
 
 def bytes_of(size: str) -> int:

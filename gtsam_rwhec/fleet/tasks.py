@@ -93,7 +93,7 @@ class Task:
 
 
 class Engine(Protocol):
-    """What carries out tasks: Dask, Ray, or this process."""
+    """What carries out tasks: Dask, or this process."""
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Receipt | Failed]:
         """Yield one receipt or failure for each task, as they end; a dead worker's tasks are tried again."""
