@@ -10,7 +10,6 @@ in FOLDER: an interrupted campaign goes on where it was. Exits with 1 if a bar i
 """
 
 from __future__ import annotations
-
 import io
 import json
 import os
@@ -18,16 +17,19 @@ import re
 import tempfile
 import warnings
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-
 import gallery_scene as scene
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from gallery_faults import FAULTS, Fault
-from loky import ProcessPoolExecutor, as_completed
+from bars import Row
+from bars import benchmark_parser
+from bars import print_rows
+from gallery_faults import FAULTS
+from gallery_faults import Fault
+from loky import ProcessPoolExecutor
+from loky import as_completed
 from rich.console import Console
-
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.report.advice import print_advice
@@ -61,7 +63,7 @@ class Outcome:
         return f"{self.fault:17s} {self.seed:6d} {kind:4s} {self.verdict:11s} {what}"
 
 
-def paragraph(calibrated: rw.pipeline.Calibrated) -> str:
+def paragraph(calibrated: rw.runs.Calibrated) -> str:
     """The verdict's sentence, and what to do: the first lines that `calibrate` prints."""
     stream = io.StringIO()
     console = Console(file=stream, width=WIDE)

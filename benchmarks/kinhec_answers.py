@@ -13,9 +13,9 @@ import numpy as np
 from kinhec_sequences import CAMERA, TARGET, Keyframes, NeutralSequence, of_kinhec, sequences
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import estimate_time_offset
 from gtsam_rwhec.errors import RwhecError, RwhecWarning, StampError
 from gtsam_rwhec.solver.cause import Status
+from gtsam_rwhec.trajectories import estimate_time_offset
 
 Offsets = Literal["true", "estimated"]
 #: Of the hand-eye pose: degrees, millimetres.

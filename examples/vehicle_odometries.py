@@ -39,7 +39,7 @@ for name, (stamps_ns, poses) in driven.tracks.items():
 rig = rw.rig.read_rig(Path(__file__).with_name("vehicle_rig.yaml"))
 without = rig.model_copy(update={"given": rw.rig.GivenSection()})
 for words, described in (("Without heights", without), ("With heights", rig)):
-    solved = rw.pipeline.calibrate_odometry_log(folder, described, folder / words.lower().replace(" ", "_"))
+    solved = rw.runs.calibrate_odometry_log(folder, described, folder / words.lower().replace(" ", "_"))
     print(f"\n{words}:")
     rw.report.print_odometry(solved.result)
     for name in list(MOUNTS)[1:]:

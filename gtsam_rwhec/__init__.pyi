@@ -71,17 +71,16 @@ from .results import write_solution as write_solution
 from . import changes as changes
 
 # From a log of images to a calibration, at once or step by step.
-from . import cleaning as cleaning
 from . import export as export
 from . import first_rig as first_rig
 from . import fleet as fleet
 from . import logs as logs
 from . import odometry as odometry
-from . import pipeline as pipeline
+from . import runs as runs
 from . import rig as rig
 from . import trajectories as trajectories
 from . import vision as vision
-from .pipeline import calibrate_log as calibrate_log
+from .runs import calibrate_log as calibrate_log
 
 # Other methods, other libraries' calls, and problems whose truth is known.
 from . import compat as compat

@@ -28,7 +28,7 @@ GIVEN = {
 NOT_RUN = {
     "docs/changes.md": "it compares folders of two calibrations; tests/changes has its calls",
     "docs/corners.md": "the corners are the reader's; examples/from_corners.py goes this way, and is tested",
-    "docs/from_a_log.md": "it takes a minute of detection; tests/pipeline goes the same way",
+    "docs/from_a_log.md": "it takes a minute of detection; tests/runs goes the same way",
     "docs/refinement.md": "the corners are the reader's; examples/from_corners.py goes this way, and is tested",
     "factors/README.md": "its graph is the reader's; examples/slam_graph.py is a whole one, and is tested",
 }

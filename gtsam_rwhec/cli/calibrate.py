@@ -177,14 +177,14 @@ def calibrate(
     if rig is not None or is_log(source):
         refuse(context, NOT_FOR_A_LOG)
         described = None if rig is None else rw.rig.read_rig(rig)
-        if rw.pipeline.is_of_odometries(described, source):
+        if rw.runs.is_of_odometries(described, source):
             refuse(context, NOT_FOR_ODOMETRIES)
         if output is None:
             needed = "give -o FOLDER"
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
-        if rw.pipeline.is_of_odometries(described, source):
+        if rw.runs.is_of_odometries(described, source):
             return calibrate_odometries(source, described, output, anyway=anyway, force=force, verbose=verbose)
         return calibrate_log(
             source,
@@ -216,7 +216,7 @@ def calibrate(
     with StageDisplay() as stage, said_in_the_report():
         stage(f"reading {source}")
         if is_samples:
-            of_samples = rw.pipeline.samples_problem(source)
+            of_samples = rw.runs.samples_problem(source)
             problem = of_samples.problem
             say(of_samples.said, to_errors=True)
         else:
@@ -308,8 +308,8 @@ def calibrate_log(
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
         described = None if rig is None else rw.rig.read_rig(rig)
-        if described is not None and rw.pipeline.is_file_of_samples(source, described):
-            samples, on_hand = rw.pipeline.samples_of_rig(source, described)
+        if described is not None and rw.runs.is_file_of_samples(source, described):
+            samples, on_hand = rw.runs.samples_of_rig(source, described)
             say(f"{samples.reading(on_hand)}.", to_errors=True)
         calibrated = rw.calibrate_log(
             source,
@@ -322,8 +322,8 @@ def calibrate_log(
             replace=force,
             progress=stage,
         )
-    written = [name for name in rw.pipeline.OUTPUTS if (output / name).exists()]
-    page = output / rw.pipeline.REPORT_FILE if rw.pipeline.REPORT_FILE in written else None
+    written = [name for name in rw.runs.OUTPUTS if (output / name).exists()]
+    page = output / rw.runs.REPORT_FILE if rw.runs.REPORT_FILE in written else None
     messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(calibrated, anyway=anyway)]
     return show(calibrated, messages, verbose=verbose, page=page)
 
@@ -333,5 +333,5 @@ def calibrate_odometries(
 ) -> ExitStatus:
     """Run all stages of sensors that know only their own motion, and print the report."""
     with StageDisplay() as stage, said_in_the_report():
-        solved = rw.pipeline.calibrate_odometry_log(source, rig, output, anyway=anyway, replace=force, progress=stage)
+        solved = rw.runs.calibrate_odometry_log(source, rig, output, anyway=anyway, replace=force, progress=stage)
     return show_odometries(solved, output, anyway=anyway, verbose=verbose)

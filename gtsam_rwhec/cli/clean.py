@@ -21,7 +21,7 @@ def clean(
 ) -> ExitStatus:
     """Second stage: find the carriers' poses at each detection, and remove measurements that are not good enough."""
     with StageDisplay() as stage:
-        report = rw.pipeline.clean_log(detected, output, None if rig is None else rw.rig.read_rig(rig), progress=stage)
+        report = rw.runs.clean_log(detected, output, None if rig is None else rw.rig.read_rig(rig), progress=stage)
         used = sum(track.used for track in report.tracks)
         say(
             f"Written to {shown_path(output)}: {used} measurements to use, and the removed measurements with the "

@@ -60,19 +60,19 @@ def convert(
         if rig is not None:
             refuse(context, NOT_WITH_A_RIG)
             described = rw.rig.read_rig(rig)
-            if rw.pipeline.is_file_of_samples(source, described):
-                reading = rw.pipeline.write_samples_log(source, described, output)
+            if rw.runs.is_file_of_samples(source, described):
+                reading = rw.runs.write_samples_log(source, described, output)
                 say(
                     f"{reading}.\nWritten to {shown_path(output)}.\n"
                     f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
                 )
                 return ExitStatus.DONE
-            if not rw.pipeline.is_folder_of_images(source, described):
+            if not rw.runs.is_folder_of_images(source, described):
                 raise LogError(
                     f"{source}: --rig is for a folder of images with poses beside them, and a rig file with "
                     "carriers.poses: {frames: [parent, child]}. Leave --rig out for a bag"
                 )
-            images, number = rw.pipeline.write_folder_log(source, described, output, progress=stage)
+            images, number = rw.runs.write_folder_log(source, described, output, progress=stage)
             say(
                 f"Written to {shown_path(output)}: {images} images and {number} poses.\n"
                 f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"

@@ -26,11 +26,11 @@ def demo(
     folder = rw.datasets.demo_folder()
     log, rig = folder / rw.datasets.LOG, folder / rw.datasets.RIG
     command = shlex.join(["gtsam-rwhec", "calibrate", str(log), "--rig", str(rig), "-o", str(output)])
-    earlier = rw.pipeline.earlier_run(output)
+    earlier = rw.runs.earlier_run(output)
     is_own = earlier is not None and earlier[0] == log.name
     say(f"This is the same as: {command}{' --force' if is_own else ''}", to_errors=True)
     status = calibrate_log(log, rig, output, images=False, workers=None, force=is_own, verbose=verbose)
-    result = rw.results.read_result(output / rw.pipeline.RESULT_FILE)
+    result = rw.results.read_result(output / rw.runs.RESULT_FILE)
     if result.refined is not None and result.log is not None:
         rw.report.print_demo(result.refined, result.log, rw.datasets.demo_truth(), output)
     return status

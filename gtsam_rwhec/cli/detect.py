@@ -35,7 +35,7 @@ def detect(
     """
     try:
         with StageDisplay() as stage:
-            report = rw.pipeline.detect_source(
+            report = rw.runs.detect_source(
                 source,
                 rw.rig.read_rig(rig),
                 output,
@@ -77,7 +77,7 @@ def _in_words(report: DetectionReport, sensor: str) -> str:
 
 def _say_pictures(output: Path, draw: Path | None) -> None:
     """Name the pictures that there are."""
-    sheet = rw.pipeline.sheet_beside(output)
+    sheet = rw.runs.sheet_beside(output)
     if sheet.exists():
         say(f"Contact sheet: {shown_path(sheet)}")
     if draw is not None and draw.is_dir():

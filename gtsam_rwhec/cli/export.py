@@ -20,18 +20,18 @@ def export(
     anyway: AnywayOption = False,
 ) -> ExitStatus:
     """Last stage: write a launch file, tf, URDF, cameras (Kalibr, ROS, OpenCV, COLMAP) and plots from a solved log."""
-    if rw.pipeline.is_of_odometries(None, solved):
+    if rw.runs.is_of_odometries(None, solved):
         with StageDisplay() as stage:
-            for path in rw.pipeline.export_odometries(solved, output, anyway=anyway, progress=stage):
+            for path in rw.runs.export_odometries(solved, output, anyway=anyway, progress=stage):
                 say(shown_path(path))
-        return _said(rw.pipeline.read_odometries(solved), anyway=anyway)
+        return _said(rw.runs.read_odometries(solved), anyway=anyway)
     with StageDisplay() as stage:
-        for path in rw.pipeline.export_solved(solved, output, anyway=anyway, progress=stage):
+        for path in rw.runs.export_solved(solved, output, anyway=anyway, progress=stage):
             say(shown_path(path))
-    return _said(rw.pipeline.read_solved(solved), anyway=anyway)
+    return _said(rw.runs.read_solved(solved), anyway=anyway)
 
 
-def _said(found: rw.pipeline.Solved | rw.pipeline.OdometrySolved, *, anyway: bool) -> ExitStatus:
+def _said(found: rw.runs.Solved | rw.runs.OdometrySolved, *, anyway: bool) -> ExitStatus:
     if found.judgement.verdict is not rw.Verdict.USE:
         say(str(found.judgement), to_errors=True)
     for message in exported(found, anyway=anyway):

@@ -95,7 +95,7 @@ VerboseOption = Annotated[
 WHOLE = "--verbose"
 
 
-def exported(solved: rw.pipeline.Solved | rw.pipeline.OdometrySolved, *, anyway: bool) -> list[str]:
+def exported(solved: rw.runs.Solved | rw.runs.OdometrySolved, *, anyway: bool) -> list[str]:
     """The message that files of poses that are not to be used were written, or that they were not; or none."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
         return []
@@ -106,7 +106,7 @@ def exported(solved: rw.pipeline.Solved | rw.pipeline.OdometrySolved, *, anyway:
 
 
 def show(
-    calibrated: rw.pipeline.Calibrated, messages: Sequence[str], *, verbose: bool, page: Path | None = None
+    calibrated: rw.runs.Calibrated, messages: Sequence[str], *, verbose: bool, page: Path | None = None
 ) -> ExitStatus:
     """Print the report of a calibrated log, and the command's messages, on one screen; its exit status."""
     rw.report.print_calibration(
@@ -122,10 +122,10 @@ def show(
     return exit_status(calibrated.judgement, of_rig=True)
 
 
-def show_odometries(solved: rw.pipeline.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
+def show_odometries(solved: rw.runs.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
     """Print the report of sensors that know only their own motion, and where the files are; its exit status."""
-    written = [name for name in rw.pipeline.OUTPUTS if (output / name).exists()]
-    page = output / rw.pipeline.REPORT_FILE if rw.pipeline.REPORT_FILE in written else None
+    written = [name for name in rw.runs.OUTPUTS if (output / name).exists()]
+    page = output / rw.runs.REPORT_FILE if rw.runs.REPORT_FILE in written else None
     rw.report.print_odometry(solved.result, verbose=verbose, page=page)
     messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(solved, anyway=anyway)]
     for message in messages:

@@ -46,14 +46,14 @@ def report(
 
 def read_of(result: Path) -> tuple[Path, ...]:
     """The files that are read of a result, or of the folder that has it."""
-    file = result / rw.pipeline.RESULT_FILE if result.is_dir() else result
+    file = result / rw.runs.RESULT_FILE if result.is_dir() else result
     return file, rw.evidence.evidence_path(file)
 
 
 def report_path(result: Path) -> Path:
     """Where the page of a result is: report.html in its folder or beside result.json, NAME.html beside NAME.json."""
     if result.is_dir():
-        return result / rw.pipeline.REPORT_FILE
-    if result.name == rw.pipeline.RESULT_FILE:
-        return result.with_name(rw.pipeline.REPORT_FILE)
+        return result / rw.runs.REPORT_FILE
+    if result.name == rw.runs.RESULT_FILE:
+        return result.with_name(rw.runs.REPORT_FILE)
     return result.with_suffix(".html")

@@ -23,14 +23,14 @@ def solve(
 ) -> ExitStatus:
     """Third stage: find the certified poses, refine them, and print covariances."""
     described = None if rig is None else rw.rig.read_rig(rig)
-    if rw.pipeline.is_of_odometries(described, cleaned):
+    if rw.runs.is_of_odometries(described, cleaned):
         with StageDisplay() as stage, said_in_the_report():
-            solved = rw.pipeline.solve_odometries_into(cleaned, described, output, progress=stage)
+            solved = rw.runs.solve_odometries_into(cleaned, described, output, progress=stage)
         return show_odometries(solved, output, anyway=False, verbose=verbose)
     with StageDisplay() as stage, said_in_the_report():
-        calibrated = rw.pipeline.solve_into(cleaned, described, output, progress=stage)
+        calibrated = rw.runs.solve_into(cleaned, described, output, progress=stage)
     messages = (
-        f"Written: {shown_path(output / rw.pipeline.RESULT_FILE)}, {shown_path(output / rw.pipeline.CLEAN_LOG)}.",
-        f"Next: gtsam-rwhec export {shown_path(output / rw.pipeline.CLEAN_LOG)} -o FOLDER",
+        f"Written: {shown_path(output / rw.runs.RESULT_FILE)}, {shown_path(output / rw.runs.CLEAN_LOG)}.",
+        f"Next: gtsam-rwhec export {shown_path(output / rw.runs.CLEAN_LOG)} -o FOLDER",
     )
     return show(calibrated, messages, verbose=verbose)

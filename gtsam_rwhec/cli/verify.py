@@ -55,7 +55,7 @@ def verify(
             stage("testing the old poses")
             found = rw.changes.verify(old, problem, level=level, targets_may_move=targets_may_move, progress=stage)
         else:
-            found = rw.pipeline.verify_log(
+            found = rw.runs.verify_log(
                 result,
                 source,
                 None if rig is None else rw.rig.read_rig(rig),
@@ -86,7 +86,7 @@ def _problem(source: Path, scale: rw.ScaleMode, targets: str, sensors: str) -> r
     if is_log(source):
         raise typer.BadParameter("the old calibration is of CSV files, not of a log: give a folder of CSV files")
     if rw.logs.is_samples_file(source):
-        return rw.pipeline.samples_problem(source).problem
+        return rw.runs.samples_problem(source).problem
     if (words := other_than_csv(source)) is not None:
         raise typer.BadParameter(words)
     return rw.read_csv(source, scale, None, None, targets, sensors)

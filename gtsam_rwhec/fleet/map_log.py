@@ -27,21 +27,21 @@ from gtsam_rwhec.fleet.stores import stamp_of, write_once
 from gtsam_rwhec.fleet.tasks import Receipt
 from gtsam_rwhec.fleet.without_secrets import shown
 from gtsam_rwhec.logs import Log, open_log
-from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, read_carrier_motion
-from gtsam_rwhec.pipeline.cleaning_stage import clean_log
-from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
-from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics, finding_against
-from gtsam_rwhec.pipeline.doubted_shapes import continued_boards, doubted_shapes
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, is_from_stage
-from gtsam_rwhec.pipeline.log_corners import LogCorners
-from gtsam_rwhec.pipeline.log_metadata import LogMetadata, read_metadata
-from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
-from gtsam_rwhec.pipeline.topics_of_rig import wanted_topics
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_section import OdometrySensor
 from gtsam_rwhec.rig.sections import Sensor
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
+from gtsam_rwhec.runs.cleaning_stage import clean_log
+from gtsam_rwhec.runs.clocks_by_turning import late_clocks
+from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
+from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
+from gtsam_rwhec.runs.log_contract import CLEAN_LOG, DETECTED_LOG, is_from_stage
+from gtsam_rwhec.runs.log_corners import LogCorners
+from gtsam_rwhec.runs.log_metadata import LogMetadata, read_metadata
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
+from gtsam_rwhec.runs.topics_of_rig import wanted_topics
 
 
 @dataclass(frozen=True)

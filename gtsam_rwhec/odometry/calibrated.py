@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.cleaning.removed import Removed
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.odometry.found import Influence, JointCertificate, OtherAnswer, Windows
 from gtsam_rwhec.odometry.tracks import OdometryNoise
+from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.cause import Status
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gtsam_rwhec.cleaning.removed import RemovalReason, Removed
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -27,6 +26,7 @@ from gtsam_rwhec.odometry.unknowns import Layout
 from gtsam_rwhec.odometry.up import up_direction
 from gtsam_rwhec.odometry.window_choice import best_length, edges_near
 from gtsam_rwhec.odometry.window_motions import WindowMotions
+from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
 
 #: A time offset that the drive does not tell stays within about so many seconds of the first guess.
 CLOCK_SIGMA_S = 0.05

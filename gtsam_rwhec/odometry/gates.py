@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.cleaning.removed import RemovalReason, Removed
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.options import OdometryOptions
 from gtsam_rwhec.odometry.tracks import OdometryTrack
+from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
 
 #: A step whose velocity is so many robust deviations away from the mean of its neighbours' is a jump.
 JUMP = 12.0

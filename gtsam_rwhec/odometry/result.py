@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.cleaning.removed import Removed
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import (
     FreeDirection,
@@ -28,6 +27,7 @@ from gtsam_rwhec.odometry.solved_windows import Answer, Task
 from gtsam_rwhec.odometry.tracks import OdometryNoise, OdometryTrack
 from gtsam_rwhec.odometry.unknowns import OFFSET, SCALE
 from gtsam_rwhec.odometry.window_choice import axes_turned
+from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.cause import Status
 
 

@@ -126,7 +126,7 @@ def legend(refined: Refined) -> str:
 
 
 def _weights_of_log(refined: Refined) -> str:
-    """Where the weights of a log's solution come from; `gtsam_rwhec.pipeline.measured_pairs.problem_of` sets them."""
+    """Where the weights of a log's solution come from; `gtsam_rwhec.runs.measured_pairs.problem_of` sets them."""
     if refined.noise_source == "estimated":
         return "from the covariances of the detections in the log"
     return "from the noise that the rig file states"

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.vision.targets import Checkerboard, Tag
 
-sys.path[:0] = [str(REPOSITORY / "tests" / part) for part in ("vision", "pipeline")]
+sys.path[:0] = [str(REPOSITORY / "tests" / part) for part in ("vision", "runs")]
 import rendered  # noqa: E402
 import synthetic_logs as made  # noqa: E402
 
@@ -58,7 +58,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gtsam_rwhec.pipeline.all_stages.plot_all", lambda *_: [])
+    monkeypatch.setattr("gtsam_rwhec.runs.all_stages.plot_all", lambda *_: [])
 
 
 def poses_of(folder: Path) -> list[Path]:

@@ -1,11 +1,9 @@
 """What starting does not bring in. How long it takes is in benchmarks/start_time.py."""
 
 from __future__ import annotations
-
 import json
 import subprocess
 import sys
-
 import pytest
 
 HEAVY = {
@@ -46,5 +44,5 @@ def test_solving_brings_in_no_images_and_no_files() -> None:
 
 
 def test_vision_brings_in_no_drawing_and_no_downloads() -> None:
-    code = "import gtsam_rwhec as rw\nrw.vision.Detector, rw.pipeline.calibrate_log"
+    code = "import gtsam_rwhec as rw\nrw.vision.Detector, rw.runs.calibrate_log"
     assert brought_in(code).isdisjoint({"matplotlib", "requests", "scipy.optimize"})

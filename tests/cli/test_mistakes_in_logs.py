@@ -15,7 +15,7 @@ from given_commands import command
 from places import DEMO, REPOSITORY
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(REPOSITORY / "tests" / "pipeline"))
+sys.path.insert(0, str(REPOSITORY / "tests" / "runs"))
 import synthetic_logs as made
 
 Change = Callable[[Path], object]
@@ -29,7 +29,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gtsam_rwhec.pipeline.all_stages.plot_all", lambda *_: [])
+    monkeypatch.setattr("gtsam_rwhec.runs.all_stages.plot_all", lambda *_: [])
 
 
 def moved(message: made.Message) -> made.Message:

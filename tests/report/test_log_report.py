@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.report.log_report import log_sentences
 from gtsam_rwhec.results.log_history import TrackCount
+from gtsam_rwhec.results.removed_measurements import RemovalReason
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 

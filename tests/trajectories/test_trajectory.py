@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import odometry_gates, synchronise, thin, without_fast
+from gtsam_rwhec.runs import synchronise, thin, without_fast
 from gtsam_rwhec.trajectories import Trajectory
 
 TWIST = np.array([0.4, -0.2, 0.7, 0.3, 0.1, -0.5])
@@ -104,18 +104,3 @@ def test_standstill_is_thinned_to_one() -> None:
     # Turning on the spot is motion.
     turning = se3.expmap(np.arange(10)[:, None] * np.array([0, 0, 0.02, 0, 0, 0]))
     assert thin(turning, np.arange(10)).mask.all()
-
-
-def test_odometry_gates_are_the_papers() -> None:
-    T = se3.expmap(np.arange(20)[:, None] * np.array([0, 0, 0.05, 0.02, 0, 0]))
-    stamps = np.arange(20) * 5 * 10**7
-    assert odometry_gates(T, T, stamps, stamps).mask.all()
-    jumped, late = T.copy(), stamps.copy()
-    jumped[10, 0, 3] += 0.5
-    late[5] += 2 * 10**8
-    kept = odometry_gates(T, jumped, stamps, late)
-    assert kept.counts == {"stamps apart (s)": 1, "step of the second sensor (m)": 2}
-    assert np.flatnonzero(~kept.mask).tolist() == [5, 10, 11]
-    turned = T.copy()
-    turned[15] = turned[15] @ se3.expmap(np.array([[0.3, 0, 0, 0, 0, 0]]))[0]
-    assert "step of the first sensor (rad)" in odometry_gates(turned, T, stamps, stamps).counts

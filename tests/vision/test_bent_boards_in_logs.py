@@ -10,9 +10,9 @@ from rendered import pose, printed, render
 
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.pipeline.estimated_intrinsics import estimate_intrinsics
-from gtsam_rwhec.pipeline.folder_log import write_folder_log
 from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.runs.estimated_intrinsics import estimate_intrinsics
+from gtsam_rwhec.runs.folder_log import write_folder_log
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.detection import Detector
 from gtsam_rwhec.vision.rejection import Rejection

@@ -12,11 +12,11 @@ from rendered import pose, printed, render
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.pipeline.causes_in_words import of_rejections, of_size
-from gtsam_rwhec.pipeline.detected_source import detect_source
-from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.runs.causes_in_words import of_rejections, of_size
+from gtsam_rwhec.runs.detected_source import detect_source
+from gtsam_rwhec.runs.sensor_detections import SensorDetections
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Tag, Target

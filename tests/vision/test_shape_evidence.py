@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rendered import pose, projected
 
-from gtsam_rwhec.pipeline.doubted_shapes import hypotheses_of
+from gtsam_rwhec.runs.doubted_shapes import hypotheses_of
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.shape_evidence import BoardView, ShapeEvidence, evidence_of_shape
 from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid

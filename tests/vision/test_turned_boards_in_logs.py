@@ -12,10 +12,10 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import LogWriter, open_log
-from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
-from gtsam_rwhec.pipeline.image_detections import detect_in_log
-from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.image_detections import detect_in_log
+from gtsam_rwhec.runs.intrinsics import read_intrinsics
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Checkerboard
 

@@ -1,0 +1,317 @@
+"""All stages, one after the other: from a log and a rig file to a folder with the calibration in every form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.export import export_all
+from gtsam_rwhec.export.files import FILES, FOLDERS
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.logs.mcap_writer import Images
+from gtsam_rwhec.results.written_result import write_calibration
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.changed_rig import changes
+from gtsam_rwhec.runs.cleaning_stage import clean_log
+from gtsam_rwhec.runs.detection_inputs import inputs_of
+from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.earlier_output import OutputFolder, list_written, log_name, output_folder, remove_unchanged
+from gtsam_rwhec.runs.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
+from gtsam_rwhec.runs.image_detections import image_count
+from gtsam_rwhec.runs.image_options import check_image_options
+from gtsam_rwhec.runs.intrinsics import check_intrinsics_files
+from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.log_contract import (
+    CLEAN_LOG,
+    CLEANING_METADATA,
+    DETECTED_LOG,
+    PLOTS_FOLDER,
+    RECORDED_LOG,
+    RESULT_FILE,
+    SEEN_SHEET,
+    is_from_stage,
+)
+from gtsam_rwhec.runs.log_metadata import read_embedded_rig, read_metadata
+from gtsam_rwhec.runs.log_report import write_report
+from gtsam_rwhec.runs.output_paths import INSIDE, LEFT, check_is_not_read, made_folder, made_output_folder
+from gtsam_rwhec.runs.samples_log import is_file_of_samples, write_samples_log
+from gtsam_rwhec.runs.seen_in_log import Pictures
+from gtsam_rwhec.runs.solution_frames import frames_of
+from gtsam_rwhec.runs.solution_plots import plot_all
+from gtsam_rwhec.runs.solved_log import read_solved, write_solved
+from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
+from gtsam_rwhec.vision.camera import Camera
+
+#: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
+OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """The options of `calibrate_log` that all its roads share."""
+
+    images: Images
+    workers: int | None
+    anyway: bool
+    report_images: bool
+
+
+@one_blas_thread()
+def calibrate_log(
+    log_path: str | Path | list[str | Path],
+    rig: Rig | None,
+    out: str | Path,
+    *,
+    images: Images = "leave_out",
+    workers: int | None = None,
+    anyway: bool = False,
+    replace: bool = True,
+    report_images: bool = True,
+    progress: Progress | None = None,
+) -> Calibrated:
+    """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
+
+    The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
+    ``camchain.yaml``, ``cameras.opencv.yaml``, ``cameras.txt`` (COLMAP's), ``camera_info/`` (ROS's, one file a camera),
+    ``seen.png`` (a contact sheet of the images), ``plots/``, and ``report.html`` with its ``evidence.json``. For a log
+    that a stage wrote, only the stages after it run. A cleaned log is cleaned again if the settings for cleaning in
+    `rig` differ from those that the log was cleaned with.
+
+    During the work the folder has the detections so far. A run that was interrupted, or killed, goes on from them when
+    it is started again: what it finds is the same as without the interruption. Images, sensors, targets and options of
+    detection must be the same; the rest of the rig file may change.
+
+    Parameters
+    ----------
+    log_path
+        As for ``open_log``; or, for a rig file with poses in files (``frames``), a folder of images, from which its
+        paths then start, or a file of samples of a hand-eye tool.
+    rig : Rig or None
+        None: the rig file embedded in a log that a stage wrote.
+    out
+        The folder; it is made if it does not exist.
+    images : "copy" or "leave_out"
+        Whether ``clean.mcap`` has the images too.
+    workers : int, optional
+        Threads, and for long logs processes, for detection; by default one for each core.
+    anyway : bool
+        As for `export_solved`.
+    replace : bool
+        Whether a finished calibration in the folder, or an unfinished run of other inputs, is replaced: by default yes,
+        so that a script can be run again. False refuses both, as the command does without ``--force``. In either case
+        an unfinished run of the same inputs is gone on with, and only files that a calibration wrote are replaced: a
+        folder with other files, and without a calibration, is refused.
+    report_images : bool
+        Whether ``report.html`` shows images. They may be confidential, as the contact sheet ``seen.png`` then is.
+    progress : callable, optional
+
+    Raises
+    ------
+    OptionError
+        `workers` is given, and no images will be searched; or ``images="copy"``, and the log has none.
+    LogError
+        The folder is not free for this calibration; nothing was changed.
+    RwhecError
+        As each stage does.
+    """
+    if rig is not None and rig.is_of_odometries:
+        raise LogError(
+            f"{rig.source.place(('sensors',))}: no sensor sees a target, and each knows only its own motion; calibrate "
+            "with rw.runs.calibrate_odometry_log"
+        )
+    check_is_no_other_folder(log_path, rig)
+    choices = _Choices(images, workers, anyway, report_images)
+    if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):
+        source = Path(str(log_path))
+        return _calibrate_files(source, rig, out, choices, replace=replace, progress=progress)
+    with open_log(log_path) as log:
+        files = [file.path for file in log.files]
+        is_raw = not is_from_stage(log)
+        if is_raw:
+            if rig is None:
+                raise LogError(
+                    f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one"
+                )
+            check_is_not_read(log, Path(out) / DETECTED_LOG)
+            check_is_not_read(log, Path(out) / CLEAN_LOG)
+            sources = tuple(file.name for file in files)
+        else:
+            _check_is_alone(log)
+            sources = read_metadata(log).detection.sources
+        check_image_options(log, rig if is_raw else None, images=images, workers=workers)
+        is_cleaned = CLEANING_METADATA in log.metadata() and (
+            rig is None or not changes(read_embedded_rig(log), rig).cleaning
+        )
+    with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
+        if is_raw:
+            assert rig is not None
+            return _from_raw(files, rig, output, choices, progress=progress)
+        output.begin()
+        pictures = Pictures(tuple(files), files[0].parent / SEEN_SHEET, choices.report_images)
+        return _from_stage(
+            files[0], rig, output.path, files, pictures, choices, is_cleaned=is_cleaned, progress=progress
+        )
+
+
+def _from_raw(
+    files: list[Path],
+    rig: Rig,
+    output: OutputFolder,
+    choices: _Choices,
+    folder: Path | None = None,
+    *,
+    progress: Progress | None,
+) -> Calibrated:
+    """All stages; `folder` is the one whose images the log has, if it is of a folder."""
+
+    def keep(log: Log, cameras: Mapping[str, Camera]) -> KeptDetections:
+        return output.kept_detections(inputs_of(log, rig, cameras, folder), image_count(log, rig))
+
+    detected = output.path / DETECTED_LOG
+    sheet = output.path / SEEN_SHEET
+    before = _version(sheet)
+    detect_log(
+        list(files),
+        rig,
+        detected,
+        images=choices.images,
+        workers=choices.workers,
+        sheet=sheet,
+        progress=progress,
+        keep=keep,
+    )
+    sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
+    # A driver's log has no sheet, and that of an earlier calibration is not its own.
+    pictures = Pictures(tuple(files), sheet if _version(sheet) != before else None, choices.report_images)
+    return _from_stage(detected, rig, output.path, sources, pictures, choices, is_cleaned=False, progress=progress)
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """What tells a file that was written anew from the one before; None where there is none."""
+    stat = path.stat() if path.is_file() else None
+    return None if stat is None else (stat.st_ino, stat.st_mtime_ns)
+
+
+def _from_stage(
+    source: Path,
+    rig: Rig | None,
+    out: Path,
+    sources: list[Path],
+    pictures: Pictures,
+    choices: _Choices,
+    *,
+    is_cleaned: bool,
+    progress: Progress | None,
+) -> Calibrated:
+    """The stages after the one that wrote the log; the measurements come from the files `sources`."""
+    if not is_cleaned:
+        clean_log(source, out / CLEAN_LOG, rig, images=choices.images, progress=progress)
+        source = out / CLEAN_LOG
+    calibrated = solve_into(source, rig, out, images=choices.images, progress=progress)
+    export_solved(out / CLEAN_LOG, out, anyway=choices.anyway, progress=progress)
+    report = write_report(calibrated, out, sources, pictures, progress)
+    list_written(out, calibrated.log.detection.sources, report)
+    return calibrated
+
+
+def _calibrate_files(
+    source: Path, rig: Rig, out: str | Path, choices: _Choices, *, replace: bool, progress: Progress | None
+) -> Calibrated:
+    """As `calibrate_log`, by way of a log of a folder's images or of samples, which is removed at the end."""
+    has_images = source.is_dir()
+    if has_images:
+        rig = rig.model_copy(update={"folder": source})
+    check_intrinsics_files(rig)  # before anything is copied
+    name = f"{source.resolve().name}{RECORDED_LOG}"
+    with output_folder(out, name, replace=replace) as output:
+        recorded = output.path / name
+        output.begin()
+        try:
+            if has_images:
+                write_folder_log(source, rig, recorded, progress=progress)
+            else:
+                (progress or silent)(write_samples_log(source, rig, recorded))
+            folder = source if has_images else None
+            return _from_raw([recorded], rig, output, choices, folder, progress=progress)
+        finally:
+            recorded.unlink(missing_ok=True)
+
+
+def _check_is_alone(log: Log) -> None:
+    """Refuse a log of a stage that is one of several files."""
+    if len(log.files) > 1:
+        raise LogError(
+            f"{', '.join(str(file.path) for file in log.files[:10])}: a stage wrote at least one of these files; give "
+            "that file alone, or only raw logs"
+        )
+
+
+def solve_into(
+    clean_path: str | Path,
+    rig: Rig | None,
+    out: str | Path,
+    *,
+    images: Images = "copy",
+    progress: Progress | None = None,
+) -> Calibrated:
+    """Solve from a cleaned log; write ``result.json``, and ``clean.mcap`` with the solution, into a folder.
+
+    Raises
+    ------
+    RwhecError
+        As `solve_log` does.
+    """
+    out = made_output_folder(out)
+    calibrated = solve_log(clean_path, rig, progress=progress)
+    write_calibration(calibrated.calibration, out / RESULT_FILE, calibrated.log)
+    write_solved(clean_path, calibrated, out / CLEAN_LOG, images=images)
+    list_written(out, calibrated.log.detection.sources, [out / RESULT_FILE, out / CLEAN_LOG])
+    return calibrated
+
+
+@one_blas_thread()
+def export_solved(
+    solved_path: str | Path, out: str | Path, *, anyway: bool = False, progress: Progress | None = None
+) -> list[Path]:
+    """Write the files for other programs, and plots, from a solved log into a folder; return their paths.
+
+    Poses that are not to be used get plots only, and no files for other programs: those of an earlier calibration in
+    this folder are removed.
+
+    Parameters
+    ----------
+    solved_path
+        The log that ``solve_into`` wrote.
+    out
+        The folder; it is made if it does not exist.
+    anyway : bool
+        Whether to write the files of poses that are not to be used too, each with the reason as a comment in its head.
+    progress : callable, optional
+
+    Raises
+    ------
+    LogError
+        The log has no solution.
+    FileFormatError
+        A file cannot be written.
+    """
+    out = made_folder(out)
+    tell = progress or silent
+    tell("exporting")
+    solved = read_solved(solved_path)
+    written = []
+    if solved.judgement.verdict is Verdict.DO_NOT_USE and not anyway:
+        for name in FILES:
+            (out / name).unlink(missing_ok=True)
+    else:
+        written = export_all(frames_of(solved), out)
+    tell("plotting")
+    written += plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))
+    remove_unchanged(out, INSIDE, keep=written)
+    list_written(out, solved.log.detection.sources, written)
+    return written

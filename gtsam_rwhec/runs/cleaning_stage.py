@@ -1,0 +1,204 @@
+"""The second stage: from detections and the carriers' motion to a log of synchronised pairs (A, B)."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import LogError, LogWarning, StampError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.logs.mcap_writer import Images
+from gtsam_rwhec.results.log_history import CleaningReport
+from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.changed_rig import rig_for_cleaning
+from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
+from gtsam_rwhec.runs.log_contract import topics_up_to_detection
+from gtsam_rwhec.runs.log_metadata import read_metadata
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, write_pairs
+from gtsam_rwhec.runs.odometry_cleaning import odometry_steps
+from gtsam_rwhec.runs.odometry_pairs import odometry_pairs
+from gtsam_rwhec.runs.odometry_tracks import read_odometry, write_files
+from gtsam_rwhec.runs.output_paths import check_writable
+from gtsam_rwhec.runs.pair_consensus import ConsensusOptions, find_consensus
+from gtsam_rwhec.runs.synchronised_tracks import synchronise, thin, without_fast
+from gtsam_rwhec.runs.tracks import Track, read_tracks
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+#: Nanoseconds. The carriers' speed at a stamp is measured from this time before it to this time after it.
+SPEED_STEP_NS = 20_000_000
+
+
+@one_blas_thread()
+def clean_log(
+    detected_path: str | Path,
+    out_path: str | Path,
+    rig: Rig | None = None,
+    *,
+    images: Images = "copy",
+    progress: Progress | None = None,
+) -> CleaningReport:
+    """Synchronise detections with the carriers' poses, clean them, and write a log with the pairs.
+
+    The messages of the detected log are copied. The stage adds the topics ``/calibration/<sensor>/pairs``: a measured
+    pair (A, B) for every detection with a pose, and the reason if it is not used.
+
+    Parameters
+    ----------
+    detected_path
+        The log that ``detect_log`` wrote.
+    out_path
+        The MCAP file to write; may be `detected_path`.
+    rig : Rig, optional
+        By default the rig file embedded in the log.
+    images : "copy" or "leave_out"
+        Whether the written log has the images of the detected log.
+    progress : callable, optional
+
+    Raises
+    ------
+    LogError, StampError, TransformError
+        The log has no detections or no carriers' poses; its clocks have no time in common; the motion does not
+        determine a time offset of any sensor; or no measurement is left.
+
+    Warns
+    -----
+    LogWarning
+        The motion does not determine the time offset of a sensor; the others are cleaned without it.
+    """
+    tell = progress or silent
+    check_writable(out_path)
+    with open_log(detected_path) as log:
+        rig = rig_for_cleaning(log, rig)
+        metadata = read_metadata(log)
+        tell("reading the carriers' poses")
+        motion = read_carrier_motion(log, rig)
+        path = motion.trajectory
+        pairs: list[MeasuredPairs] = []
+        offsets_s: dict[str, float] = {}
+        sigmas_s: dict[str, float] = {}
+        unknown: dict[str, StampError] = {}
+        for sensor in rig.sensors:
+            tell(f"synchronising {sensor}")
+            tracks = read_tracks(log, rig, sensor)
+            try:
+                offsets_s[sensor], sigma_s = _time_offset(rig, sensor, path, tracks)
+            except StampError as error:  # the other sensors have an answer without this one
+                unknown[sensor] = error
+                pairs += [clean_track(track.without(RemovalReason.CLOCK_UNKNOWN), path, rig, 0.0) for track in tracks]
+                continue
+            if sigma_s is not None:
+                sigmas_s[sensor] = sigma_s
+            _check_overlap(tracks, path, sensor, offsets_s[sensor])
+            pairs += [clean_track(track, path, rig, offsets_s[sensor]) for track in tracks]
+        if rig.is_of_odometries:
+            assert rig.reference is not None
+            reference = read_odometry(log, rig, rig.reference)
+            for sensor, section in rig.odometries.items():
+                tell(f"cleaning {sensor}")
+                pairs.append(odometry_steps(log, rig, reference, sensor))
+                offsets_s[sensor] = 0.0 if section.time_offset == "estimate" else float(section.time_offset)
+        for sensor in (name for name in rig.odometries if name != rig.reference and not rig.is_of_odometries):
+            tell(f"comparing the motions of {sensor}")
+            motions, offsets_s[sensor], sigma_s = odometry_pairs(log, rig, sensor, motion)
+            if sigma_s is not None:
+                sigmas_s[sensor] = sigma_s
+            pairs.append(motions)
+        report = CleaningReport(
+            tracks=tuple(measured.count for measured in pairs), time_offsets_s=offsets_s, coarse_sigma_s=sigmas_s
+        )
+        if not any(track.used for track in report.tracks):
+            if unknown:
+                raise next(iter(unknown.values()))
+            raise LogError(
+                f"{log.files[0].path}: no measurement is left after cleaning. {'; '.join(map(str, report.tracks))}."
+            )
+        for why in unknown.values():
+            warnings.warn(f"none of the measurements is used of {why}", LogWarning, stacklevel=3)
+        tell("writing pairs")
+        with LogWriter(out_path) as out:
+            out.copy(log, topics_up_to_detection(log), images)
+            write_files(out, log, rig)
+            write_pairs(out, pairs)
+            replace(metadata, rig=rig, cleaning=report).write(out)
+    return report
+
+
+def clean_track(track: Track, path: Trajectory, rig: Rig, offset_s: float) -> MeasuredPairs:
+    """Synchronise a track with the carriers' path, and give a reason to each measurement that is not used."""
+    options = rig.cleaning
+    A, kept = synchronise(
+        path, track.stamps_ns, time_offset_s=offset_s, max_gap_s=rig.carriers.max_gap_s, needs_overlap=False
+    )
+    pairs = MeasuredPairs(**vars(track), A=A).marked(kept, np.arange(len(A)))
+    stamps = pairs.stamps_ns
+    if options.max_rotation_deg_s is not None or options.max_translation_m_s is not None:
+        at = np.flatnonzero(pairs.used)
+        turning, moving = speeds(path, stamps[at] + round(1e9 * offset_s))
+        turning_limit_deg_s, moving_limit_m_s = (
+            np.inf if limit is None else limit for limit in (options.max_rotation_deg_s, options.max_translation_m_s)
+        )
+        fast = without_fast(
+            turning,
+            moving,
+            stamps[at],
+            max_turning_rad_s=float(np.radians(turning_limit_deg_s)),
+            max_moving_m_s=moving_limit_m_s,
+        )
+        pairs = pairs.marked(fast, at)
+    if options.thin:
+        at = np.flatnonzero(pairs.used)
+        moved = thin(
+            A[at],
+            stamps[at],
+            min_rotation_rad=float(np.radians(options.min_rotation_deg)),
+            min_translation_m=1e-3 * options.min_translation_mm,
+        )
+        pairs = pairs.marked(moved, at)
+    at = np.flatnonzero(pairs.used)
+    if len(at) == 1 or (options.consensus and len(at)):  # nothing can validate a single measurement
+        found = find_consensus(A[at], pairs.B[at], stamps[at], ConsensusOptions(scale_known=rig.sizes == "known"))
+        pairs = pairs.marked(found.kept, at)
+    return pairs
+
+
+def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
+    """How fast the carriers turn (rad/s) and move (m/s) at stamps (N,), by central differences of their path."""
+    before, _ = path.at(stamps_ns - SPEED_STEP_NS)
+    after, _ = path.at(stamps_ns + SPEED_STEP_NS)
+    step = se3.inverse(before) @ after
+    seconds = 2e-9 * SPEED_STEP_NS
+    return (
+        np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1) / seconds,
+        np.linalg.norm(step[:, :3, 3], axis=1) / seconds,
+    )
+
+
+def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -> tuple[float, float | None]:
+    """A sensor's time offset, as stated or estimated from rotations, and an estimate's standard deviation."""
+    given = rig.sensors[sensor].time_offset
+    if given != "estimate":
+        return float(given), None
+    usable = [(track.stamps_ns[track.used], track.B[track.used]) for track in tracks if track.used.sum() >= 2]
+    if not usable:
+        raise StampError(
+            f"{sensor}: no target was seen twice, and without this the time offset cannot be estimated; state "
+            "time_offset in the rig file"
+        )
+    found = offset_of_either_direction(path, usable, rig.carriers.max_gap_s, sensor)
+    return found.offset_s, found.sigma_s
+
+
+def _check_overlap(tracks: list[Track], path: Trajectory, sensor: str, offset_s: float) -> None:
+    """Refuse a sensor if all its stamps are outside the carriers' path. A single target may be outside."""
+    if tracks:
+        stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
+        synchronise(path, stamps, time_offset_s=offset_s, where=sensor)

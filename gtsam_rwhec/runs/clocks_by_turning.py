@@ -1,0 +1,99 @@
+"""Clocks of sensors from whole rotations: those to be estimated, and those that the rig file states.
+
+Rotations tell an offset before anything is calibrated, however large it is. So they find offsets first, and contradict
+stated ones that a calibration with large residuals would hide. Poses of the carriers that are exchanged turn the other
+way, and agree at no offset; their offset is found along the inverse path, so that the next stage can name the exchange.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.errors import StampError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
+from gtsam_rwhec.trajectories.time_offset import TimeOffset, estimate_time_offset
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+#: Rotations of one target by one sensor: stamps (M,), B (M, 4, 4).
+Detections = tuple[np.ndarray, Array]
+#: Rotations that agree to this, rad, about each axis are those of a sensor: another direction need not be tried.
+PLAIN_RAD = np.radians(2.0)
+#: From this offset on, s, and from so many standard deviations on, rotations contradict a stated one. Smaller ones are
+#: the calibration's to find, which knows the noise better.
+LATE_S, SURELY = 0.03, 8.0
+#: The other direction of the carriers' path must fit better by this factor.
+FAR_BETTER = 2.0
+
+
+def offset_of_either_direction(
+    path: Trajectory, tracks: Sequence[Detections], max_gap_s: float, sensor: str
+) -> TimeOffset:
+    """The time offset of a sensor, along the carriers' path or, if that fits far better, along its inverse.
+
+    Raises `StampError` if the motion determines no offset in either direction.
+    """
+    found, why = _offset(path, tracks, max_gap_s, sensor)
+    if found is not None and found.rms_rad < PLAIN_RAD:
+        return found
+    other, _ = _offset(replace(path, T=se3.inverse(path.T)), tracks, max_gap_s, sensor)
+    if other is not None and other.rms_rad < PLAIN_RAD and (found is None or _is_far_better(other, found)):
+        return other
+    if found is None:
+        assert why is not None
+        raise why
+    return found
+
+
+def late_clocks(
+    pairs: Mapping[Pair, MeasuredPairs], path: Trajectory, rig: Rig, stated_s: Mapping[str, float]
+) -> list[Finding]:
+    """The clocks whose offsets the rig file states, and whose rotations agree with the carriers' at another offset.
+
+    Parameters
+    ----------
+    pairs : dict of (target, sensor) to MeasuredPairs
+        Without marks of outliers.
+    path : Trajectory
+        T_sensorcarrier_targetcarrier over time.
+    rig : Rig
+    stated_s : dict of sensor to float
+        The stated offsets, seconds.
+    """
+    findings = []
+    for sensor, stated in stated_s.items():
+        tracks = [(m.stamps_ns[m.used], m.B[m.used]) for m in pairs.values() if m.sensor == sensor and m.used.any()]
+        if not tracks:
+            continue
+        found, _ = _offset(path, tracks, rig.carriers.max_gap_s, sensor)
+        if found is None or found.rms_rad > PLAIN_RAD:
+            continue  # the motion does not tell, or other things are wrong
+        off = found.offset_s - stated
+        if abs(off) > LATE_S and abs(off) > SURELY * found.sigma_s:
+            words = (
+                f"the time offset of {sensor} is {stated:g} s in the rig file, but its rotations agree with the "
+                f"carriers' at {1e3 * found.offset_s:+.1f} ms, to +-{1e3 * found.sigma_s:.1f} ms "
+                f"({rig.source.place(('sensors', sensor, 'time_offset'))}: write time_offset: estimate)"
+            )
+            findings.append(Finding(Ground.LATE_CLOCK, words))
+    return findings
+
+
+def _offset(
+    path: Trajectory, tracks: Sequence[Detections], max_gap_s: float, sensor: str
+) -> tuple[TimeOffset | None, StampError | None]:
+    try:
+        return estimate_time_offset(path, tracks, max_gap_s=max_gap_s, where=sensor), None
+    except StampError as error:
+        return None, error
+
+
+def _is_far_better(one: TimeOffset, other: TimeOffset) -> bool:
+    return FAR_BETTER * one.rms_rad < other.rms_rad and 2 * one.measurements > other.measurements

@@ -1,0 +1,48 @@
+"""Noise of targets and of odometries on one footing, before outliers are looked for in all measurements together.
+
+One variance factor is estimated for all measurements, so that their covariances must be right beside one another. Those
+of motions are found from what two motions have in common (`odometry_windows`); those of targets are found here, from
+the residuals of the targets alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.refined import PairNoise
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
+from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
+
+
+def with_comparable_noise(rounds: SolvingRounds, given: SynchronisedPairs) -> SynchronisedPairs:
+    """The pairs with covariances of the targets' poses as their own residuals have them.
+
+    They stay as they are where the rig file states the noise, where there is no odometry or no target, and where the
+    targets alone have no answer.
+    """
+    targets = {pair: one for pair, one in given.pairs.items() if not pair.is_motion and one.used.any()}
+    if rounds.rig.noise != "estimate" or not targets or not any(pair.is_motion for pair in given.pairs):
+        return given
+    rounds.progress("finding the noise of the targets' poses")
+    try:
+        noise = rounds.refined(replace(given, pairs=targets), (), "outliers").noise
+    except RwhecError:
+        return given  # all measurements together may have an answer, under weights that are guessed
+    found = {pair: _with_noise(one, noise[pair]) for pair, one in targets.items() if pair in noise}
+    return replace(given, pairs=given.pairs | found)
+
+
+def _with_noise(measured: MeasuredPairs, noise: PairNoise) -> MeasuredPairs:
+    """Covariances of the same shape whose median is that of the noise; of none, equal ones about and along all axes."""
+    variances = np.array([noise.rotation_rad**2] * 3 + [noise.translation_m**2] * 3)
+    if measured.covariance is None:
+        covariance: Array = np.tile(np.diag(variances), (len(measured.B), 1, 1))
+        return replace(measured, covariance=covariance)
+    diagonal = np.diagonal(measured.covariance[measured.used], axis1=1, axis2=2)
+    stated = np.repeat(np.median(diagonal.reshape(-1, 2, 3).mean(axis=2), axis=0), 3)
+    by = np.sqrt(variances / stated)
+    return replace(measured, covariance=by[:, None] * measured.covariance * by)

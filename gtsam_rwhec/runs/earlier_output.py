@@ -1,0 +1,349 @@
+"""What an output folder has before a calibration: an unfinished run, a finished one, or files of somebody else.
+
+The folder has a list of the files that were written into it, with a checksum of each: pictures and files for other
+programs do not say what they are from. One rule serves ``calibrate``, ``demo`` and Python:
+
+- A file that is not on the list, or was changed since, is never replaced.
+- A finished calibration is replaced only on request. An unfinished run is gone on with; one that ended with an error is
+  too, or begun anew where its inputs are other ones: they were mended.
+- Other files beside ours are refused, since the folder may be meant for something else; with a request to replace a
+  calibration that is there, they stay as they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict
+
+from gtsam_rwhec.errors import LogError, RwhecError
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.runs.detection_inputs import differences
+from gtsam_rwhec.runs.kept_detections import KeptDetections, kept_inputs
+from gtsam_rwhec.runs.log_contract import DETECTED_LOG, RECORDED_LOG
+from gtsam_rwhec.runs.output_paths import INSIDE, is_written, made_output_folder
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+#: The list of the written files, in the output folder.
+LIST_FILE = ".written.json"
+#: The detections so far, in the output folder. It is removed at the end.
+DETECTIONS = "detections.jsonl"
+#: A file that was half written when the run was killed: the name that it would have had.
+_PART = re.compile(r"\.(.+)\.\d+\.(?:part|trial)")
+#: Files that desktops leave in folders that were looked at.
+_OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
+#: A message names at most this many files.
+MOST_NAMED = 5
+
+#: "failed" is a run that ended with an error: who mended its inputs need not ask for a new start.
+State: TypeAlias = Literal["unfinished", "failed", "finished"]
+
+
+class _Written(BaseModel):
+    """The list of the written files."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    log: str
+    state: State = "finished"
+    sha256: dict[str, str]
+
+
+class OutputFolder:
+    """The output folder of a calibration while it is at work. `output_folder` makes it.
+
+    Attributes
+    ----------
+    path : Path
+    log : str
+        The name of the log, or of the folder, that is calibrated.
+    begins_anew : bool
+        Whether an unfinished run of other inputs is replaced.
+    """
+
+    def __init__(self, path: Path, log: str, before: _Written | None, *, replace: bool) -> None:
+        self.path = path
+        self.log = log
+        self.begins_anew = replace or (before is not None and before.state != "unfinished")
+        self._before = before
+        self._has_begun = False
+        self._kept: KeptDetections | None = None
+
+    def begin(self) -> None:
+        """Say in the folder's list that a run is at work, before its first file is written."""
+        if not self._has_begun:
+            earlier = self._before
+            if earlier is not None and earlier.state != "finished" and earlier.log.endswith(RECORDED_LOG):
+                (self.path / Path(earlier.log).name).unlink(missing_ok=True)
+            sums = {} if self._before is None else self._before.sha256
+            _write_list(self.path, _Written(log=self.log, state="unfinished", sha256=sums))
+            self._has_begun = True
+
+    def kept_detections(self, inputs: dict[str, str], total: int) -> KeptDetections:
+        """The detections that an interrupted run kept, if its inputs were the same; else none.
+
+        Raises
+        ------
+        LogError
+            The folder has an unfinished run of other inputs, and nobody asked to replace it.
+        """
+        file = self.path / DETECTIONS
+        earlier = kept_inputs(file)
+        other = "" if earlier is None else differences(earlier, inputs)
+        if other and not self.begins_anew:
+            self._has_begun = False  # the list stays as it was
+            raise LogError(
+                f"{self.path} has an unfinished run of other inputs, and nothing was changed: {other}. Put that back, "
+                "and the run goes on; or begin anew (--force; in Python replace=True), or give another folder"
+            )
+        self.begin()
+        self._kept = KeptDetections(file, inputs, total)
+        if earlier is None or other:
+            file.unlink(missing_ok=True)
+        else:
+            self._kept.go_on()
+        return self._kept
+
+    def end(self, error: BaseException | None, sources: Sequence[Path]) -> None:
+        """Bring the list up to date, and remove what only an unfinished run needs; `sources` stay."""
+        if self._kept is not None:
+            self._kept.close()
+        if isinstance(error, KeyboardInterrupt):
+            error.add_note(self._how_to_go_on())
+        with suppress(
+            *(() if error is None else (OSError, RwhecError))
+        ):  # the error itself is said, not what follows it
+            self._bring_list_up_to_date(error)
+        if error is None:
+            for name in (DETECTED_LOG, DETECTIONS):
+                if not _is_one_of(self.path / name, sources):
+                    (self.path / name).unlink(missing_ok=True)
+
+    def _bring_list_up_to_date(self, error: BaseException | None) -> None:
+        if self._has_begun:
+            state: State = "finished" if error is None else "failed" if isinstance(error, RwhecError) else "unfinished"
+            written = [name for name in _names_in(self.path) if is_written(name) and (self.path / name).is_file()]
+            if error is not None and not written and self._before is None and not (self.path / DETECTIONS).exists():
+                (self.path / LIST_FILE).unlink(missing_ok=True)
+            else:
+                sums = {name: _sha256(self.path / name) for name in written}
+                _write_list(self.path, _Written(log=self.log, state=state, sha256=sums))
+
+    def _how_to_go_on(self) -> str:
+        if self._kept is None or not self._kept.done:
+            return f"The same command starts again; {self.path} has no detections yet."
+        done = f"{self._kept.done:,} of {self._kept.total:,} images are done"
+        return f"The same command goes on from here: {done}, and kept in {self.path}."
+
+
+@contextmanager
+def output_folder(path: str | Path, log: str, *, replace: bool, sources: Sequence[Path] = ()) -> Iterator[OutputFolder]:
+    """Calibrate in the block: into a folder that is free for it, whose list is brought up to date at the end.
+
+    Parameters
+    ----------
+    path
+        It is made if it does not exist, and removed if an error ends the block before anything was written.
+    log : str
+        Name of the log or folder that is calibrated.
+    replace : bool
+        Whether a finished calibration, or an unfinished run of other inputs, is replaced.
+    sources : sequence of Path
+        The files of the log: one that is in the folder is not foreign.
+
+    Raises
+    ------
+    LogError
+        The folder is not free, another run is at work in it, or files cannot be written into it. Nothing was changed.
+    """
+    path = Path(path)
+    before = _check_is_free(path, log, replace=replace, sources=sources)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    made_output_folder(path)
+    output = OutputFolder(path, log, before, replace=replace)
+    error: BaseException | None = None
+    try:
+        with _alone_in(path):
+            try:
+                for name in _names_in(path):
+                    if _is_part(name, log):
+                        (path / name).unlink(missing_ok=True)
+                yield output
+            except BaseException as caught:
+                error = caught
+                raise
+            finally:
+                output.end(error, sources)
+    finally:
+        with suppress(OSError):  # what has files in it stays
+            for folder in made:
+                folder.rmdir()
+
+
+def earlier_run(path: str | Path) -> tuple[str, State] | None:
+    """The log of the run that wrote a folder's files, and how that run ended; None if there was none."""
+    written = _read_list(Path(path))
+    return None if written is None else (written.log, written.state)
+
+
+def log_name(sources: Sequence[str]) -> str:
+    """The name of a log of several files: those of all, as a list of written files has it."""
+    return ", ".join(sources)
+
+
+def list_written(folder: Path, sources: Sequence[str], files: Iterable[Path]) -> None:
+    """Put files that a stage wrote on the folder's list; `sources` are the files of the raw log."""
+    before = _read_list(folder) or _Written(log=log_name(sources), sha256={})
+    sums = {file.relative_to(folder).as_posix(): _sha256(file) for file in files if file.is_file()}
+    if sums:
+        _write_list(folder, before.model_copy(update={"sha256": before.sha256 | sums}))
+
+
+def remove_unchanged(folder: Path, inside: Collection[str], keep: Iterable[Path] = ()) -> None:
+    """Remove what a calibration wrote into some folders of a folder, where it is as it was written, but for `keep`.
+
+    A camera that has another name now has another file, and a picture of what is no more would be taken for one of now.
+    No file of others is removed.
+    """
+    written = _read_list(folder)
+    kept = {file.relative_to(folder).as_posix() for file in keep}
+    for name, sha256 in () if written is None else written.sha256.items():
+        if name.rpartition("/")[0] in inside and name not in kept and _is_as_written(folder / name, sha256):
+            (folder / name).unlink()
+    for name in inside:
+        with suppress(OSError):  # what has files in it stays
+            (folder / name).rmdir()
+
+
+def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[Path]) -> _Written | None:
+    """Refuse a folder that is not free for a calibration; return the list of what was written into it before."""
+    before = _read_list(folder)
+    there = _names_in(folder)
+    if before is not None and before.state == "finished" and not replace:
+        raise LogError(
+            f"{folder} has a finished calibration of {_named_log(before.log)}, and nothing was changed. Replace it "
+            "(--force; in Python replace=True), or give another folder"
+        )
+    is_going_on = before is not None and before.state != "finished"
+    others_of_ours = {LIST_FILE, DETECTIONS, *INSIDE}
+    if before is not None and is_going_on and before.log.endswith(RECORDED_LOG):
+        others_of_ours.add(before.log)
+    ours = {name for name in there if is_written(name) or name in others_of_ours}
+    own = {name for name in there if name in ours or _is_part(name, log) or _is_one_of(folder / name, sources)}
+    others = [name for name in there if name not in own]
+    if others and (before is None or not replace):
+        raise LogError(
+            f"{folder} has files that are not of a calibration, and nothing was changed: {_named(others)}. Give "
+            "another folder"
+        )
+    if before is not None and before.state == "unfinished" and before.log != log and not replace:
+        earlier = _named_log(before.log)
+        raise LogError(
+            f"{folder} has an unfinished run on {earlier}, which is not {_named_log(log)}, and nothing was changed. "
+            f"Give {earlier}, and the run goes on; or begin anew (--force; in Python replace=True), or give another "
+            "folder"
+        )
+    if not is_going_on:
+        listed = () if before is None else (LIST_FILE, DETECTIONS)
+        sums = {} if before is None else before.sha256
+        changed = [
+            name
+            for name in there
+            if name in ours and name not in listed and not _is_one_of(folder / name, sources)
+            and not _is_as_written(folder / name, sums.get(name))
+        ]  # fmt: skip
+        if changed:
+            raise LogError(
+                f"{folder} has files that no earlier calibration wrote there, or that were changed since, and nothing "
+                f"was changed: {_named(changed)}. Give another folder, or remove them"
+            )
+    return before
+
+
+def _names_in(folder: Path) -> list[str]:
+    """The names of all that is in a folder, and in its folders of ours."""
+    names = []
+    try:
+        for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if entry.name in INSIDE and entry.is_dir() and not entry.is_symlink():
+                names += [f"{entry.name}/{inside.name}" for inside in sorted(entry.iterdir())]
+            elif entry.name not in _OF_DESKTOPS:
+                names.append(entry.name)
+    except OSError as error:
+        raise LogError(f"{folder} cannot be read: {error.strerror}. Give another folder") from error
+    return names
+
+
+def _is_part(name: str, log: str) -> bool:
+    """Whether a file is what a killed run of ours left half written."""
+    folder, _, file = name.rpartition("/")
+    part = _PART.fullmatch(file)
+    whole = "" if part is None else f"{folder}/{part[1]}".lstrip("/")
+    return is_written(whole) or whole in (LIST_FILE, DETECTIONS, log)
+
+
+def _is_one_of(path: Path, sources: Sequence[Path]) -> bool:
+    """Whether a file is one of those that the log is read from."""
+    return any(os.path.realpath(path) == os.path.realpath(source) for source in sources)
+
+
+def _is_as_written(path: Path, sha256: str | None) -> bool:
+    try:
+        return path.is_file() and not path.is_symlink() and sha256 == _sha256(path)
+    except OSError:  # what cannot be read cannot be known as ours
+        return False
+
+
+def _named_log(log: str) -> str:
+    """A log's name for messages: that of the folder, if it is of one."""
+    return log.removesuffix(RECORDED_LOG)
+
+
+def _named(names: Sequence[str]) -> str:
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} others" if more > 0 else "")
+
+
+def _read_list(folder: Path) -> _Written | None:
+    try:
+        return _Written.model_validate_json((folder / LIST_FILE).read_bytes())
+    except (OSError, ValueError):
+        return None
+
+
+def _write_list(folder: Path, written: _Written) -> None:
+    write_atomically(folder / LIST_FILE, written.model_dump_json(indent=2).encode())
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder against other runs; the system gives it back when the process ends, however it ends."""
+    if fcntl is None:
+        yield
+        return
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise LogError(f"{folder}: another run is at work in this folder. Wait for it, or give another") from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(held)

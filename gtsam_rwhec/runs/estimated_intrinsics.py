@@ -1,0 +1,260 @@
+"""Intrinsics of sensors that state none (``intrinsics: estimate``), from their images of boards, before detection.
+
+Some of a sensor's images, spread over all of them, are searched with a pinhole in place of the camera that nobody
+knows: what detection tests in a board's plane holds for any focal length. A lens bends boards, and many are rejected
+then; a first camera from those that were read, or from the rejected ones if there are few, reads them in a second
+look, and searches the other images. The corners give the intrinsics, and detection in all images then has a camera as
+it always has. The same images give the same camera, so an interrupted run goes on from the images that it has detected.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gtsam_rwhec.errors import CameraError, LogError, LogWarning
+from gtsam_rwhec.files.progress import Counted, Progress
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import ImageRecord, Log
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion
+from gtsam_rwhec.runs.image_detections import check_usable, detections_of_sensor, message_count
+from gtsam_rwhec.runs.likely_causes import likely_causes
+from gtsam_rwhec.runs.seen_sheet import write_contact_sheet
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.detected import Detection, layouts_over_track
+from gtsam_rwhec.vision.detection import Detector
+from gtsam_rwhec.vision.image_sizes import Size, stated_size
+from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images
+from gtsam_rwhec.vision.rejection import Rejection
+from gtsam_rwhec.vision.tag_agreement import plane_coordinates
+from gtsam_rwhec.vision.targets import Target
+from gtsam_rwhec.vision.unknown_intrinsics import CORNERS, ENOUGH, EstimatedIntrinsics, Lens, estimated_intrinsics
+
+#: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
+FIRST, TIMES = 16, 4
+#: Images have the size that most of the first so many have.
+FOR_SIZE = 20
+#: From fewer views than this a first camera is made with those too that the lens bends too much for a pinhole.
+FEW = 6
+#: The focal length of a usual lens over the width.
+USUAL = 0.87
+#: These rejections are about poses, which need intrinsics.
+ABOUT_POSES = (Rejection.NO_POSE, Rejection.REPROJECTION, Rejection.GRAZING)
+
+
+@dataclass(frozen=True, eq=False)
+class NotEstimated:
+    """A sensor whose images determine no intrinsics: why not, what was searched with, and what was found."""
+
+    why: str
+    camera: Camera
+    images: list[DetectedImage]
+
+
+def estimate_intrinsics(
+    log: Log, rig: Rig, *, workers: int | None, progress: Progress
+) -> tuple[dict[str, EstimatedIntrinsics], dict[str, NotEstimated]]:
+    """The intrinsics of each sensor of the rig file that states none, and those sensors whose images determine none.
+
+    Raises `LogError` if a topic has no image whose size can be read.
+    """
+    found: dict[str, EstimatedIntrinsics] = {}
+    failed: dict[str, NotEstimated] = {}
+    for name, sensor in rig.sensors.items():
+        if sensor.images is None or sensor.intrinsics is None or sensor.intrinsics.estimate is None:
+            continue
+        size = _image_size(log, rig, name, sensor.images)
+        result = _of_images(log, rig, name, sensor.images, size, sensor.intrinsics.estimate, workers, progress)
+        if isinstance(result, NotEstimated):
+            failed[name] = result
+        else:
+            found[name] = result
+    return found, failed
+
+
+def in_words(sensor: str, found: EstimatedIntrinsics) -> str:
+    """What was estimated, for a report."""
+    K, camera = found.camera.K, found.camera
+    bent = ", ".join(f"{k:.4g}" for k in camera.D) if camera.D.any() else "none"
+    return (
+        f"No intrinsics of {sensor} are stated. Detection worked with a first estimate, from {found.views} views of "
+        f"boards in its images of {camera.width} x {camera.height} pixels: {camera.model}, "
+        f"fx, fy = {K[0, 0]:.1f}, {K[1, 1]:.1f}, cx, cy = {K[0, 2]:.1f}, {K[1, 2]:.1f}, distortion {bent}; "
+        f"{found.rms_px:.2f} px rms over {found.corners} corners. "
+        "If you have a calibration of this camera, state it in the rig file."
+    )
+
+
+def refuse_not_estimated(
+    log: Log, rig: Rig, failed: Mapping[str, NotEstimated], motion: CarrierMotion, sheet: str | Path | None
+) -> None:
+    """Raise `CameraError` for sensors whose images determine no intrinsics, with what their images show.
+
+    The contact sheet of the images that were searched is written first. Raises `LogError` if none can be used.
+    """
+    found = {
+        name: detections_of_sensor(log, rig, name, [_without_poses(image) for image in of.images], motion)
+        for name, of in failed.items()
+    }
+    check_usable(log, rig, found)
+    cameras = {name: of.camera for name, of in failed.items()}
+    has_sheet = sheet is not None and write_contact_sheet(Path(sheet), log, rig, cameras, found)
+    said = []
+    for name, of in failed.items():
+        said.append(
+            f"{rig.source.place(('sensors', name, 'intrinsics'))}: the intrinsics of {name} {of.why}. {len(of.images)} "
+            f"of its {message_count(log, rig.sensors[name].images)} images were searched. Or state intrinsics: a file, "
+            "a topic or numbers"
+        )
+    said += likely_causes(log, rig, cameras, found)
+    shown = f"\n{sheet} shows some of the images." if has_sheet else ""
+    raise CameraError("\n- ".join(said) + shown)
+
+
+def _of_images(
+    log: Log, rig: Rig, sensor: str, topic: str, size: Size, lens: Lens, workers: int | None, progress: Progress
+) -> EstimatedIntrinsics | NotEstimated:
+    """Search some images with a pinhole, and more, while there are too few boards, with what the boards so far say."""
+    total = message_count(log, topic)
+    camera = pinhole = _camera(size)
+    found: dict[int, DetectedImage] = {}
+    searched: set[int] = set()
+
+    def search(which: set[int]) -> None:
+        looked_at: list[int] = []
+
+        def images() -> Iterator[ImageRecord]:
+            for i, record in enumerate(_records(log, topic)):
+                if i in which:
+                    looked_at.append(i)
+                    yield record
+
+        done = len(searched - which)
+        words = f"estimating the intrinsics of {sensor}: image"
+        makers = {topic: partial(Detector, camera, rig.target_list, rig.detection_options)}
+        seen = detect_in_images(
+            images(), makers, workers=workers, progress=lambda n: progress(Counted(words, done + n, total))
+        )
+        found.update(zip(looked_at, list(seen), strict=False))  # in their order: they are of one topic
+
+    wanted = FIRST
+    while True:
+        which = set(np.linspace(0, total - 1, min(wanted, total)).round().astype(int).tolist()) - searched
+        searched |= which
+        search(which)
+        if camera is pinhole:
+            camera = _roughly(rig, found, size, lens) or pinhole
+            if camera is not pinhole:
+                search({i for i, image in found.items() if _rejected(image)})
+        if len(searched) == total or len(_views(rig, found)) >= ENOUGH:
+            break
+        wanted *= TIMES
+    views = _views(rig, found)
+    try:
+        return estimated_intrinsics([p for p, _ in views], [u for _, u in views], size, lens)
+    except CameraError as error:
+        why = str(error)
+    if not views and all(len(target.corners()) < CORNERS for target in rig.target_list):
+        why += ". The rig file has only single tags, whose four corners do not determine a camera: add a board"
+    return NotEstimated(why, camera, [found[i] for i in sorted(found)])
+
+
+def _roughly(rig: Rig, found: Mapping[int, DetectedImage], size: Size, lens: Lens) -> Camera | None:
+    """A camera from the boards that were read; if they are few, also from those that no pinhole would see so bent."""
+    views = _views(rig, found)
+    if len(views) < FEW:
+        views = _views(rig, found, (*ABOUT_POSES, Rejection.NOT_A_GRID))
+    try:
+        return estimated_intrinsics([p for p, _ in views], [u for _, u in views], size, lens).camera
+    except CameraError:
+        return None
+
+
+def _views(
+    rig: Rig, found: Mapping[int, DetectedImage], also: Sequence[Rejection] = ABOUT_POSES
+) -> list[tuple[Array, Array]]:
+    """Corners in their plane (n, 3) and pixels (n, 2) of every flat target that was read, in the images' order.
+
+    `also` are the rejections that do not matter.
+    """
+    views = []
+    images = [found[i].found for i in sorted(found)]
+    for target in rig.target_list:
+        flat = _flat(target)
+        if flat is None:
+            continue
+        track = [d for image in images if image for d in image.detections if d.target == target.name]
+        views += [
+            (flat[seen.indices], seen.corners_px)
+            for seen in layouts_over_track(track)
+            if (seen.rejection is None or seen.rejection in also) and len(seen.indices) >= CORNERS
+        ]
+    return views
+
+
+def _rejected(image: DetectedImage) -> bool:
+    """Whether a board in an image was rejected, but for its pose."""
+    seen = image.found.detections if image.found else ()
+    return any(d.rejection is not None and d.rejection not in ABOUT_POSES and len(d.indices) >= CORNERS for d in seen)
+
+
+def _flat(target: Target) -> Array | None:
+    """A target's corners (n, 3) in its plane, with z = 0; None where they lie in several planes."""
+    corners = target.corners()
+    if not corners[:, 2].any():
+        return corners
+    in_plane = plane_coordinates(corners.reshape(-1, 4, 3))
+    return None if in_plane is None else np.pad(in_plane.reshape(-1, 2), ((0, 0), (0, 1)))
+
+
+def _without_poses(image: DetectedImage) -> DetectedImage:
+    """The image without the rejections that intrinsics would have to be right for."""
+
+    def plain(seen: Detection) -> Detection:
+        return replace(seen, rejection=None) if seen.rejection in ABOUT_POSES else seen
+
+    if image.found is None:
+        return image
+    return replace(image, found=replace(image.found, detections=tuple(map(plain, image.found.detections))))
+
+
+def _camera(size: Size) -> Camera:
+    """A pinhole of a usual focal length whose axis is in the middle of the image."""
+    width, height = size
+    K = [[USUAL * width, 0.0, 0.5 * (width - 1)], [0.0, USUAL * width, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
+    return Camera.of(width, height, "pinhole", K, (), "in place of the camera")
+
+
+def _image_size(log: Log, rig: Rig, sensor: str, topic: str) -> Size:
+    """The size (width, height) of most of a topic's first images."""
+    sizes: Counter[Size] = Counter()
+    for record in _records(log, topic):
+        size = stated_size(record.data) if record.is_compressed else (record.width or 0, record.height or 0)
+        if size is not None and min(size) > 0:
+            sizes[size] += 1
+        if sizes.total() == FOR_SIZE:
+            break
+    if not sizes:
+        place = rig.source.place(("sensors", sensor, "intrinsics"))
+        raise LogError(
+            f"{place}: intrinsics are to be estimated, and {log.files[0].path}, topic {topic} has no image whose size "
+            "can be read"
+        )
+    return sizes.most_common(1)[0][0]
+
+
+def _records(log: Log, topic: str) -> Iterator[ImageRecord]:
+    """The images of a topic. Detection says later which messages cannot be read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LogWarning)
+        for record in log.records([topic]):
+            if not isinstance(record, ImageRecord):
+                raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
+            yield record

@@ -1,0 +1,275 @@
+"""Detection in the images of all cameras; a detection gets the one of its two poses that its whole track supports."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from functools import partial
+
+import numpy as np
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.progress import Counted, Progress, Remark
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
+from gtsam_rwhec.runs.causes_in_words import of_size
+from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.log_contract import IMAGES_METADATA, detections_topic, image_key
+from gtsam_rwhec.runs.sensor_detections import LookedAt, SensorDetections
+from gtsam_rwhec.vision.ambiguity import choose_over_time
+from gtsam_rwhec.vision.board_turns import Turns, choose_turns, turn_between, turned_detection
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.detected import layouts_over_track
+from gtsam_rwhec.vision.detection import Detection, Detector
+from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, measured_corner_px
+from gtsam_rwhec.vision.rejection import Rejection
+from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target
+
+#: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
+CHECKED_AFTER = (10, 100, 1000, 10_000)
+
+
+def detect_in_log(
+    log: Log,
+    rig: Rig,
+    cameras: Mapping[str, Camera],
+    motion: CarrierMotion,
+    *,
+    workers: int | None,
+    progress: Progress,
+    kept: KeptDetections | None = None,
+) -> dict[str, SensorDetections]:
+    """The detections of every sensor that has images; those that `kept` has are not detected again.
+
+    Raises `LogError` if a topic has other messages than images; `StampError` as `check_order`.
+    """
+    sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
+    images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}
+    for image in _detected(log, rig, cameras, sensor_of, workers=workers, progress=progress, kept=kept):
+        images[image.topic].append(image)
+    upright: dict[str, Turns] = {}
+    found = {}
+    for topic, sensor in sensor_of.items():
+        found[sensor] = detections_of_sensor(log, rig, sensor, images[topic], motion, upright)
+    return found
+
+
+def _detected(
+    log: Log,
+    rig: Rig,
+    cameras: Mapping[str, Camera],
+    sensor_of: Mapping[str, str],
+    *,
+    workers: int | None,
+    progress: Progress,
+    kept: KeptDetections | None,
+) -> Iterator[DetectedImage]:
+    """The detections of every image, in any order. Stamps are checked while images are read."""
+    if not sensor_of:
+        return
+    total = image_count(log, rig)
+    if kept is not None and kept.done:
+        progress(Remark(f"going on with an unfinished run: {kept.done:,} of {total:,} images are done"))
+        progress(Counted("detecting: image", kept.done, total))
+    if kept is not None and kept.is_whole:
+        yield from kept.all()
+        return
+    stamps: dict[str, list[int]] = defaultdict(list)
+
+    def images() -> Iterator[ImageRecord]:
+        for record in log.records(list(sensor_of)):
+            if not isinstance(record, ImageRecord):
+                raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
+            of_topic = stamps[record.topic]
+            of_topic.append(record.stamp_ns)
+            if len(of_topic) in CHECKED_AFTER:
+                check_order(np.array(of_topic, dtype=np.int64), f"topic {record.topic}")
+            yield record
+
+    makers = {
+        topic: partial(Detector, cameras[sensor], rig.target_list, rig.detection_options)
+        for topic, sensor in sensor_of.items()
+    }
+    yield from detect_in_images(
+        images(),
+        makers,
+        workers=workers,
+        kept=kept,
+        progress=lambda done: progress(Counted("detecting: image", done, total)),
+    )
+    for topic in sensor_of:
+        check_order(np.array(stamps[topic], dtype=np.int64), f"topic {topic}")
+    if kept is not None:
+        kept.finish()
+
+
+def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> None:
+    """Raise `LogError` if no image of a sensor can be used, with what is wrong with the first, and what to do."""
+    for sensor, of_sensor in found.items():
+        topic, faults = rig.sensors[sensor].images, of_sensor.faults
+        if topic is not None and len(faults) == of_sensor.count:
+            why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
+            raise LogError(
+                f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
+                f"be used; {why}{of_size(rig, sensor, why)}"
+            )
+
+
+def detections_of_sensor(
+    log: Log,
+    rig: Rig,
+    sensor: str,
+    images: list[DetectedImage],
+    motion: CarrierMotion,
+    upright: dict[str, Turns] | None = None,
+) -> SensorDetections:
+    """The detections in a sensor's images, in any order, each with the pose that its whole track supports.
+
+    `upright` has the first track of each board that looks the same turned, and gets this one if there is none.
+    """
+    images = sorted(images, key=lambda image: image.stamp_ns)
+    upright = {} if upright is None else upright
+    faults = _faults(log, images)
+    strangers: Counter[tuple[str, str]] = Counter()
+    tracks: dict[str, list[tuple[int, Detection]]] = defaultdict(list)
+    for image in images:
+        if image.found is not None:
+            strangers.update({(family, str(i)): n for (family, i), n in image.found.strangers.items()})
+            for detection in image.found.detections:
+                tracks[detection.target].append((image.stamp_ns, detection))
+    records: list[DetectionRecord] = []
+    corner_px: dict[str, float] = {}
+    for target in rig.target_list:
+        of_target, measured_px = _of_track(tracks[target.name], target, sensor, rig, motion, upright)
+        records += of_target
+        if measured_px is not None:
+            corner_px[f"{target.name}/{sensor}"] = measured_px
+    remarks = tuple(
+        f"{name} is {note}."
+        for name, track in tracks.items()
+        for note in dict.fromkeys(d.note for _, d in track if d.note and d.rejection is None)
+    )
+    looked_at = {image.stamp_ns: LookedAt(image.logged_ns, image.fault) for image in images}
+    return SensorDetections(records, len(images), strangers, faults, corner_px, remarks=remarks, images=looked_at)
+
+
+def _faults(log: Log, images: list[DetectedImage]) -> tuple[str, ...]:
+    """What is wrong with images; an image that was a file of a folder has its name in place of a stamp."""
+    names = log.metadata().get(IMAGES_METADATA, {})
+    faulty = [image for image in images if image.found is None]
+    stamped = [(image, f"topic {image.topic}, image at {image.stamp_ns} ns") for image in faulty]
+    return tuple(
+        image.fault.replace(words, names.get(image_key(image.topic, image.stamp_ns), words)) for image, words in stamped
+    )
+
+
+def _of_track(
+    track: list[tuple[int, Detection]],
+    target: Target,
+    sensor: str,
+    rig: Rig,
+    motion: CarrierMotion,
+    upright: dict[str, Turns],
+) -> tuple[list[DetectionRecord], float | None]:
+    """Each stamped detection of a target, with the pose that the whole track supports, and the corners' noise.
+
+    `upright` has the first track of each board that looks the same turned, and gets this one if there is none.
+    """
+    options = rig.detection_options
+    judged = layouts_over_track([detection for _, detection in track])
+    track = [(stamp_ns, detection) for (stamp_ns, _), detection in zip(track, judged, strict=True)]
+    chosen = [0] * len(track)
+    rejections = [detection.rejection for _, detection in track]
+    factor, corner_px = 1.0, None
+    good = [i for i, rejection in enumerate(rejections) if rejection is None]
+    if good:
+        detections = [track[i][1] for i in good]
+        squared = np.array([detection.squared_px for detection in detections])
+        corner_px = rig.corner_px or measured_corner_px(
+            squared[:, 0], np.array([len(detection.indices) for detection in detections])
+        )
+        factor = (corner_px / options.corner_px) ** 2
+        stamps = np.array([track[i][0] for i in good], dtype=np.int64)
+        carrier = motion.A_where_known(stamps, rig.carriers.max_gap_s)
+        sure_of_turn = np.full(len(good), np.inf)
+        if isinstance(target, (Checkerboard, CircleGrid)) and target.ways > 1:
+            detections, sure_of_turn = _turned(detections, target, carrier, corner_px, factor, upright)
+            track = track.copy()
+            for i, detection in zip(good, detections, strict=True):
+                track[i] = (track[i][0], detection)
+        choice = choose_over_time(
+            stamps,
+            np.array([detection.T for detection in detections]),
+            squared,
+            factor * np.array([detection.covariance for detection in detections]),
+            corner_px,
+            carrier,
+        )
+        surest = np.minimum(choice.margin, sure_of_turn)
+        for i, which, margin in zip(good, choice.which.tolist(), surest.tolist(), strict=True):
+            chosen[i] = which
+            rejections[i] = Rejection.AMBIGUOUS if margin < options.ambiguity_margin else None
+    records = []
+    for (stamp_ns, detection), which, rejection in zip(track, chosen, rejections, strict=True):
+        has_pose = bool(np.isfinite(detection.T[which]).all() and np.isfinite(detection.covariance[which]).all())
+        records.append(
+            DetectionRecord(
+                logged_ns=stamp_ns,
+                stamp_ns=stamp_ns,
+                topic=detections_topic(sensor),
+                frame=rig.frame_of(sensor),
+                family=target.family,
+                id=target.name,
+                corners_px=np.asarray(detection.corners_px, dtype=np.float64),
+                T_camera_tag=detection.T[which] if has_pose else None,
+                covariance=factor * detection.covariance[which] if has_pose else None,
+                size_m=target.length_m,
+                reprojection_px=float(detection.reprojection_px[which]) if has_pose else None,
+                reason=detection.reason(rejection),
+                corner_indices=tuple(detection.indices.tolist()),
+            )
+        )
+    return records, corner_px
+
+
+def _turned(
+    detections: list[Detection],
+    board: Checkerboard | CircleGrid,
+    carrier: Array,
+    corner_px: float,
+    factor: float,
+    upright: dict[str, Turns],
+) -> tuple[list[Detection], Array]:
+    """Detections of a board that looks the same turned, each the same way up in its frame, and how sure that is (n,).
+
+    The first sensor's first image says which way is up.
+    """
+    turns = choose_turns(
+        np.array([detection.T for detection in detections]),
+        factor * np.array([detection.covariance for detection in detections]),
+        np.array([detection.squared_px for detection in detections]),
+        corner_px,
+        carrier,
+        board.ways,
+    )
+    more, margin = 0, np.inf
+    if board.name in upright:
+        more, margin = turn_between(upright[board.name], turns, board.ways)
+    elif len(turns.R_A):
+        upright[board.name] = turns
+    which = (turns.which + more) % board.ways
+    turned = [turned_detection(*pair) for pair in zip(detections, [board] * len(which), which.tolist(), strict=True)]
+    return turned, np.minimum(turns.margin, margin)
+
+
+def image_count(log: Log, rig: Rig) -> int:
+    """How many images a log has for the sensors of a rig file, with those that cannot be read."""
+    topics = {source.images for source in rig.sensors.values() if source.images is not None}
+    return sum(topic.count for topic in log.topics() if topic.name in topics)
+
+
+def message_count(log: Log, topic: str | None) -> int:
+    """How many messages a topic has, with those that cannot be read."""
+    return sum(t.count for t in log.topics() if t.name == topic)

@@ -1,0 +1,214 @@
+"""What is found against a log beside what ``calibrate`` finds, and the lines of the rig file to change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gtsam_rwhec.calibration.misreadings import Misreading
+from gtsam_rwhec.calibration.moved_outliers import Measured, moved_with_outliers
+from gtsam_rwhec.calibration.reading import Reading
+from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.task_units import PointUncertainty
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.results.log_history import SizeFields
+from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
+
+#: A point that is known to this share of its distance only (with 95 %) is known to nothing.
+LARGEST_SHARE = 0.25
+#: Mistakes in rotations that angles of another convention look like, for poses without quaternions or matrices.
+OF_ROTATIONS = (Mistake.QUATERNION_ORDER, Mistake.TRANSPOSED, Mistake.HANDEDNESS)
+#: What to do about it.
+OTHER_ANGLES = (
+    "write the axes in the order of the turns, capitals for turning axes (ZYX: yaw, pitch, roll) and small letters for "
+    "fixed ones (xyz: roll, pitch, yaw), or rotation_vector"
+)
+#: Other sizes that are estimated, or other clocks, may look like these.
+NOT_OF_DIRECTIONS = (Mistake.UNIT, Mistake.SCALE, Mistake.ROWS_SHIFTED)
+
+
+def is_of_the_poses(misreadings: Sequence[Misreading]) -> bool:
+    """Whether poses were misread in a way that neither sizes nor clocks explain: then no round helps."""
+    return bool(misreadings) and all(one.mistake not in NOT_OF_DIRECTIONS for one in misreadings)
+
+
+def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading, ...]:
+    """The misreadings with the cure for a log: the line of the rig file to change, or the messages that are wrong.
+
+    Carriers that are exchanged in the rig file make A the inverse of what it says. For one target in one sensor that is
+    the same as B inverted, so this is not said beside it.
+    """
+    exchanged = [one for one in misreadings if _is_exchange(one, rig)]
+    said = [replace(one, likely=_exchange(rig), cure=_unless_carried(rig)) for one in exchanged[:1]]
+    is_B = [one.mistake is Mistake.INVERTED and bool(exchanged) for one in misreadings]
+    others = [one for one, left_out in zip(misreadings, is_B, strict=True) if one not in exchanged and not left_out]
+    if rig.carriers.poses.euler is not None and any(one.mistake in OF_ROTATIONS for one in others):
+        of_angles = next(one for one in others if one.mistake in OF_ROTATIONS)
+        return (*said, replace(of_angles, likely=_other_angles(rig), cure=OTHER_ANGLES))
+    return (*said, *(replace(one, cure=_cure(one, rig)) for one in others))
+
+
+def _is_exchange(misreading: Misreading, rig: Rig) -> bool:
+    """Whether exchanged carriers explain it. What this library detects in images is never inverted."""
+    if misreading.mistake is Mistake.INVERTED and "A is inverted" in misreading.likely:
+        return True
+    from_images = all(sensor.images is not None for sensor in rig.sensors.values())
+    return from_images and misreading.mistake in (Mistake.INVERTED, Mistake.ROLES_EXCHANGED)
+
+
+def _exchange(rig: Rig) -> str:
+    place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
+    return f"exchange `sensors` and `targets` in the rig file ({place})"
+
+
+def _other_angles(rig: Rig) -> str:
+    poses = rig.carriers.poses
+    return f"the files' angles are not euler: {poses.euler} ({rig.source.place(('carriers', 'poses', 'euler'))})"
+
+
+def _unless_carried(rig: Rig) -> str:
+    """The other cure, where the carriers are as the rig file says, and their poses are the inverse of what it says."""
+    carriers, place = rig.carriers, rig.source.place
+    parent, child = carriers.poses.parent_and_child
+    if carriers.poses.frames is not None:
+        key = place(("carriers", "poses"))
+        cure = f"the files have T_{child}_{parent}: write frames: [{child}, {parent}] ({key})"
+    elif carriers.poses.topic is not None:
+        key = place(("carriers", "poses", "parent"))
+        cure = f"topic {carriers.poses.topic} has poses of {parent} in {child}: exchange parent and child in {key}"
+    else:
+        cure = f"what publishes tf writes the inverse of T_{parent}_{child}"
+    return f"or, if {carriers.sensors} does carry the sensors, {cure}"
+
+
+def may_be_exchanged(rig: Rig, measurements: int) -> Finding:
+    """So few measurements that exchanged carriers, or another reading of the poses, would not show."""
+    place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
+    return Finding(
+        Ground.NO_COVARIANCE,
+        f"{measurements} measurements are too few to tell whether the poses were read right, and whether `sensors` and "
+        f"`targets` are exchanged ({place}): measure at 10 poses or more",
+    )
+
+
+def with_cures(findings: Sequence[Finding], before: tuple[Misreading, ...], rig: Rig) -> tuple[Finding, ...]:
+    """The findings, with the cures for a log in that of the misreadings."""
+    said, now = Reading(before).finding, Reading(in_rig_file(before, rig)).finding
+    return tuple(now if now is not None and finding == said else finding for finding in findings)
+
+
+def not_of_late_clocks(findings: Sequence[Finding], misreadings: Sequence[Misreading]) -> tuple[Finding, ...]:
+    """The findings without those that late clocks make, which rotations tell better: large residuals, shifted rows."""
+    made = {Ground.IMPLAUSIBLE, Ground.COVARIANCE_DOUBTED, Ground.LATE_CLOCK}
+    if all(one.mistake is Mistake.ROWS_SHIFTED for one in misreadings):
+        made.add(Ground.MISREAD)
+    return tuple(finding for finding in findings if finding.ground not in made)
+
+
+def not_of_marked_outliers(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The findings without measurements that look wrong: outliers were looked for, under each detection's own noise."""
+    return tuple(finding for finding in findings if finding.ground is not Ground.OUTLIERS_KEPT)
+
+
+def moved_of_left_out(
+    findings: Sequence[Finding], refined: Refined, pairs: Mapping[Pair, MeasuredPairs]
+) -> list[Finding]:
+    """A frame that was elsewhere when the outliers were measured; nothing where one is said to have moved already.
+
+    Where half of the measurements were left out, which half is right is open; how far apart both are is not.
+    """
+    if any(finding.ground is Ground.MOVED for finding in findings):
+        return []
+    measured = {}
+    for pair, one in pairs.items():
+        asked = one.used | np.array([reason == RemovalReason.OUTLIER for reason in one.reasons], dtype=bool)
+        measured[pair] = Measured(one.A[asked], one.B[asked], one.used[asked])
+    found = moved_with_outliers(refined, measured)
+    return [] if found is None else [Finding(Ground.MOVED, str(found))]
+
+
+def _cure(misreading: Misreading, rig: Rig) -> str:
+    place = rig.source.place
+    also = f"; {_exchange(rig)}" if "A is inverted" in misreading.likely else ""
+    if rig.carriers.poses.frames is not None and (cure := _cure_of_files(misreading.mistake, rig)):
+        return cure + also
+    if misreading.mistake is Mistake.INVERTED:
+        topics = ", ".join(sensor.detections for sensor in rig.sensors.values() if sensor.detections is not None)
+        return f"let the driver publish the target's pose in the sensor's frame (topics {topics})" if topics else (
+            misreading.cure
+        )  # fmt: skip
+    if misreading.mistake is Mistake.ROWS_SHIFTED:
+        lines = place(*(("sensors", name, "time_offset") for name in rig.sensors))
+        return f"write time_offset: estimate ({lines})"
+    if misreading.mistake is Mistake.SCALE:
+        return (
+            f"measure the targets again ({place(('targets',))}), or write sizes: estimate; or the carriers' unit of "
+            "length or the focal lengths are wrong"
+        )
+    if misreading.mistake is Mistake.QUATERNION_ORDER:
+        return f"ROS and Foxglove messages have quaternions as x, y, z, w: correct what publishes these poses{also}"
+    return misreading.cure
+
+
+def _cure_of_files(mistake: Mistake, rig: Rig) -> str:
+    """The cure where the carriers' poses are in files beside images; empty where it is the same as for a log."""
+    poses, key = rig.carriers.poses, rig.source.place(("carriers", "poses"))
+    if mistake is Mistake.QUATERNION_ORDER:
+        other = "xyzw" if poses.quaternion == "wxyz" else "wxyz"
+        return f"write quaternion: {other} beside the frames ({key}); where the files name their columns, rename those"
+    if mistake is Mistake.ROWS_SHIFTED and all(sensor.time_offset == 0.0 for sensor in rig.sensors.values()):
+        paths = ", ".join(f"{sensor.images} with {sensor.poses}" for sensor in rig.sensors.values())
+        return (
+            f"poses belong to other images than those of their names or order ({paths}): compare both, first and last; "
+            "where the names are stamps, write time_offset: estimate"
+        )
+    return ""
+
+
+def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig, *, with_intrinsics: bool) -> list[Finding]:
+    """Stated sizes that were to be checked, that the motion contradicts, and that were estimated in their place.
+
+    Where another stated size fits the motion, the carriers' unit and the focal lengths are right, and the poses rest
+    on it. Where none does, any of the three may be wrong; the focal lengths only where they were not estimated too.
+    """
+    if rig.sizes != "check":
+        return []
+    told = [size for size in sizes if size.sigma is not None]
+    doubted = [size for size in told if size.is_doubted and size.is_free]
+    if not doubted:
+        return []
+    words = ", ".join(
+        f"{size.target} is {abs(size.percent_too_large):.2g} % too {'large' if size.scale > 1.0 else 'small'} "
+        f"({rig.source.place(('targets', size.target))}: the motion says {1e3 * size.stated_m / size.scale:.2f} mm)"
+        for size in doubted
+    )
+    if len(doubted) == len(told):
+        said = "the stated size of" if len(doubted) == 1 else "no stated size fits the motion:"
+        why = "the poses use the sizes that the motion gives, and nothing tells whether the sizes are wrong or the "
+        others = "carriers' unit of length" if with_intrinsics else "carriers' unit of length or the focal lengths"
+        return [Finding(Ground.NO_SIZE_FITS, f"{said} {words}; {why}{others}")]
+    return [Finding(Ground.SIZE_ESTIMATED, f"the stated size of {words}; the poses use the size that the motion gives")]
+
+
+def known_to_nothing(points: Iterable[PointUncertainty], rig: Rig) -> list[Finding]:
+    """Points that are known no better than by a part of their distance: what was stated does not fit together.
+
+    Noise that is as large as this is no camera's. Wrong intrinsics of all cameras look like it.
+    """
+    findings = []
+    for point in points:
+        distance_mm = 1e3 * float(np.linalg.norm(point.point_m))
+        if np.isfinite(point.radius_mm) and point.radius_mm > LARGEST_SHARE * distance_mm:
+            place = rig.source.place(("sensors", point.frame, "intrinsics"))
+            words = (
+                f"a point {1e-3 * distance_mm:.2f} m from {point.frame} is known to {point.radius_mm:.0f} mm only, and "
+                f"that is no noise of a camera: intrinsics ({place}), sizes and the carriers' poses do not fit together"
+            )
+            findings.append(Finding(Ground.IMPLAUSIBLE, words))
+    return findings

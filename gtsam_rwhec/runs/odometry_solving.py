@@ -1,0 +1,179 @@
+"""Solving of sensors that know only their own motion: from a cleaned log to the joint answer, and its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.errors import LogError, OptionError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.odometry import (
+    Given,
+    Ground,
+    KnownDirection,
+    OdometryCalibration,
+    OdometryOptions,
+    OdometryTrack,
+    calibrate_odometries,
+)
+from gtsam_rwhec.odometry.odometry_file import (
+    OdometryResult,
+    parse_odometry_result,
+    result_json,
+    result_of,
+    write_odometry_result,
+)
+from gtsam_rwhec.report.page.odometry_page import write_odometry_page
+from gtsam_rwhec.results.log_history import CleaningReport
+from gtsam_rwhec.rig import Rig, RigFrames
+from gtsam_rwhec.runs.changed_rig import rig_for_solving
+from gtsam_rwhec.runs.earlier_output import list_written
+from gtsam_rwhec.runs.log_contract import CLEAN_LOG, REPORT_FILE, RESULT_FILE, SOLUTION_TOPIC, topics_up_to_detection
+from gtsam_rwhec.runs.log_metadata import read_metadata
+from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
+from gtsam_rwhec.runs.odometry_tracks import read_odometry
+from gtsam_rwhec.runs.output_paths import made_output_folder
+
+
+@dataclass(frozen=True, eq=False)
+class OdometrySolved:
+    """A calibration of odometries from a log.
+
+    Attributes
+    ----------
+    result : OdometryResult
+        The content of ``result.json``.
+    rig : Rig
+        The rig file that was used.
+    cleaning : CleaningReport
+        What cleaning removed.
+    calibration : OdometryCalibration or None
+        What ``calibrate_odometries`` returned; None where the log was solved before.
+    """
+
+    result: OdometryResult
+    rig: Rig
+    cleaning: CleaningReport
+    calibration: OdometryCalibration | None = None
+
+    @property
+    def judgement(self) -> Judgement:
+        """The verdict, with its grounds."""
+        return self.result.judgement
+
+
+@one_blas_thread()
+def solve_odometries(
+    clean_path: str | Path, rig: Rig | None = None, *, progress: Progress | None = None
+) -> OdometrySolved:
+    """Calibrate from the cleaned log of odometries. Raises as `calibrate_odometry_log`."""
+    with open_log(clean_path) as log:
+        rig = rig_for_solving(log, rig)
+        if not rig.is_of_odometries:
+            raise OptionError(f"{clean_path}: its rig file has sensors that see targets; solve it with solve_log")
+        metadata = read_metadata(log)
+        if metadata.cleaning is None:
+            raise LogError(f"{clean_path} was not cleaned: gtsam-rwhec clean {clean_path} -o clean.mcap")
+        tracks = [_on_reference_clock(read_odometry(log, rig, name), rig) for name in rig.odometries]
+    assert rig.reference is not None
+    found = calibrate_odometries(
+        tracks, reference=rig.reference, given=given_of(rig), options=options_of(rig), progress=progress
+    )
+    stated = {name: float(one.time_offset) for name, one in rig.odometries.items() if one.time_offset != "estimate"}
+    offsets = {name: value + stated.get(name, 0.0) for name, value in found.time_offsets_s.items()}
+    found = replace(found, time_offsets_s=offsets)
+    frames = {name: rig.frame_of(name) for name in rig.odometries}
+    return OdometrySolved(result_of(found, frames, metadata.detection.sources), rig, metadata.cleaning, found)
+
+
+def _on_reference_clock(track: OdometryTrack, rig: Rig) -> OdometryTrack:
+    """The track with a stated time offset added to its stamps; an offset that is estimated is found from there."""
+    offset = rig.odometries[track.sensor].time_offset
+    if offset == "estimate" or offset == 0.0:
+        return track
+    return replace(track, stamps_ns=np.asarray(track.stamps_ns) + round(1e9 * float(offset)))
+
+
+def given_of(rig: Rig) -> Given:
+    """What the rig file's ``given`` says, in SI units."""
+    said = rig.given
+    ground = said.ground
+    return Given(
+        heights_m={name: (height, 1e-3 * said.height_sigma_mm) for name, height in said.heights_m.items()},
+        ground=None
+        if ground is None
+        else Ground(ground.up, ground.below_m, float(np.radians(ground.sigma_deg)), 1e-3 * ground.sigma_mm),
+        directions=tuple(
+            KnownDirection(one.sensor, one.of, one.in_reference, float(np.radians(one.sigma_deg)))
+            for one in said.directions
+        ),
+        distances_m={one.between: (one.distance_m, 1e-3 * one.sigma_mm) for one in said.distances},
+    )
+
+
+def options_of(rig: Rig) -> OdometryOptions:
+    """The options: the widest gates of all sensors, and clocks where one is to be estimated."""
+    sources = [one.odometry for one in rig.odometries.values()]
+    return OdometryOptions(
+        estimate_time_offsets=any(one.time_offset == "estimate" for one in rig.odometries.values()),
+        max_speed_m_per_s=max(one.max_speed_m_s for one in sources),
+        max_turn_rad_per_s=float(np.radians(max(one.max_turn_deg_s for one in sources))),
+        max_gap_s=max(one.max_gap_s for one in sources),
+        reject_outliers=rig.cleaning.robust != "none",
+    )
+
+
+def solve_odometries_into(
+    clean_path: str | Path, rig: Rig | None, out: str | Path, *, progress: Progress | None = None
+) -> OdometrySolved:
+    """Solve; write ``result.json``, ``report.html``, and ``clean.mcap`` with the solution, into a folder."""
+    out = made_output_folder(out)
+    solved = solve_odometries(clean_path, rig, progress=progress)
+    write_odometry_result(solved.result, out / RESULT_FILE)
+    write_odometry_page(solved.result, out / REPORT_FILE)
+    with open_log(clean_path) as log, LogWriter(out / CLEAN_LOG) as writer:
+        writer.copy(log, topics_up_to_detection(log), "leave_out")
+        pairs = read_pairs(log, solved.rig)
+        write_pairs(writer, pairs.values())
+        replace(read_metadata(log), rig=solved.rig).write(writer)
+        first_ns = min(int(one.stamps_ns[0]) for one in pairs.values())
+        frames = frames_of_odometries(solved)
+        named = [(parent, child, np.asarray(T, dtype=np.float64)) for parent, child, T in frames.sensor_frames()]
+        writer.transforms(SOLUTION_TOPIC, first_ns, named)
+        writer.attachment(RESULT_FILE, "application/json", result_json(solved.result), first_ns)
+    list_written(out, solved.result.sources, [out / name for name in (RESULT_FILE, REPORT_FILE, CLEAN_LOG)])
+    return solved
+
+
+def read_odometries(path: str | Path) -> OdometrySolved:
+    """Read the log that `solve_odometries_into` wrote; `LogError` if it has no result."""
+    with open_log(path) as log:
+        content = log.attachment(RESULT_FILE)
+        if content is None:
+            raise LogError(f"{path} has no {RESULT_FILE} attached: gtsam-rwhec solve or calibrate did not write it")
+        result = parse_odometry_result(content, f"{path}, attachment {RESULT_FILE}")
+        metadata = read_metadata(log)
+    if metadata.cleaning is None or {one.sensor for one in result.tracks} != set(metadata.rig.odometries):
+        raise LogError(
+            f"{path} has a {RESULT_FILE} of other sensors than its rig file: they are not of one calibration"
+        )
+    return OdometrySolved(result, metadata.rig, metadata.cleaning)
+
+
+def frames_of_odometries(solved: OdometrySolved) -> RigFrames:
+    """The calibrated frames: sensors on the reference."""
+    result, rig = solved.result, solved.rig
+    warnings = () if result.verdict is Verdict.USE else (str(result.judgement), *result.not_determined)
+    return RigFrames(
+        sensor_carrier=rig.carriers.sensors,
+        target_carrier=rig.carriers.targets,
+        sensors={rig.frame_of(one.sensor): result.pose(one.sensor) for one in result.sensors},
+        targets={},
+        time_offsets_s={rig.frame_of(one.sensor): one.time_offset_s for one in result.sensors},
+        warnings=warnings,
+    )

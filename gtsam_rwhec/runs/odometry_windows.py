@@ -1,0 +1,202 @@
+"""Motions of an odometry and of the carriers, A Y = Y B, over windows of time that are chosen for information."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry import OdometryNoise, OdometryTrack
+from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.rig import Cleaning, OdometrySource
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+#: Seconds. Windows have one of these lengths.
+LENGTHS_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+#: Fewer windows than this make no calibration, whatever each of them tells.
+FEWEST_WINDOWS = 12
+#: No odometry is better than this, after a second: rad and m.
+QUIETEST = OdometryNoise(1e-6, 1e-6)
+#: A robust standard deviation is this many times the median of the absolute values.
+OF_MEDIAN = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryWindows:
+    """Motions over windows that follow one another.
+
+    Attributes
+    ----------
+    window_s : float
+    end_ns : (N,) integers
+        The ends of the windows, on the sensor's clock.
+    A, B : (N, 4, 4) arrays
+        T_before_after of the carriers (metres), and of the sensor (in its own lengths).
+    covariance : (N, 6, 6) array
+        Of B, rotation first, right perturbation.
+    noise : OdometryNoise
+        As stated, or found from what both motions must have in common.
+    reasons : tuple of str
+        Why a window is not used; empty where it is.
+    """
+
+    window_s: float
+    end_ns: np.ndarray
+    A: Array
+    B: Array
+    covariance: Array
+    noise: OdometryNoise
+    reasons: tuple[str, ...]
+
+
+def odometry_windows(
+    track: OdometryTrack,
+    path: Trajectory,
+    offset_s: float,
+    source: OdometrySource,
+    cleaning: Cleaning,
+    max_gap_s: float,
+) -> OdometryWindows:
+    """Windows of an odometry against the carriers' path (T_sensorcarrier_targetcarrier over time).
+
+    The length is that with the most information on the rotation: the sum over windows of |R - I|_F^2 / T, as the
+    variance of a random walk grows with the window's length T. `offset_s` leads from the sensor's clock to the
+    carriers', `max_gap_s` is that of the carriers' poses.
+    """
+    own = Trajectory(np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor), track.sensor)
+    step = float(np.median(np.diff(own.stamps_ns))) * 1e-9
+    best: tuple[float, tuple[np.ndarray, np.ndarray, Array, Array]] | None = None
+    chosen_s = LENGTHS_S[0]
+    for length_s in LENGTHS_S:
+        if length_s < 2.0 * step and length_s != LENGTHS_S[-1]:
+            continue
+        made = _motions(own, path, offset_s, length_s)
+        if len(made[0]) < FEWEST_WINDOWS and best is not None:
+            break
+        good = ~(
+            _lost(own, made[0], source) | _gap(own, made[0], source.max_gap_s) | _unknown(path, made[1], max_gap_s)
+        )
+        turned = ((made[2][good][:, :3, :3] - np.eye(3)) ** 2).sum()
+        information = float(turned) / (length_s + step)
+        if best is None or information > best[0]:
+            best, chosen_s = (information, made), length_s
+    assert best is not None
+    edges_ns, edges_of_path_ns, A, B = best[1]
+    reasons = _reasons(own, path, edges_ns, edges_of_path_ns, A, chosen_s, source, cleaning, max_gap_s)
+    used = np.array([not reason for reason in reasons], dtype=bool)
+    noise = track.noise or found_noise(A[used], B[used], chosen_s, has_unknown_scale=track.has_unknown_scale)
+    return OdometryWindows(chosen_s, edges_ns[:, 1], A, B, covariances(B, chosen_s, noise), noise, reasons)
+
+
+def covariances(B: Array, window_s: float, noise: OdometryNoise) -> Array:
+    """Covariances (N, 6, 6) of B after a random walk; its turning moves the end of a straight way by T^2 d / 3."""
+    rotation, translation = (
+        rate**2 * window_s for rate in (noise.rotation_rad_per_sqrt_s, noise.translation_m_per_sqrt_s)
+    )
+    squared = (B[:, :3, 3] ** 2).sum(axis=1) / 3.0
+    made = np.zeros((len(B), 6, 6))
+    made[:, range(3), range(3)] = rotation
+    made[:, range(3, 6), range(3, 6)] = (translation + rotation * squared)[:, None]
+    return made
+
+
+def found_noise(A: Array, B: Array, window_s: float, *, has_unknown_scale: bool) -> OdometryNoise:
+    """The noise by which the invariants of A Y = Y B differ: the angles of both, and their ways along the axis.
+
+    Where nothing turned there is no axis, and the lengths of both ways are compared.
+    """
+    if len(A) < 3:
+        return OdometryNoise(np.radians(0.1), 0.01)
+    a, b = (se3.so3_logmap(T[:, :3, :3]) for T in (A, B))
+    angle_a, angle_b = (np.linalg.norm(v, axis=1) for v in (a, b))
+    has_axis = np.minimum(angle_a, angle_b) > np.radians(2.0)
+    way_a, way_b = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (A, B))
+    if has_axis.sum() >= 3:
+        way_a, way_b = (
+            np.einsum("ni,ni->n", T[has_axis, :3, 3], v[has_axis]) / angle[has_axis]
+            for T, v, angle in ((A, a, angle_a), (B, b, angle_b))
+        )
+    scale = 1.0
+    if has_unknown_scale and (way_a @ way_a) > 0.0:
+        scale = float(way_a @ way_b) / float(way_a @ way_a)
+    rates = (
+        OF_MEDIAN * float(np.median(np.abs(difference))) / np.sqrt(window_s)
+        for difference in (angle_b - angle_a, way_b - scale * way_a)
+    )
+    rotation, translation = rates
+    return OdometryNoise(
+        max(rotation, QUIETEST.rotation_rad_per_sqrt_s), max(translation, QUIETEST.translation_m_per_sqrt_s)
+    )
+
+
+def _motions(
+    own: Trajectory, path: Trajectory, offset_s: float, length_s: float
+) -> tuple[np.ndarray, np.ndarray, Array, Array]:
+    """Ends of windows (N, 2) on both clocks, A and B; windows in the time that both have."""
+    shift_ns, length_ns = round(1e9 * offset_s), round(1e9 * length_s)
+    first = max(int(own.stamps_ns[0]), int(path.stamps_ns[0]) - shift_ns)
+    last = min(int(own.stamps_ns[-1]), int(path.stamps_ns[-1]) - shift_ns)
+    edges = np.arange(first, last + 1, length_ns)
+    edges_ns = np.stack([edges[:-1], edges[1:]], axis=1)
+    (carrier, _), (sensor, _) = path.at(edges + shift_ns), own.at(edges)
+    return edges_ns, edges_ns + shift_ns, carrier[:-1] @ se3.inverse(carrier[1:]), se3.inverse(sensor[:-1]) @ sensor[1:]
+
+
+def _reasons(
+    own: Trajectory,
+    path: Trajectory,
+    edges_ns: np.ndarray,
+    edges_of_path_ns: np.ndarray,
+    A: Array,
+    window_s: float,
+    source: OdometrySource,
+    cleaning: Cleaning,
+    max_gap_s: float,
+) -> tuple[str, ...]:
+    """Why windows are not used: the first of what is wrong."""
+    turned, moved = np.linalg.norm(se3.so3_logmap(A[:, :3, :3]), axis=1), np.linalg.norm(A[:, :3, 3], axis=1)
+    none = np.zeros(len(A), dtype=bool)
+    still = (turned < np.radians(cleaning.min_rotation_deg)) & (moved < 1e-3 * cleaning.min_translation_mm)
+    turns, moves = cleaning.max_rotation_deg_s, cleaning.max_translation_m_s
+    checks = (
+        (_gap(own, edges_ns, source.max_gap_s), RemovalReason.ODOMETRY_GAP),
+        (_lost(own, edges_ns, source), RemovalReason.ODOMETRY_STEP),
+        (_unknown(path, edges_of_path_ns, max_gap_s), RemovalReason.GAP),
+        (none if turns is None else turned > np.radians(turns) * window_s, RemovalReason.TURNING_FAST),
+        (none if moves is None else moved > moves * window_s, RemovalReason.MOVING_FAST),
+        (still if cleaning.thin else none, RemovalReason.STANDSTILL),
+    )
+    reasons = np.full(len(A), "", dtype=object)
+    for wrong, reason in reversed(checks):
+        reasons[wrong] = str(reason)
+    return tuple(reasons.tolist())
+
+
+def _lost(own: Trajectory, edges_ns: np.ndarray, source: OdometrySource) -> np.ndarray:
+    """Windows (N,) with a step beyond the gates (DQ paper, Appendix D.1, as speeds)."""
+    step = se3.inverse(own.T[:-1]) @ own.T[1:]
+    seconds = np.diff(own.stamps_ns) * 1e-9
+    turned = np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)
+    moved = np.linalg.norm(step[:, :3, 3], axis=1) if source.scale == "known" else np.zeros(len(step))
+    wrong = (turned > np.radians(source.max_turn_deg_s) * seconds) | (moved > source.max_speed_m_s * seconds)
+    return _contains(own.stamps_ns, wrong, edges_ns)
+
+
+def _gap(own: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
+    return _contains(own.stamps_ns, np.diff(own.stamps_ns) > 1e9 * max_gap_s, edges_ns)
+
+
+def _unknown(path: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
+    """Windows (N,) at an end of which the carriers' pose is not known."""
+    return np.asarray((path.gaps(edges_ns.reshape(-1)) > max_gap_s).reshape(-1, 2).any(axis=1))
+
+
+def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: np.ndarray) -> np.ndarray:
+    """Windows (N,) that have a part of a wrong step (M - 1,)."""
+    count = np.r_[0, np.cumsum(wrong)]
+    first = np.clip(np.searchsorted(stamps_ns, edges_ns[:, 0], side="right") - 1, 0, len(wrong))
+    last = np.clip(np.searchsorted(stamps_ns, edges_ns[:, 1], side="left"), 0, len(wrong))
+    has: np.ndarray = count[last] > count[first]
+    return has

@@ -1,0 +1,209 @@
+"""Gross outliers of one pair, found by consensus on its own A X = Y B (RWHEC paper, Section 9, eq. 66).
+
+The paper knows Y and asks which measurements agree on X. Here neither X nor Y is known. A hypothesis is X, Y (and a
+scale) from a few measurements, in closed form; all hypotheses are computed at once. The hypothesis that most
+measurements agree with is fitted again to the measurements that agree. This step removes gross errors: the id of
+another tag, a reflection, a flipped pose. Robust refinement (``robust="gnc"``) finds the small ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
+from gtsam_rwhec.solver.rotations import project
+
+#: A hypothesis is fitted at most this often to the measurements that agree with it. Most need two or three fits.
+MOST_FITS = 10
+
+
+@dataclass(frozen=True)
+class ConsensusOptions:
+    """Limits of agreement; the defaults are the paper's.
+
+    Attributes
+    ----------
+    max_translation_m, max_rotation_rad : float
+        A measurement agrees if it is this near to its prediction.
+    min_inlier_share : float
+        If a smaller share of the pair's measurements agrees, all of them are removed.
+    scale_known : bool
+        Whether the target's length is known.
+    max_scale_error : float
+        How far an unknown scale may be from 1: tag sizes are known within 10 %.
+    hypotheses : int
+        Number of samples.
+    sample_size : int
+        Measurements in each sample.
+    seed : int
+        Seed of the generator that draws the samples.
+    """
+
+    max_translation_m: float = 0.6
+    max_rotation_rad: float = float(np.radians(60.0))
+    min_inlier_share: float = 1.0 / 3.0
+    scale_known: bool = True
+    max_scale_error: float = 0.1
+    hypotheses: int = 200
+    sample_size: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("max_translation_m", "max_rotation_rad", "hypotheses", "sample_size"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"ConsensusOptions.{name}={getattr(self, name)!r}; it must be positive")
+        for name in ("min_inlier_share", "max_scale_error"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise OptionError(f"ConsensusOptions.{name}={getattr(self, name)!r}; give one above 0 and up to 1")
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """The measurements that agree (``kept``), their share, and their hypothesis: X, Y (4, 4) and scale."""
+
+    kept: Kept
+    share: float
+    X: Array
+    Y: Array
+    scale: float
+
+
+@one_blas_thread()
+def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptions | None = None) -> Consensus:
+    """Keep the measurements of a pair that agree on one hypothesis.
+
+    Parameters
+    ----------
+    A, B : (N, 4, 4) arrays
+        T_sensorcarrier_targetcarrier and T_sensor_target, metres.
+    stamps_ns : (N,) integers
+    options : ConsensusOptions, optional
+
+    Returns
+    -------
+    Consensus
+        A single measurement is removed: nothing can validate it. Two measurements almost always agree with what is
+        fitted to them, but the limits still apply.
+    """
+    options = options or ConsensusOptions()
+    N = len(A)
+    everything = np.ones(N, dtype=bool)
+    if N < 2:
+        kept = Kept.of(everything, RemovalReason.SINGLE, stamps_ns, np.ones(N), 2.0)
+        return Consensus(kept, 0.0, np.eye(4), np.eye(4), 1.0)
+    generator = np.random.default_rng(options.seed)
+    # Each row is a sample without repetition: the beginning of a random order.
+    order = np.argsort(generator.random((options.hypotheses, N)), axis=1)
+    samples = order[:, : min(options.sample_size, N)]
+    best = _best(A, B, closed_form(A[samples], B[samples], options), options)
+    for _ in range(MOST_FITS):
+        mask = best.agrees
+        if mask.sum() < 2:
+            break
+        again = _best(A, B, closed_form(A[mask][None], B[mask][None], options), options)
+        if again.agrees.sum() < mask.sum():
+            break
+        best = again
+        if np.array_equal(again.agrees, mask):
+            break
+    share = float(best.agrees.mean())
+    if share < options.min_inlier_share:
+        shares = np.full(N, share)
+        kept = Kept.of(everything, RemovalReason.NO_CONSENSUS, stamps_ns, shares, options.min_inlier_share)
+    else:
+        kept = Kept.within(
+            stamps_ns,
+            (RemovalReason.ROTATION_OFF, best.radians, options.max_rotation_rad),
+            (RemovalReason.TRANSLATION_OFF, best.metres, options.max_translation_m),
+        )
+    return Consensus(kept, share, best.X, best.Y, best.scale)
+
+
+def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, Array, Array]:
+    """X, Y (H, 4, 4) and scale (H,) of H samples of n measurements, A and B (H, n, 4, 4).
+
+    First the rotations (Shah 2013): sum R_A (x) R_B maps vec R_X to n vec R_Y. The first singular vectors of the sum,
+    projected to SO(3), are R_Y and R_X. Then least squares gives translations and scale: the solution of minimum norm
+    if a sample leaves a direction free.
+    """
+    H, n = A.shape[:2]
+    R_A, R_B = A[..., :3, :3], B[..., :3, :3]
+    # R_Y = R_A R_X R_B': vec over rows, K[(i, j), (k, l)] = sum R_A[i, k] R_B[j, l]
+    K = np.einsum("hnik,hnjl->hijkl", R_A, R_B).reshape(H, 9, 9) / n
+    U, _, Vt = np.linalg.svd(K)
+    R_X, R_Y = _rotation(Vt[:, 0].reshape(H, 3, 3)), _rotation(U[:, :, 0].reshape(H, 3, 3))
+    rows = np.zeros((H, n, 3, 6 + (not options.scale_known)))
+    rows[..., 0:3], rows[..., 3:6] = R_A, -np.eye(3)
+    seen = np.einsum("hij,hnj->hni", R_Y, B[..., :3, 3])
+    right = seen - A[..., :3, 3]
+    if not options.scale_known:  # R_A t_X + t_A - t_Y = (1 / s) R_Y t_B
+        rows[..., 6] = -seen
+        right = -A[..., :3, 3]
+    solution = _least_squares(rows, right)
+    scale: Array = np.ones(H)
+    if not options.scale_known:
+        low, high = 1.0 / (1.0 + options.max_scale_error), 1.0 / (1.0 - options.max_scale_error)
+        inverse = np.clip(solution[:, 6], low, high)
+        # At a limit the translations are solved again. The scale is at a limit where the motion does not determine it:
+        # the carrier turns in place.
+        at_limit = inverse != solution[:, 6]
+        if at_limit.any():
+            right = inverse[at_limit, None, None] * seen[at_limit] - A[at_limit, ..., :3, 3]
+            solution[at_limit, :6] = _least_squares(rows[at_limit, ..., :6], right)
+        scale = 1.0 / inverse
+    X, Y = np.zeros((H, 4, 4)), np.zeros((H, 4, 4))
+    X[:, 3, 3] = Y[:, 3, 3] = 1.0
+    X[:, :3, :3], Y[:, :3, :3] = R_X, R_Y
+    X[:, :3, 3], Y[:, :3, 3] = solution[:, :3], solution[:, 3:6]
+    return X, Y, scale
+
+
+def _least_squares(rows: Array, right: Array) -> Array:
+    """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right sides (H, n, 3)."""
+    H, n, _, k = rows.shape
+    inverse = np.linalg.pinv(rows.reshape(H, 3 * n, k), rcond=1e-6)
+    solution: Array = np.einsum("hij,hj->hi", inverse, right.reshape(H, 3 * n))
+    return solution
+
+
+def _rotation(M: Array) -> Array:
+    """The rotations nearest to matrices (H, 3, 3) of unknown sign; the sign is chosen so that det M > 0."""
+    return project(M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None])
+
+
+def distances(A: Array, B: Array, X: Array, Y: Array, scale: Array) -> tuple[Array, Array]:
+    """How far each of N measurements is from each of H hypotheses: metres and radians, (H, N)."""
+    R = np.einsum("hji,njk,hkl->hnil", Y[:, :3, :3], A[:, :3, :3], X[:, :3, :3])  # predicted R_B
+    c = np.einsum("nij,hj->hni", A[:, :3, :3], X[:, :3, 3]) + A[:, :3, 3] - Y[:, None, :3, 3]
+    t = np.einsum("hji,hnj->hni", Y[:, :3, :3], c)
+    metres = np.linalg.norm(t - B[:, :3, 3] / scale[:, None, None], axis=2)
+    trace = np.einsum("hnij,nij->hn", R, B[:, :3, :3])
+    return metres, np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class _Best:
+    """A hypothesis X, Y, scale; the distances (N,) of the measurements from it, and which measurements agree."""
+
+    agrees: np.ndarray
+    metres: Array
+    radians: Array
+    X: Array
+    Y: Array
+    scale: float
+
+
+def _best(A: Array, B: Array, hypotheses: tuple[Array, Array, Array], options: ConsensusOptions) -> _Best:
+    """The hypothesis that most measurements agree with. Among equals it has the smallest distances."""
+    X, Y, scale = hypotheses
+    metres, radians = distances(A, B, X, Y, scale)
+    agree = (metres <= options.max_translation_m) & (radians <= options.max_rotation_rad)
+    size = metres / options.max_translation_m + radians / options.max_rotation_rad
+    score = agree.sum(axis=1) - np.where(agree, size, 0.0).sum(axis=1) / (2.0 * len(A) + 1.0)
+    best = int(np.argmax(score))
+    return _Best(agree[best], metres[best], radians[best], X[best], Y[best], float(scale[best]))

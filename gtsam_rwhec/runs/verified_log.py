@@ -1,0 +1,256 @@
+"""Whether an old calibration still holds on a new log: detect, clean, and test, without calibrating anew."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.changes.change_test import LEVEL, checked_level
+from gtsam_rwhec.changes.verification import Verification
+from gtsam_rwhec.changes.verifying import verify
+from gtsam_rwhec.errors import FrameError, LogError, LogWarning, StampError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.results.log_history import DetectionReport
+from gtsam_rwhec.results.result_file import Result
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.changed_rig import rig_for_cleaning, rig_for_solving
+from gtsam_rwhec.runs.cleaning_stage import clean_log
+from gtsam_rwhec.runs.corner_answer import with_intrinsics
+from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.folder_log import is_folder_of_images, write_folder_log
+from gtsam_rwhec.runs.log_contract import CLEAN_LOG, CLEANING_METADATA, DETECTED_LOG, RECORDED_LOG, is_from_stage
+from gtsam_rwhec.runs.log_corners import LogCorners
+from gtsam_rwhec.runs.log_metadata import read_cleaning_report, read_metadata
+from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
+from gtsam_rwhec.runs.old_calibration import OldCalibration, with_cameras
+from gtsam_rwhec.runs.samples_log import is_file_of_samples, write_samples_log
+from gtsam_rwhec.runs.solving_rounds import Pairs, SolvingRounds, without_outlier_marks
+from gtsam_rwhec.vision.camera import Camera
+
+#: Standard deviation of a corner along each axis where the old calibration is not from corners, pixels: what detection
+#: takes before it has measured it. The test finds the noise of poses itself.
+CORNER_PX = 0.1
+
+
+@one_blas_thread()
+def verify_log(
+    old: str | Path,
+    log_path: str | Path | list[str | Path],
+    rig: Rig | None = None,
+    *,
+    level: float = LEVEL,
+    targets_may_move: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Verification:
+    """Whether the calibration in an output folder still holds on a new log.
+
+    Targets are detected with the intrinsics of the old calibration, and the measurements cleaned as for a calibration.
+    Nothing is written.
+
+    Parameters
+    ----------
+    old
+        The output folder of a calibration, its ``clean.mcap`` or its ``result.json``.
+    log_path
+        As for ``calibrate_log``; of a log that a stage wrote, only the stages after it run.
+    rig : Rig, optional
+        By default the rig file of the old calibration, or, for a log that a stage wrote, the log's own.
+    level : float
+    targets_may_move : bool
+        As in ``rw.changes.verify``.
+    workers : int, optional
+        As in ``calibrate_log``.
+    progress : callable, optional
+
+    Raises
+    ------
+    RwhecError
+        A file cannot be read, the rigs differ, or the new log has too few measurements; the message says which.
+    """
+    checked_level(level)
+    tell = progress or silent
+    calibration = OldCalibration.read(old)
+    with TemporaryDirectory(prefix="gtsam-rwhec-verify-") as folder:
+        cleaned, rig = _cleaned(log_path, rig, calibration, Path(folder), workers, tell)
+        return _verified(calibration, cleaned, rig, level=level, targets_may_move=targets_may_move, tell=tell)
+
+
+def _cleaned(
+    log_path: str | Path | list[str | Path],
+    given: Rig | None,
+    old: OldCalibration,
+    folder: Path,
+    workers: int | None,
+    tell: Progress,
+) -> tuple[Path, Rig | None]:
+    """The new log after detection and cleaning, and the rig file for what comes after, if it is not the log's own."""
+    rig = given or old.rig
+    if rig is not None and not isinstance(log_path, list):
+        source = Path(log_path)
+        if is_folder_of_images(source, rig):
+            recorded = folder / f"new{RECORDED_LOG}"
+            rig = rig.model_copy(update={"folder": source})
+            write_folder_log(source, rig, recorded, progress=tell)
+            log_path = recorded
+        elif is_file_of_samples(source, rig):
+            recorded = folder / f"new{RECORDED_LOG}"
+            tell(write_samples_log(source, rig, recorded))
+            log_path = recorded
+    with open_log(log_path) as log:
+        files = [file.path for file in log.files]
+        is_raw = not is_from_stage(log)
+        is_cleaned = CLEANING_METADATA in log.metadata()
+    if is_cleaned:
+        return files[0], given
+    detected = files[0]
+    if is_raw:
+        if rig is None:
+            raise LogError(
+                f"{files[0]}: a raw log needs a rig file, and the old calibration has no {CLEAN_LOG} that holds one: "
+                "give --rig FILE"
+            )
+        detected = folder / DETECTED_LOG
+        detect_log(list(files), with_cameras(rig, old.cameras), detected, workers=workers, progress=tell)
+    _clean(detected, folder / CLEAN_LOG, None if is_raw else given, old, tell)
+    return folder / CLEAN_LOG, None
+
+
+def _clean(detected: Path, cleaned: Path, rig: Rig | None, old: OldCalibration, tell: Progress) -> None:
+    """Clean a log; where its motion does not tell the time offset of a sensor, the old one is taken as stated."""
+    before = {} if old.result.log is None else {one.sensor: one.offset_s for one in old.result.log.time_offsets}
+    with open_log(detected) as log:
+        rig = rig_for_cleaning(log, rig)
+    free = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in before]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LogWarning)
+            found = clean_log(detected, cleaned, rig, images="leave_out", progress=tell).time_offsets_s
+    except StampError:
+        if not free:
+            raise
+        found = {}
+    untold = [name for name in free if name not in found]
+    if untold:
+        sensors = {
+            name: sensor.model_copy(update={"time_offset": before[name]}) if name in untold else sensor
+            for name, sensor in rig.sensors.items()
+        }
+        rig = rig.model_copy(update={"sensors": sensors})
+        clean_log(detected, cleaned, rig, images="leave_out", progress=tell)
+
+
+def _verified(
+    old: OldCalibration, cleaned: Path, given: Rig | None, *, level: float, targets_may_move: bool, tell: Progress
+) -> Verification:
+    with open_log(cleaned) as log:
+        rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
+        pairs, motion = without_outlier_marks(read_pairs(log, rig)), read_carrier_motion(log, rig)
+        corners = LogCorners.of(log, rig, metadata.cameras)
+    _check_carriers(old.result, rig)
+    used = {measured.sensor for measured in pairs.values() if measured.used.any()}
+    free = tuple(name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used)
+    rounds = SolvingRounds(rig, motion, free, tell)
+    pairs = rounds.at(pairs, cleaning.time_offsets_s).pairs
+    cameras = {**metadata.cameras, **old.cameras}
+    refined = old.result.refined
+    if refined is not None and any(_differ(cameras[name], metadata.cameras[name]) for name in metadata.cameras):
+        px = CORNER_PX if refined.reprojection is None else refined.reprojection.corner_px
+        pairs = with_intrinsics(pairs, corners, cameras, refined.X, refined.Y, px)
+    problem = problem_of(pairs, rig, cleaning.time_offsets_s)
+    tell("testing the old poses")
+    found = verify(
+        old.result, problem, level=level, targets_may_move=targets_may_move, carrier_noise=motion.noise,
+        time_offsets=free, carrier_path=motion.trajectory if free else None, progress=tell,
+    )  # fmt: skip
+    if refined is None:
+        return found
+    taken = _taken_offsets(old.result, rig)
+    if taken:
+        found = replace(found, remarks=(*found.remarks, *taken))
+    if old.result.log is not None and are_same_images(old.result.log.detection, metadata.detection):
+        remark = "the new log is the one that the old calibration comes from, so that it holds as a matter of course"
+        found = replace(found, remarks=(remark, *found.remarks))
+    pixels = {name: pixel_errors(refined, pairs, corners, cameras, name) for name in found.sensors if name in cameras}
+    return replace(
+        found,
+        sensors={name: replace(check, held_px=_median(pixels.get(name))) for name, check in found.sensors.items()},
+    )
+
+
+def _taken_offsets(old: Result, rig: Rig) -> list[str]:
+    """The sensors whose old time offset was taken."""
+    offsets = [] if old.log is None else [one for one in old.log.time_offsets if one.sigma_s is not None]
+    return [
+        f"the new motion does not tell the time offset of {shown(one.sensor)}, and the old one was taken: "
+        f"{1e3 * one.offset_s:.1f} ms"
+        for one in offsets
+        if one.sensor in rig.sensors and rig.sensors[one.sensor].time_offset == one.offset_s
+    ]
+
+
+def are_same_images(one: DetectionReport, other: DetectionReport) -> bool:
+    """Whether two detections are of the same images: the noise of their corners is the same to the last digit."""
+    return bool(one.corner_px) and one.corner_px == other.corner_px and len(set(one.corner_px.values())) > 1
+
+
+def _check_carriers(old: Result, rig: Rig) -> None:
+    if old.log is None:
+        return
+    for what, name, now in (
+        ("sensors", old.log.sensor_carrier, rig.carriers.sensors),
+        ("targets", old.log.target_carrier, rig.carriers.targets),
+    ):
+        if name != now:
+            raise FrameError(
+                f"the carrier of the {what} is {shown(name)} in the old calibration and {shown(now)} in the new log: "
+                "they are of different rigs. Give a log of the same rig"
+            )
+
+
+def _differ(one: Camera, other: Camera) -> bool:
+    return one.model != other.model or not np.allclose(one.parameters, other.parameters, rtol=1e-12, atol=0.0)
+
+
+def pixel_errors(
+    answer: RefinedPoses, pairs: Pairs, corners: LogCorners, cameras: Mapping[str, Camera], sensor: str
+) -> Array:
+    """How far (n,) each corner is from where the poses say that it is, pixels.
+
+    A target's corners are of its stated size; the answer's scale makes it the true one.
+    """
+    found = []
+    for pair, measured in pairs.items():
+        if pair.sensor != sensor or pair.target not in answer.X or sensor not in answer.Y:
+            continue
+        seen, pixels = corners.seen(measured)
+        if not len(seen):
+            continue
+        scale = answer.scale[pair.target] if isinstance(answer.scale, dict) else answer.scale
+        T = _inverse(answer.Y[sensor]) @ measured.A[seen] @ answer.X[pair.target].matrix()
+        points = np.einsum("nij,kj->nki", T[:, :3, :3], corners.targets[pair.target] / scale) + T[:, None, :3, 3]
+        projected = cameras[sensor].project(points.reshape(-1, 3)).reshape(pixels.shape)
+        lengths = np.linalg.norm(projected - pixels, axis=2)
+        found.append(lengths[np.isfinite(lengths)])
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def _inverse(pose: gtsam.Pose3) -> Array:
+    inverse: Array = pose.inverse().matrix()
+    return inverse
+
+
+def _median(errors: Array | None) -> float | None:
+    return None if errors is None or not len(errors) else float(np.median(errors))

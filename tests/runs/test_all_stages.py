@@ -1,0 +1,82 @@
+"""Options that count only for images are refused where there are none: in a stage's log, and in a driver's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic_logs as made
+from typer.testing import CliRunner
+
+from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.errors import LogError, OptionError
+from gtsam_rwhec.logs import ImageRecord, LogWriter, open_log
+from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, draw_log
+
+
+@pytest.fixture(scope="module", params=["detected.mcap", "clean.mcap"])
+def stage_log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of detections, or a cleaned log."""
+    folder = tmp_path_factory.mktemp("stages")
+    detected, clean = folder / "detected.mcap", folder / "clean.mcap"
+    detect_log(made.write(folder / "raw.mcap", made.recording(4.0)), made.rig(), detected)
+    clean_log(detected, clean)
+    path: Path = folder / request.param
+    return path
+
+
+def test_workers_are_refused_where_detection_is_skipped(stage_log: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=rf"workers=2 \(--workers\).*{stage_log.name}.*raw log"):
+        calibrate_log(stage_log, None, tmp_path / "out", workers=2)
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_are_refused_where_the_log_has_none(stage_log: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=rf"--images.*{stage_log.name} has no images to copy"):
+        calibrate_log(stage_log, made.rig(), tmp_path / "out", images="copy")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_images_are_copied_where_the_log_has_them(tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
+    with LogWriter(tmp_path / "image.mcap") as out:
+        out.compressed_image("/cam_0/image", made.BEGIN_NS, "cam_0", "png", b"an image")
+    detect_log([raw, tmp_path / "image.mcap"], made.rig(), tmp_path / "detected.mcap", images="copy")
+    calibrate_log(tmp_path / "detected.mcap", None, tmp_path / "out", images="copy")
+    with open_log(tmp_path / "out" / "clean.mcap") as log:
+        (image,) = (record for record in log.records(["/cam_0/image"]) if isinstance(record, ImageRecord))
+    assert bytes(image.data) == b"an image"
+
+
+@pytest.mark.parametrize("stage", [detect_log, calibrate_log])
+def test_a_drivers_detections_need_no_workers_and_have_no_images(stage: Any, tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
+    with pytest.raises(OptionError, match=r"workers=2 \(--workers\).*no sensor of the rig file has images: leave"):
+        stage(raw, made.rig(), tmp_path / "out", workers=2)
+    with pytest.raises(OptionError, match=r"--images.*raw\.mcap has no images to copy. Leave the option out"):
+        stage(raw, made.rig(), tmp_path / "out", images="copy")
+    assert list(tmp_path.iterdir()) == [raw]
+
+
+def test_a_drivers_detections_cannot_be_drawn(tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
+    (tmp_path / "rig.yaml").write_text(made.rig_text(), encoding="utf-8")
+    arguments = ["detect", raw, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "d.mcap", "--draw", tmp_path / "pics"]
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exit_code == 2
+    assert "(--draw): no sensor of the rig file has images" in " ".join(done.stderr.split())
+    assert {path.name for path in tmp_path.iterdir()} == {"raw.mcap", "rig.yaml"}
+
+    detect_log(raw, made.rig(), tmp_path / "d.mcap")
+    with pytest.raises(OptionError, match="--draw"):
+        draw_log(raw, tmp_path / "d.mcap", tmp_path / "pics")
+    assert not (tmp_path / "pics").exists()
+
+
+def test_several_files_of_which_a_stage_wrote_one_are_refused(stage_log: Path, tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "raw.mcap", [made.transform(made.BEGIN_NS, "base", "hand", np.eye(4))])
+    with pytest.raises(LogError, match="give that file alone"):
+        calibrate_log([stage_log, raw], None, tmp_path / "out")

@@ -1,0 +1,170 @@
+"""Runs that are killed, with SIGKILL, at several moments: the same command does the rest, and finds the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from cells_of_others import WORKCELL
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.runs.all_stages import calibrate_log
+from gtsam_rwhec.runs.earlier_output import DETECTIONS, LIST_FILE
+
+NUMBERS = (1, 43, 61, 94, 112, 121, 208, 221, 233, 242)
+#: Instead of these of the workcell's images there are others: no picture, an empty file, a picture of another size, and
+#: a link to nothing.
+OTHERS = (20, 46, 49, 52)
+IMAGES = len(NUMBERS) + len(OTHERS)
+#: So many are detected together: four of 1920 x 1080, and the others.
+TOGETHER = 4 + len(OTHERS)
+#: Calibrates in a process for each moment, which kills itself then; says how many images each process decoded.
+SCRIPT = """\
+import os, signal, sys
+from pathlib import Path
+import gtsam_rwhec as rw
+from gtsam_rwhec.runs import all_stages, solution_plots
+from gtsam_rwhec.vision import many_images
+
+folder, rig, out, *moments = sys.argv[1:]
+decode, give_name = many_images.decode_gray, os.replace
+
+def calibrate(moment, counts):
+    def counting(*arguments):
+        os.write(counts, b".")
+        return decode(*arguments)
+
+    def killing(source, target):
+        if Path(target).name == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+        give_name(source, target)
+
+    def progress(stage):
+        if stage == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    many_images.decode_gray, os.replace = counting, killing
+    rw.calibrate_log(folder, rw.rig.read_rig(rig), out, workers=1, replace=False, progress=progress)
+
+for moment in moments:
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        calibrate(moment, write)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    os.close(write)
+    print(len(os.read(read, 10_000)), os.WTERMSIG(status), flush=True)
+    if not moment.endswith(".mcap"):
+        with open(f"{out}/detections.jsonl", "ab") as stream:
+            stream.write(b'0badc0de {"batch":1,"count":')
+"""
+
+
+@pytest.fixture(scope="module")
+def cell(workcell_camera2: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ten of the workcell's images, and four that cannot be used."""
+    folder = tmp_path_factory.mktemp("cell")
+    (folder / "image").mkdir()
+    for number in NUMBERS:
+        (folder / "image" / f"{number:04d}.png").symlink_to(workcell_camera2 / "image" / f"{number:04d}.png")
+    others = b"no picture", b"", cv2.imencode(".png", np.zeros((480, 640), dtype=np.uint8))[1].tobytes()
+    for number, content in zip(OTHERS, others, strict=False):
+        (folder / "image" / f"{number:04d}.png").write_bytes(content)
+    (folder / "image" / f"{OTHERS[-1]:04d}.png").symlink_to(folder / "nothing")
+    for name in ("pose", "intrinsic_pars_file.yaml"):
+        (folder / name).symlink_to(workcell_camera2 / name)
+    return folder
+
+
+def result(out: Path) -> Any:
+    """The result without its times."""
+
+    def timeless(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: timeless(of_key) for key, of_key in value.items() if key != "seconds"}
+        return [timeless(each) for each in value] if isinstance(value, list) else value
+
+    return timeless(json.loads((out / "result.json").read_text(encoding="utf-8")))
+
+
+def interrupted(
+    folder: Path, out: Path, stage: str, text: str = WORKCELL, *, replace: bool = True
+) -> tuple[list[str], str]:
+    """What a calibration told until it was interrupted when a stage began, and what it said then."""
+    stages: list[str] = []
+
+    def interrupt(told: str) -> None:
+        stages.append(told)
+        if told.startswith(stage):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        calibrate_log(folder, parse_rig(text, "rig.yaml"), out, workers=1, replace=replace, progress=interrupt)
+    (said,) = stopped.value.__notes__
+    return stages, said
+
+
+@pytest.mark.filterwarnings("ignore:.*(poses have no image|counts as an image)")
+def test_a_run_that_is_killed_again_and_again(cell: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (tmp_path / "rig.yaml").write_text(WORKCELL, encoding="utf-8")
+    moments = (f"detecting: image {TOGETHER} of {IMAGES}", "clean.mcap")
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", SCRIPT, cell, tmp_path / "rig.yaml", out, *moments],
+        capture_output=True,
+        text=True,
+    )
+    killed = [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
+    assert [number for _, number in killed] == [signal.SIGKILL] * 2, done.stderr
+    assert killed[1][0] == IMAGES - TOGETHER  # the rest only
+    assert {DETECTIONS, LIST_FILE, "detected.mcap"} <= {path.name for path in out.iterdir()}
+    assert [path.name for path in out.iterdir() if path.name.startswith(".clean.mcap.")]
+
+    # The result is there before files are exported, which takes longer than all else.
+    stages, _ = interrupted(cell, out, "exporting", replace=False)
+    assert f"going on with an unfinished run: {IMAGES} of {IMAGES} images are done" in stages
+    assert [stage for stage in stages if stage.startswith("detecting")] == [f"detecting: image {IMAGES} of {IMAGES}"]
+    assert not [path for path in out.iterdir() if path.name.endswith(".part")]
+    interrupted(cell, tmp_path / "at once", "exporting")
+    assert result(out) == result(tmp_path / "at once")
+
+    faults = result(out)["log"]["detection"]["undecoded"]["camera2"]
+    assert [fault.split(":")[0] for fault in faults] == [f"image/{number:04d}.png" for number in OTHERS]
+    assert "640 x 480 pixels, but the intrinsics are for 1920 x 1080" in faults[2]
+    assert faults[1] == "image/0046.png: there are no bytes in it"
+    assert faults[3] == "image/0052.png: there are no bytes in it"
+
+
+@pytest.mark.filterwarnings("ignore:.*(poses have no image|counts as an image)")
+def test_an_unfinished_run_of_other_inputs_is_refused(cell: Path, tmp_path: Path) -> None:
+    folder, out = tmp_path / "cell", tmp_path / "out"
+    shutil.copytree(cell, folder, symlinks=True)
+
+    done = f"{TOGETHER} of {IMAGES} images are done"
+    _, said = interrupted(folder, out, "detecting: image")
+    assert said == f"The same command goes on from here: {done}, and kept in {out}."
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    (folder / "image" / "0020.png").write_bytes(b"another content")
+    changed = WORKCELL.replace("square_m: 0.05", "square_m: 0.06")
+    for _ in range(2):  # refused once, it is refused again
+        with pytest.raises(LogError, match=r"unfinished run of other inputs, and nothing was changed: ") as refused:
+            interrupted(folder, out, "detecting: image", changed, replace=False)
+        assert "image/0020.png was changed; targets.board.square_m was 0.05 and is 0.06. Put that back" in str(
+            refused.value
+        )
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    # Where it may replace them it begins anew. What does not count for detection may change then.
+    stages, _ = interrupted(folder, out, "detecting: image", changed)
+    assert not [stage for stage in stages if stage.startswith("going on")]
+    stages, _ = interrupted(folder, out, "writing detections", changed + "cleaning: {consensus: false}\n")
+    assert f"going on with an unfinished run: {done}" in stages

@@ -1,0 +1,68 @@
+"""Corners of a solved log for pictures: errors that stay in the refinement are those of its optimum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from refined_corners import two_cameras
+
+from gtsam_rwhec.evidence.seen_views import SeenView, board_of
+from gtsam_rwhec.refinement.reprojection_found import BoardShape
+from gtsam_rwhec.reprojection.corner_views import pixel_errors
+from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.runs.plotted_corners import residuals_of
+
+
+def views_of(sensor: str) -> list[SeenView]:
+    given, _, refined = two_cameras()
+    view = given.observations.views["board", sensor]
+    corners = board_of(refined, "board", given.observations.corners["board"])
+    inverse = np.linalg.inv(refined.Y[sensor].matrix())
+    X = refined.X["board"].matrix()
+    seen = enumerate(zip(view.A, view.pixels, strict=True))
+    return [SeenView.of(pixels, corners, inverse @ A, X, i) for i, (A, pixels) in seen]
+
+
+def test_errors_are_those_of_the_optimum_where_A_is_a_variable() -> None:
+    _, corners, refined = two_cameras()
+    assert refined.reprojection is not None
+    for stack in corners.graph.model.stacks:
+        sensor = stack.sensor
+        found, image = residuals_of(refined.intrinsics[sensor].camera, views_of(sensor), refined.reprojection)
+        assert np.bincount(image).tolist() == [len(stack.points)] * len(stack.instant)
+        camera = corners.intrinsics[sensor].camera
+        X, Y = corners.X["board"].matrix(), corners.Y[sensor].matrix()
+        optimum = pixel_errors(stack, X, Y, corners.point.A, parameters_of(camera), corners.shapes["board"])
+        assert found.errors_px.shape == stack.pixels.reshape(-1, 2).shape
+        apart = np.abs(found.errors_px) - np.abs(optimum.reshape(-1, 2))  # whichever is taken from the other
+        assert np.abs(apart).max() < 0.05
+        assert np.sqrt((found.errors_px**2).mean()) < 0.11
+        measured = np.concatenate([view.pixels - camera.project(view.points) for view in views_of(sensor)])
+        assert np.sqrt((measured**2).mean()) > 0.15  # with A as it was measured
+
+
+def test_a_misread_corner_does_not_count() -> None:
+    _, _, refined = two_cameras()
+    assert refined.reprojection is not None
+    views = views_of("cam_0")
+    moved = views[3].pixels.copy()
+    moved[7] += 40.0
+    camera = refined.intrinsics["cam_0"].camera
+    found, _ = residuals_of(camera, [*views[:3], views[3]._replace(pixels=moved)], refined.reprojection)
+    assert len(found.pixels) == 4 * len(moved) - 1
+    assert np.abs(found.errors_px).max() < 0.6
+
+
+def test_a_board_is_as_it_was_found() -> None:
+    given, corners, refined = two_cameras()
+    flat = given.observations.corners["board"]
+    found = board_of(refined, "board", flat)
+    size, warp_x, warp_y = corners.shapes["board"]
+    assert refined.reprojection is not None
+    np.testing.assert_allclose(found[:, :2], flat[:, :2] * (1.0 + size), rtol=1e-12)
+    assert np.ptp(found[:, 2]) > 0.2 * max(abs(warp_x), abs(warp_y))
+    stiff = replace(refined, reprojection=replace(refined.reprojection, boards={"board": BoardShape((), (), ())}))
+    np.testing.assert_allclose(board_of(stiff, "board", flat)[:, 2], 0.0)
+    unknown = replace(refined, reprojection=None, scale=0.5)
+    np.testing.assert_allclose(board_of(unknown, "board", flat), 2.0 * flat)
