@@ -4,6 +4,7 @@ python benchmarks/camera_logs.py [--poses 1000000]
 """
 
 from __future__ import annotations
+
 import json
 import sys
 import tempfile
@@ -12,21 +13,18 @@ import tracemalloc
 import warnings
 from pathlib import Path
 from typing import Any
+
 import gtsam
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from mcap.reader import make_reader
-import gtsam_rwhec as rw
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.rig import read_rig
 from ros2_twin import write_twins
-from utias_log import rig_text
-from utias_log import write_utias_log
+from utias_log import rig_text, write_utias_log
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.rig import parse_rig, read_rig
 from gtsam_rwhec.runs.all_stages import calibrate_log
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"

@@ -14,34 +14,21 @@ baselines' answers. Exits with 1 if a bar is missed.
 """
 
 from __future__ import annotations
+
 import multiprocessing
 import os
-from collections.abc import Callable
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures import as_completed
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import TypeVar
+
 import kinhec_tables
-from bars import benchmark_parser
-from bars import print_rows
+from bars import benchmark_parser, print_rows
 from calibrate_times import rows as time_rows
-from kinhec_answers import Answer
-from kinhec_answers import Offsets
-from kinhec_answers import answers_of
-from kinhec_answers import baselines_of
-from kinhec_answers import store_baselines
-from kinhec_answers import stored_baselines
-from kinhec_sequences import STANDARD_SEED
-from kinhec_sequences import TRACKS
-from kinhec_sequences import generated
-from kinhec_sequences import numbers_of
+from kinhec_answers import Answer, Offsets, answers_of, baselines_of, store_baselines, stored_baselines
+from kinhec_sequences import STANDARD_SEED, TRACKS, generated, numbers_of
 from rich.console import Console
-from rich.progress import BarColumn
-from rich.progress import MofNCompleteColumn
-from rich.progress import Progress
-from rich.progress import TextColumn
-from rich.progress import TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 CHUNK = 20
 Result = TypeVar("Result")

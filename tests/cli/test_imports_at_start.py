@@ -1,9 +1,11 @@
 """What starting does not bring in. How long it takes is in benchmarks/start_time.py."""
 
 from __future__ import annotations
+
 import json
 import subprocess
 import sys
+
 import pytest
 
 HEAVY = {
