@@ -50,7 +50,7 @@ from gtsam_rwhec.changes.change_test import change_test
 from gtsam_rwhec.changes.comparing import as_result
 from gtsam_rwhec.changes.constant_errors import without_constant_errors
 from gtsam_rwhec.changes.quantities import Quantities, quantities
-from gtsam_rwhec.refinement.unknowns import Unknown
+from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.simulate.motion import Motion, carrier_poses
 from gtsam_rwhec.simulate.transforms import random_poses
 

@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojec
 import simulated_cells
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
-from gtsam_rwhec.reprojection.intrinsics import Stated
-from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.observations import first_intrinsics
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 LEVEL, LEAST, MOST = 0.95, 0.935, 0.965
 

@@ -34,9 +34,9 @@ import simulated_cells
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NoiseError, RwhecWarning
-from gtsam_rwhec.reprojection.intrinsics import Stated
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.reduced import Noise, Reduced
+from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 #: Of the bound.
 MOST = 1.05

@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojec
 import simulated_cells
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.intrinsics import Stated
-from gtsam_rwhec.reprojection.lens import PINHOLE, parameters_of
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE, parameters_of
 from gtsam_rwhec.vision.distortion import coefficient_jacobian
 
 

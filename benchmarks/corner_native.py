@@ -27,9 +27,9 @@ import native_graph
 import simulated_models
 from rwhec_factors import se3
 
+from gtsam_rwhec.fitting.corner_graph import CornerGraph
+from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.reprojection.corner_graph import CornerGraph
-from gtsam_rwhec.reprojection.reduced import Reduced
 
 
 @dataclass(frozen=True)

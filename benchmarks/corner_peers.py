@@ -16,10 +16,10 @@ from rwhec_factors import se3
 from scipy.optimize import least_squares
 from scipy.sparse import block_diag, csr_matrix, hstack, vstack
 
+from gtsam_rwhec.fitting.corner_residuals import Stack
 from gtsam_rwhec.methods.corner_costs import Corners
 from gtsam_rwhec.methods.evangelista2023 import edges
 from gtsam_rwhec.methods.tabb2017_rp1 import frames_of
-from gtsam_rwhec.reprojection.corner_views import Stack
 
 Array = np.ndarray
 #: Of scipy's tolerances; Ceres has 1e-6 for the cost, which leaves 1e-4 of a deviation.

@@ -24,7 +24,7 @@ import simulated_cells
 import simulated_clocks
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.observations import Views
+from gtsam_rwhec.fitting.observations import Views
 from gtsam_rwhec.vision.targets import Checkerboard
 
 BOARD = Checkerboard("board", 10, 7, 0.03)

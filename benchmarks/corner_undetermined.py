@@ -26,8 +26,8 @@ import placements
 import simulated_cells
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.intrinsics import Stated
-from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 LEVEL, LEAST = 0.95, 0.93
 

@@ -30,10 +30,9 @@ import placements
 import simulated_cells
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.intrinsics import Stated, free_model, prior_of
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.refined import RefinedIntrinsics
-from gtsam_rwhec.reprojection.stated_intrinsics import PARTS, TOLD
+from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import PARTS, TOLD, free_model, parameters_of, prior_of
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.targets import Checkerboard
 

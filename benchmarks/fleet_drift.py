@@ -38,9 +38,9 @@ from simulated_arms import ARM
 import gtsam_rwhec as rw
 from gtsam_rwhec.changes.comparing import as_result
 from gtsam_rwhec.changes.constant_errors import without_constant_errors
+from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.fleet.rows import RobotRow, RowFrame
 from gtsam_rwhec.fleet.watching import DAY_NS, Watched, watch
-from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.simulate.transforms import random_poses
 
 FloatArray = NDArray[np.float64]

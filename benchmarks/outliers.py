@@ -29,9 +29,8 @@ from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OutlierError, RwhecWarning
+from gtsam_rwhec.fitting.truncated_least_squares import NoiseScale, graduated
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.graduated import graduated
-from gtsam_rwhec.refinement.truncated_least_squares import NoiseScale
 from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 

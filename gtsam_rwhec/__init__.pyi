@@ -42,19 +42,19 @@ from .calibration import CrossValidation as CrossValidation
 from .calibration import cross_validate as cross_validate
 from .calibration import reading_of as reading_of
 from .geometry import pose_covariances as pose_covariances
-from .refinement import CarrierNoise as CarrierNoise
-from .refinement import RefineOptions as RefineOptions
-from .refinement import Refined as Refined
-from .refinement import RefinedPoses as RefinedPoses
-from .reprojection import refine as refine
+from .fitting import CarrierNoise as CarrierNoise
+from .fitting import RefineOptions as RefineOptions
+from .fitting import Refined as Refined
+from .fitting import RefinedPoses as RefinedPoses
+from .fitting import refine as refine
 
 # Refine it from the corners in the images, with the cameras' intrinsics.
-from . import reprojection as reprojection
-from .reprojection import CornerOptions as CornerOptions
-from .reprojection import CornersRefined as CornersRefined
-from .reprojection import Observations as Observations
-from .reprojection import calibrate_corners as calibrate_corners
-from .reprojection import refine_corners as refine_corners
+from . import fitting as fitting
+from .fitting import CornerOptions as CornerOptions
+from .fitting import CornersRefined as CornersRefined
+from .fitting import Observations as Observations
+from .fitting import calibrate_corners as calibrate_corners
+from .fitting import refine_corners as refine_corners
 
 # Keep it in files, print it, draw it.
 from . import evidence as evidence

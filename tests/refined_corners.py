@@ -9,11 +9,10 @@ from functools import cache
 from places import REPOSITORY
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.reprojection_found import TriedModel
-from gtsam_rwhec.reprojection.as_refined import as_refined, intrinsics_of
-from gtsam_rwhec.reprojection.held_out import held_out_errors
-from gtsam_rwhec.reprojection.in_numbers import numbers_of
+from gtsam_rwhec.fitting.corners_as_refined import as_refined, intrinsics_of, numbers_of
+from gtsam_rwhec.fitting.held_out import held_out_errors
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.reprojection_record import TriedModel
 
 sys.path.insert(0, str(REPOSITORY / "tests" / "reprojection"))
 from simulated_cells import Cell, cell

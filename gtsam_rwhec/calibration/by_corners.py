@@ -17,16 +17,15 @@ from gtsam_rwhec.calibration.corner_stage import CornersFound, corners_found
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError, RwhecError
+from gtsam_rwhec.fitting.corner_findings import is_doubtful
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
+from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
+from gtsam_rwhec.fitting.fit_options import CornerOptions
+from gtsam_rwhec.fitting.observations import Observations, check_corners_can_hold, check_corners_everywhere
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement import as_stated, observed
 from gtsam_rwhec.problem.nearer_poses import nearer_poses
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.reprojection.findings import is_doubtful
-from gtsam_rwhec.reprojection.observations import Observations
-from gtsam_rwhec.reprojection.options import CornerOptions
-from gtsam_rwhec.reprojection.problem_corners import check_corners_can_hold, check_corners_everywhere
-from gtsam_rwhec.reprojection.refined import RefinedIntrinsics
-from gtsam_rwhec.reprojection.refining import as_stated, observed
-from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.vision.camera import Camera
 
 #: Poses of targets are computed again at most so often.

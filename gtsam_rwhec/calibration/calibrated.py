@@ -22,10 +22,10 @@ from gtsam_rwhec.calibration.verdict import Finding, Judgement, Verdict
 from gtsam_rwhec.calibration.views import SensorView
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array, PoseLike
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.solving.solution import Solution
 
 

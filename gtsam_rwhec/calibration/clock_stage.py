@@ -15,9 +15,9 @@ from gtsam_rwhec.calibration.outlier_stage import say_outliers, without_outliers
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.solution import Solution
 
 #: A time offset of so many standard deviations explains rows that look shifted.

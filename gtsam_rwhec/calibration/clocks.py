@@ -13,11 +13,11 @@ import numpy as np
 from scipy.special import chdtri, stdtrit
 
 from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.pair_data import PairData, local_paths
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.pair_data import PairData, local_paths
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S, LocalPaths
 from gtsam_rwhec.trajectories.trajectory import Trajectory

@@ -13,12 +13,11 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
+from gtsam_rwhec.fitting.held_out import LeftOut, left_out
+from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.held_out import LeftOut, left_out
-from gtsam_rwhec.reprojection.observations import Observations, Views
-from gtsam_rwhec.reprojection.options import CornerOptions
-from gtsam_rwhec.reprojection.refining_corners import refine_corners
 
 #: At most so many images are looked at, and of a pair at least so many.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8

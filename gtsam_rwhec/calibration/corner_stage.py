@@ -16,18 +16,17 @@ from gtsam_rwhec.calibration.corner_choice import Tried, chosen_model, thinned
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import CameraError, OutlierError, RwhecError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.fitting.corner_findings import DETECTOR_PX, is_doubtful, lens_that_was_left_out
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
+from gtsam_rwhec.fitting.corners_as_refined import as_refined, intrinsics_of, numbers_of
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.fit_options import CornerOptions
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement import beyond_independent_errors
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection, TriedModel
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.noise_model.found import NoiseInData
-from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, TriedModel
-from gtsam_rwhec.reprojection.as_refined import as_refined, intrinsics_of
-from gtsam_rwhec.reprojection.findings import DETECTOR_PX, is_doubtful, lens_that_was_left_out
-from gtsam_rwhec.reprojection.in_numbers import numbers_of
-from gtsam_rwhec.reprojection.observations import Observations
-from gtsam_rwhec.reprojection.options import CornerOptions
-from gtsam_rwhec.reprojection.refined import CornersRefined
-from gtsam_rwhec.reprojection.refining_corners import refine_corners
 
 #: What is chosen: the measurements that the answer is from.
 MEASUREMENTS = "refinement"

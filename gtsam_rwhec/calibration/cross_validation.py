@@ -19,6 +19,9 @@ from gtsam_rwhec.calibration.prediction_errors import HoldOutError, PredictionEr
 from gtsam_rwhec.errors import CountError, OptionError, OutlierError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
@@ -26,9 +29,6 @@ from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.calibration.two_poses import TwoPoses, residual_twists
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.refined import Refined
 
 #: At least so many outliers, and this share of those of a frame, agree with one another.
 FEWEST, MOST_OF_THEM = 4, 0.75

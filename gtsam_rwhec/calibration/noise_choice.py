@@ -10,16 +10,14 @@ from gtsam_rwhec.calibration.noise_found import NoiseFound
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.found import NoiseInData
-from gtsam_rwhec.noise_model.options import NoiseOptions
-from gtsam_rwhec.noise_model.refining import under_noise
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.noise_refinement import under_noise
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.problem.pairs import Pair
 
 

@@ -12,9 +12,9 @@ from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.noise_model.found import MOST_BY_CHANCE, NoiseInData, ratio_words
+from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio_words
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.solving.weights import contradicted_by, overstated_by
 

@@ -7,11 +7,8 @@ from typing import Literal, get_args
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, CornerOptions, Drift, NoiseGroups
 from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
-from gtsam_rwhec.noise_model.options import Drift
-from gtsam_rwhec.noise_model.rows import Side
-from gtsam_rwhec.refinement.options import CarrierNoise, NoiseGroups
-from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
@@ -75,7 +72,7 @@ class CalibrateOptions:
     carrier_noise: CarrierNoise | None = None
     drift: Drift = "auto"
     systematic: bool = True
-    hand: Side | None = None
+    hand: About | None = None
     robust: RobustChoice = "auto"
     inlier_confidence: float = 0.997
     misreadings: bool = True
@@ -115,9 +112,10 @@ class CalibrateOptions:
             raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
-        if self.hand is not None and not is_one_of(self.hand, get_args(Side)):
+        if self.hand is not None and not is_one_of(self.hand, get_args(About)):
             raise OptionError(
-                f"CalibrateOptions.hand={brief(self.hand)}; give None, or one of {', '.join(map(repr, get_args(Side)))}"
+                f"CalibrateOptions.hand={brief(self.hand)}; give None, or one of "
+                f"{', '.join(map(repr, get_args(About)))}"
             )
         if not isinstance(self.systematic, bool):
             raise OptionError(f"CalibrateOptions.systematic={brief(self.systematic)}; give True or False")

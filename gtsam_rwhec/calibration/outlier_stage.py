@@ -18,11 +18,11 @@ from gtsam_rwhec.calibration.second_choice import more_consistent
 from gtsam_rwhec.calibration.stated_poses import stated_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.refinement_from_poses import refine
+from gtsam_rwhec.fitting.truncated_least_squares import graduated
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.graduated import graduated
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 

@@ -21,11 +21,11 @@ from gtsam_rwhec.calibration.task_units import (
 )
 from gtsam_rwhec.calibration.views import SensorView
 from gtsam_rwhec.errors import PoseError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.unknowns import Unknown
 
 
 def point_uncertainty(

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import LocalPaths
 

@@ -9,7 +9,7 @@ import gtsam
 
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import RefinedPoses
 
 #: The words for a carrier that a problem does not name. Without A, each but one means the carrier of the point's own
 #: frame; with A, the other one.

@@ -18,17 +18,15 @@ import numpy as np
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions, Walk
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.noise_refinement import refine_under_noise
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement_from_poses import refine
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.found import NoiseInData
-from gtsam_rwhec.noise_model.options import NoiseOptions
-from gtsam_rwhec.noise_model.refining import refine_under_noise
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.refining import refine
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.certified_solution import solve
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.

@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS, Prior
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.refined import Refined
 
 #: Chance that a true stated pose is contradicted.
 CHANCE = 1e-6

@@ -17,14 +17,14 @@ from gtsam_rwhec.calibration.two_poses import TwoPoses, by_station, means_of, re
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.noise_model.drift_choice import CORRELATED, likeness_of_neighbours
-from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.truncated_least_squares import graduated
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.graduated import graduated
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.solving.certified_solution import solve
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.identifiability.free_directions import FEW
-from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.solver.cause import Status
 from gtsam_rwhec.solving.solution import Solution
 

@@ -20,9 +20,9 @@ from scipy.special import chdtrc, fdtrc
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.fitting.joint_covariance import SHARE
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.refinement.joint_covariance import SHARE
 
 #: The level at which something counts as changed, unless another one is asked for.
 LEVEL = 0.01

@@ -14,9 +14,9 @@ from gtsam_rwhec.changes.constant_errors import has_constant_errors, without_con
 from gtsam_rwhec.changes.quantities import Movement, Quantities, quantities
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief, shown
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.result_file import Result
 

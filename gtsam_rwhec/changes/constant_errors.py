@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.result_file import Result
 
 #: An eigenvalue of correlations that is below zero by more than this is none of rounding.

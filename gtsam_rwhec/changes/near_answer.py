@@ -16,27 +16,22 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.component_posterior import FEWEST, SAMPLES, mixture_of
+from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.free_space import free_space_of
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.noise_refinement import SPARE_EQUATIONS, agreeing
+from gtsam_rwhec.fitting.noise_rows import Instants
+from gtsam_rwhec.fitting.noise_search import INSTANTS, Settled, Task, moved, thinned
+from gtsam_rwhec.fitting.noise_summary import FEWER_SAMPLES, is_drift_untried, settled, widening
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.refinement_from_poses import data_of, scale_of, sensors_with_offset
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.noise_model.agreement import agreeing
-from gtsam_rwhec.noise_model.blocks import widening
-from gtsam_rwhec.noise_model.mixture import FEWEST, SAMPLES, mixture_of
-from gtsam_rwhec.noise_model.modelled import FEWER_SAMPLES, is_drift_untried, settled
-from gtsam_rwhec.noise_model.options import NoiseOptions
-from gtsam_rwhec.noise_model.refining import SPARE_EQUATIONS
-from gtsam_rwhec.noise_model.rows import Instants
-from gtsam_rwhec.noise_model.settling import INSTANTS, Settled, Task, moved, thinned
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.free_space import free_space_of
-from gtsam_rwhec.refinement.input_checks import sensors_with_offset
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.refining import data_of, scale_of
-from gtsam_rwhec.refinement.reprojection_found import Intrinsics
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solving.certified_solution import solve
 

@@ -9,8 +9,8 @@ import numpy as np
 from gtsam_rwhec.calibration.prediction_errors import PredictionError, prediction_errors
 from gtsam_rwhec.changes.near_answer import NearAnswer
 from gtsam_rwhec.changes.verification import SensorCheck
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 

@@ -12,11 +12,11 @@ import numpy as np
 from rwhec_factors.se3 import right_jacobian_inverse
 
 from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.fitting.joint_covariance import SHARE, JointCovariance
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.joint_covariance import SHARE, JointCovariance
-from gtsam_rwhec.refinement.reprojection_found import Intrinsics
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 
 
 @dataclass(frozen=True)

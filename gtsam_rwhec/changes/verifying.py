@@ -17,13 +17,11 @@ from gtsam_rwhec.changes.verification import UNSEEN_SENSOR, UNSEEN_TARGET, Senso
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import UnknownKind
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from gtsam_rwhec.evidence.record import EvidenceRecord, Rows
+from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.reprojection_found import WARPS, BoardShape
 from gtsam_rwhec.vision.dictionaries import dictionary, modules
 from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
 from gtsam_rwhec.vision.target_checks import grid, square

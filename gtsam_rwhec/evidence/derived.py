@@ -13,9 +13,9 @@ from pydantic import Field
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.evidence.record import EvidenceRecord
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import UnknownKind
 
 Triple = tuple[float, float, float]
 Deviations = tuple[float | None, float | None, float | None]

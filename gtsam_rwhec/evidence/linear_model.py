@@ -19,11 +19,11 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.evidence.measured import MeasuredRows
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.refinement.refined import PairNoise
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 
 #: Directions with less than this share of the largest information, in units of their own, count as free.
 FREE = 1e-12

@@ -16,10 +16,10 @@ from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.evidence.board_shapes import WITH_MODULES, DrawnBoard, drawn_board, drawn_points
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.record import EvidenceRecord, Rows
+from gtsam_rwhec.fitting.reprojection_record import BoardShape
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.reprojection_found import BoardShape
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.targets import Target
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from gtsam_rwhec.evidence.seen import CELLS, MOST_WORST, SeenCamera, WorstImage
 from gtsam_rwhec.evidence.seen_views import CornerErrors, SeenView, errors_as_measured, errors_at_optimum
+from gtsam_rwhec.fitting.reprojection_record import Reprojection
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.reprojection_found import Reprojection
 from gtsam_rwhec.vision.camera import Camera
 
 #: So many corners of a camera are kept, and so many of all cameras together.

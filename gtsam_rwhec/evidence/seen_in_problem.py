@@ -13,10 +13,10 @@ from gtsam_rwhec.evidence.seen import PIECES, SeenEvidence
 from gtsam_rwhec.evidence.seen_cameras import rated_views, seen_cameras, worst_image, worst_views
 from gtsam_rwhec.evidence.seen_tracks import counts_of, removed_list, span_of, tracks_of
 from gtsam_rwhec.evidence.seen_views import SeenView, board_of
+from gtsam_rwhec.fitting.pair_data import local_paths
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.pair_data import local_paths
-from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: The stage that removes measurements of a problem.

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.fitting.corner_residuals import shaped
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.reprojection_record import SIZE, WARPS, Reprojection
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import SIZE, WARPS, Reprojection
-from gtsam_rwhec.reprojection.corner_views import shaped
 from gtsam_rwhec.vision.camera import Camera
 
 #: Fewer corners than this in an image say nothing beside its pose.

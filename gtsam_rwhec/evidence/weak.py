@@ -26,10 +26,10 @@ from rwhec_factors import se3
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.record import EvidenceRecord
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.refinement.refined import Refined
 
 Triple = tuple[float, float, float]
 Kind = Literal["translation", "rotation"]

@@ -13,13 +13,13 @@ import numpy as np
 from rwhec_factors.batch import BatchResiduals
 
 from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 
 
 def with_covariances_of_detections(found: Calibration, problem: Problem, covariances: dict[Pair, Array]) -> Calibration:

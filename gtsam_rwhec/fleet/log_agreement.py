@@ -9,11 +9,11 @@ from scipy.special import chdtrc
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.fleet.detection_covariance import rows_of_pair, weights_of_pair
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 
 #: Logs disagree where a frame's changes are this many times what noise explains, by chance in one case of a million.
 TIMES, CHANCE = 2.0, 1e-6

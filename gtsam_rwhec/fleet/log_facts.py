@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.options import About
 from gtsam_rwhec.results.log_history import (
     CleaningReport,
     DetectionReport,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fleet.log_facts import Weighting
 from gtsam_rwhec.fleet.map_log import measurements_file, partial_file
 from gtsam_rwhec.fleet.merging import Merged, sensor_name
@@ -18,7 +19,6 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import GivenMeasurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 

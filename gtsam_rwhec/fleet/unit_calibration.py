@@ -11,6 +11,8 @@ from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.calibrating import calibrate
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.fleet.consistency import check_logs
 from gtsam_rwhec.fleet.detection_covariance import with_covariances_of_detections
 from gtsam_rwhec.fleet.log_agreement import disagreeing_logs
@@ -18,8 +20,6 @@ from gtsam_rwhec.fleet.log_facts import findings_of_logs, merged_fields
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.fleet.merging import Merged
 from gtsam_rwhec.problem.of_moments import problem_of_moments
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.unknowns import UnknownKind
 from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import LogFields, TimeOffsetFields
 from gtsam_rwhec.results.unanswered import short_of_measurements

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.fitting.corner_residuals import SHAPE, Linear, Stack, linearised, pixel_errors, stacks_of
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.reprojection.corner_views import SHAPE, Linear, Stack, linearised, pixel_errors, stacks_of
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.observations import Observations
 
 #: Boards are as stated.
 FLAT = np.zeros(SHAPE)

@@ -19,12 +19,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.fitting.corner_residuals import linearised
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods.corner_costs import FLAT, Corners, Minimum
 from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
-from gtsam_rwhec.reprojection.corner_views import linearised
-from gtsam_rwhec.reprojection.lens import parameters_of
 
 #: Deviations (rad, m) of a robot's pose for each pixel of a corner's, where information matrices are the identity.
 IDENTITY = (2.0, 1.0)

@@ -10,12 +10,12 @@ from __future__ import annotations
 from functools import partial
 
 from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.fitting.observations import check_corners_everywhere, observations_of
 from gtsam_rwhec.methods import reprojection
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.methods.tabb2017 import SOURCE
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.reprojection.problem_corners import check_corners_everywhere, observations_of
 
 
 def check_corners(problem: Problem) -> None:

@@ -17,6 +17,10 @@ import numpy as np
 
 from gtsam_rwhec.errors import CameraError, OptionError, RwhecError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.fitting.corner_checks import check_arguments
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
+from gtsam_rwhec.fitting.observations import Observations, solved_with_chosen_poses
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, one_transform, to_pose3
 from gtsam_rwhec.methods import evangelista2023, tabb2017_rp1
@@ -26,12 +30,6 @@ from gtsam_rwhec.methods.estimate import Poses
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import MethodOptions, check_options, checked_start
 from gtsam_rwhec.methods.tabb2017 import Parameterisation
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.chosen_poses import solved_with_chosen_poses
-from gtsam_rwhec.reprojection.determined import check_arguments
-from gtsam_rwhec.reprojection.observations import Observations
-from gtsam_rwhec.reprojection.options import CornerOptions
-from gtsam_rwhec.reprojection.refining_corners import refine_corners
 
 #: The name of ``rw.refine_corners`` in tables.
 OURS = "refine_corners"

@@ -11,11 +11,7 @@ from rich.console import Console
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import Consequence, Intrinsics, Reprojection
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
-from gtsam_rwhec.reprojection.consequences import (
+from gtsam_rwhec.fitting.corners_as_refined import (
     CARRIER_RAD,
     CENTRE_PX,
     FOCAL_SHARE,
@@ -23,7 +19,11 @@ from gtsam_rwhec.reprojection.consequences import (
     centre_causes,
     focal_cause,
 )
-from gtsam_rwhec.reprojection.projection_uncertainty import uneven_words
+from gtsam_rwhec.fitting.projection_uncertainty import uneven_words
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.reprojection_record import Consequence, Intrinsics, Reprojection
+from gtsam_rwhec.report.pose_table import FrameTable
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
 
 ERRORS_LEGEND = (
     "rms: root mean square of the corners that count, along each axis. hold-out: root mean square length of the error "

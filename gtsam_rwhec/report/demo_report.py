@@ -8,10 +8,10 @@ import numpy as np
 from rich.console import Console
 
 from gtsam_rwhec.datasets.demo_log import DemoTruth
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_heading, print_list, print_tables, report_console
 from gtsam_rwhec.results.log_history import LogFields

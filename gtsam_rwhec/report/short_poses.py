@@ -9,7 +9,7 @@ from dataclasses import replace
 import gtsam
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS, deviation_cells, label, scale_and_offset_sentences
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
 from gtsam_rwhec.report.short_report import PoseTables

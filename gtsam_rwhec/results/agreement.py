@@ -16,8 +16,8 @@ from typing import Any
 from gtsam_rwhec.calibration.disagreement import HALF, NEARLY_HALF
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.files.terminal_text import brief, shown
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import SIZE
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.reprojection_record import SIZE
 from gtsam_rwhec.results.json_tree import POSED
 from gtsam_rwhec.results.log_history import LogFields, contradictions
 from gtsam_rwhec.results.schema import RefinedFields, SolutionFields

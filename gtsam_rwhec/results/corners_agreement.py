@@ -14,10 +14,10 @@ import numpy as np
 
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.fitting.corners_as_refined import SHAPE_NAMES
+from gtsam_rwhec.fitting.reprojection_record import SIZE, BoardShape, Intrinsics, Regions, Reprojection, lens_of
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.reprojection_found import SIZE, BoardShape, Intrinsics, Regions, Reprojection, lens_of
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.reprojection.as_refined import SHAPE_NAMES
 from gtsam_rwhec.results.covariance_agreement import TWICE
 from gtsam_rwhec.results.schema import RefinedFields
 

@@ -10,12 +10,12 @@ from collections.abc import Iterable
 import numpy as np
 
 from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.reprojection_record import SIZE
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import SIZE
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.schema import FrameFields, RefinedFields, SolutionFields
 
 #: Largest difference of two mirrored elements of a covariance, over the root of the product of their variances.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gtsam_rwhec.calibration.disagreement import LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.results.log_history import FrameOutliers, LogFields
 from gtsam_rwhec.results.unanswered import shortage
 from gtsam_rwhec.solving.solution import Solution

@@ -16,7 +16,7 @@ from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.results.agreement import (
     check_certificates,
     check_log,

@@ -17,12 +17,12 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetPydanticSchema, model_validator
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.refined import PairNoise, RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.residuals import Residual

@@ -19,7 +19,7 @@ from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.errors import FileFormatError, OptionError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.paths import checked_path
-from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
+from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.conventions import CONVENTIONS
 from gtsam_rwhec.results.json_tree import POSED, in_words, to_json

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from gtsam_rwhec.reprojection.intrinsics import Stated
+from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.rig.field_types import OrText, Text, list_of
 from gtsam_rwhec.rig.section import Section, one_of
 from gtsam_rwhec.vision.camera import Camera

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import Intrinsics
-from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
+from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 from gtsam_rwhec.vision.camera import Camera
 

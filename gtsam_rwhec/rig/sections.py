@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from gtsam_rwhec.reprojection.intrinsics import Stated
+from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.rig.camera_link import link_of_optical
 from gtsam_rwhec.rig.field_types import EulerAxes, FramePair, Name, OrText, Positive, Text, TimeOffset, list_of
 from gtsam_rwhec.rig.intrinsics_section import IntrinsicsOrText

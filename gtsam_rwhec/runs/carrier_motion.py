@@ -10,10 +10,10 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import LogError, StampError, TransformError
+from gtsam_rwhec.fitting.fit_options import About, CarrierNoise
+from gtsam_rwhec.fitting.free_space import MOVED
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
-from gtsam_rwhec.refinement.free_space import MOVED
-from gtsam_rwhec.refinement.options import About, CarrierNoise
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 from gtsam_rwhec.trajectories.smooth_path import SmoothPath

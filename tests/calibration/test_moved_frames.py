@@ -9,7 +9,7 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.moved_frames import moved_frame
 from gtsam_rwhec.calibration.trial_fits import Sample
-from gtsam_rwhec.noise_model.drift_choice import CORRELATED, likeness_of_neighbours
+from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
 
 COUNT = 120
 

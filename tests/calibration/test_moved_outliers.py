@@ -8,9 +8,9 @@ from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.moved_outliers import Measured, moved_with_outliers
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.simulate.transforms import random_poses
 
 #: A step of 3 degrees and 2 cm; noise of 0.02 degrees and 0.2 mm; the measurement before which the frame moves.

@@ -12,8 +12,8 @@ from refinement_problems import rig
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.evidence.derived import DISTANCES_M, Derived, clock_effects, derived_of
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from harness import Harness, scratch
 from mutations import json_tree
 
 from gtsam_rwhec.calibration.calibrating import calibrate
-from gtsam_rwhec.refinement import refined, refining
+from gtsam_rwhec.fitting import refined, refinement
 from gtsam_rwhec.results import result_file, written_result
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solving import certified_solution
@@ -50,7 +50,7 @@ def seeds() -> Iterable[bytes]:
             solution = certified_solution.solve(problem)
             written_result.write_solution(solution, folder / "a.json")
             yield (folder / "a.json").read_bytes()
-        better: refined.Refined = refining.refine(problems[0], certified_solution.solve(problems[0]))
+        better: refined.Refined = refinement.refine(problems[0], certified_solution.solve(problems[0]))
         calibrations = [calibrate(problem) for problem in problems[:2]]
     written_result.write_refined(better, folder / "b.json")
     yield (folder / "b.json").read_bytes()

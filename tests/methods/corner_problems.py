@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.vision.camera import Camera
 
 CAMERAS = {

@@ -9,12 +9,12 @@ from method_problems import four_targets, one_pair
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import MethodOptions, evangelista2023, run
 from gtsam_rwhec.methods import reprojection as methods
 from gtsam_rwhec.methods.corner_costs import Corners
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.simulate.simulation import frame_distance
 
 

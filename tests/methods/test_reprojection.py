@@ -11,11 +11,11 @@ from problems_of_corners import problem_of
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, OptionError, TargetError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.methods import MethodOptions, compare, run
 from gtsam_rwhec.methods import reprojection as methods
 from gtsam_rwhec.methods.corner_costs import Corners
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.simulate.simulation import frame_distance
 
 

@@ -11,12 +11,12 @@ from corner_problems import seen
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import MethodOptions, tabb2017_rp1
 from gtsam_rwhec.methods import reprojection as methods
 from gtsam_rwhec.methods.corner_costs import Corners
 from gtsam_rwhec.methods.tabb2017 import CHARTS, Parameterisation
-from gtsam_rwhec.reprojection.observations import Observations, Views
 
 EVERY: tuple[Parameterisation, ...] = get_args(Parameterisation)
 

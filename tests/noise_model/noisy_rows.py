@@ -6,12 +6,12 @@ import numpy as np
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.noise_model.rows import Instants, Rows
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.noise_rows import Instants, Rows
+from gtsam_rwhec.fitting.pair_data import PairData
+from gtsam_rwhec.fitting.unknowns import Variables
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.pair_data import PairData
-from gtsam_rwhec.refinement.variables import Variables
 
 
 def random_poses(chance: np.random.Generator, count: int, angle: float = 1.0, length: float = 0.5) -> np.ndarray:

@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.noise_model.components import Component, Sizes
-from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.options import NoiseOptions
-from gtsam_rwhec.noise_model.reml import Fitted
-from gtsam_rwhec.noise_model.rows import Instants, Side
-from gtsam_rwhec.noise_model.settling import Settled, Task, moved
-from gtsam_rwhec.refinement.free_space import free_space_of
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.pair_data import PairData, local_paths
-from gtsam_rwhec.refinement.variables import Variables
+from gtsam_rwhec.fitting.component_posterior import Fitted
+from gtsam_rwhec.fitting.fit_options import About, Component, NoiseOptions, RefineOptions, Walk
+from gtsam_rwhec.fitting.free_space import free_space_of
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.noise_components import Sizes
+from gtsam_rwhec.fitting.noise_rows import Instants
+from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
+from gtsam_rwhec.fitting.pair_data import PairData, local_paths
+from gtsam_rwhec.fitting.unknowns import Variables
 from gtsam_rwhec.solver.parts import parts_of
 
 C = Component
@@ -35,7 +33,7 @@ def task_of(problem: rw.Problem, solution: rw.Solution, offsets: tuple[str, ...]
     return Task(problem, data, variables, layout, Instants.of(data), NoiseOptions(), space.directions)
 
 
-def settled_at(task: Task, solution: rw.Solution, side: Side, walk: Walk | None, *, systematic: bool) -> Settled:
+def settled_at(task: Task, solution: rw.Solution, side: About, walk: Walk | None, *, systematic: bool) -> Settled:
     """The optimum at ``SIGMA``, as ``Task.settle`` leaves it at the components that it finds."""
     sizes = Sizes.of(SIGMA, {})
     state = task.variables.start(solution)

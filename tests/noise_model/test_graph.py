@@ -13,14 +13,11 @@ from settled_models import SIGMA, settled_at, task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.noise_model import graph as graphs
-from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.graph import NoiseGraph, graph_of, optimum_of
-from gtsam_rwhec.noise_model.refined import disagreement
-from gtsam_rwhec.noise_model.rows import Side
-from gtsam_rwhec.noise_model.settling import Settled, Task
-from gtsam_rwhec.refinement.optimisation import information_of, optimise
+from gtsam_rwhec.fitting import noise_graph as graphs
+from gtsam_rwhec.fitting.fit_options import About, Component, Walk
+from gtsam_rwhec.fitting.noise_graph import NoiseGraph, disagreement, graph_of, optimum_of
+from gtsam_rwhec.fitting.noise_search import Settled, Task
+from gtsam_rwhec.fitting.pose_graph import information_of, optimise
 
 C = Component
 
@@ -34,7 +31,7 @@ class Case:
     scale: str = "shared"
     walk: Walk | None = None
     systematic: bool = False
-    side: Side = "targetcarrier"
+    side: About = "targetcarrier"
     priors: bool = False
     fixed: bool = False
     offset: bool = False

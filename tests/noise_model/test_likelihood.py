@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from noisy_rows import problem_of, rows_of
 
-from gtsam_rwhec.noise_model.average_information import average_information
-from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.drift import TRACK, DriftPrior, Walk, drift_columns, unit_of
-from gtsam_rwhec.noise_model.likelihood import NoiseModel
-from gtsam_rwhec.noise_model.rows import Side
+from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns, unit_of
+from gtsam_rwhec.fitting.fit_options import About, Component, Walk
+from gtsam_rwhec.fitting.noise_likelihood import NoiseModel, average_information
 
 C = Component
 SIGMA = {
@@ -63,7 +61,7 @@ def dense_variance(model: NoiseModel, sigma: dict[Component, float]) -> np.ndarr
 @pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
 @pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False), (4, 1, True)])
 def test_it_is_that_of_dense_matrices(
-    targets: int, sensors: int, shared: bool, correlation: float | None, side: Side
+    targets: int, sensors: int, shared: bool, correlation: float | None, side: About
 ) -> None:
     rows, *_ = rows_of(problem_of(targets, sensors, 8, scale="shared", shared=shared))
     # without one frame, nothing is free
@@ -92,7 +90,7 @@ def test_it_is_that_of_dense_matrices(
     np.testing.assert_allclose(found.step, -np.linalg.solve(information, g), rtol=1e-6, atol=1e-9)
 
 
-def model_of(targets: int, sensors: int, shared: bool, correlation: float | None, side: Side) -> NoiseModel:
+def model_of(targets: int, sensors: int, shared: bool, correlation: float | None, side: About) -> NoiseModel:
     """With covariances stated, full ones, and some measurements of the last instants left out."""
     problem = problem_of(targets, sensors, 9, scale="shared", shared=shared, missing=2)
     rows, *_ = rows_of(problem)
@@ -116,7 +114,7 @@ def model_of(targets: int, sensors: int, shared: bool, correlation: float | None
 @pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
 @pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False), (4, 1, True)])
 def test_the_gradient_is_that_of_differences(
-    targets: int, sensors: int, shared: bool, correlation: float | None, side: Side
+    targets: int, sensors: int, shared: bool, correlation: float | None, side: About
 ) -> None:
     model = model_of(targets, sensors, shared, correlation, side)
     active = tuple(c for c in Component if correlation is not None or not c.startswith("drift"))
@@ -135,7 +133,7 @@ def test_the_gradient_is_that_of_differences(
 )
 @pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False), (4, 1, True)])
 def test_the_average_information_is_that_of_dense_matrices(
-    targets: int, sensors: int, shared: bool, correlation: float | None, side: Side
+    targets: int, sensors: int, shared: bool, correlation: float | None, side: About
 ) -> None:
     model = model_of(targets, sensors, shared, correlation, side)
     active = tuple(c for c in Component if correlation is not None or not c.startswith("drift"))

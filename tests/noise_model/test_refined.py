@@ -13,13 +13,11 @@ from settled_models import SIGMA, settled_at, task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotConvergedWarning
-from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.refined import change_between, refined_of
-from gtsam_rwhec.noise_model.settling import Settled, Task, moved
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.fitting.fit_options import Component, RefineOptions, Walk
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.noise_graph import change_between, refined_of
+from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
+from gtsam_rwhec.fitting.refined import Refined
 
 C = Component
 

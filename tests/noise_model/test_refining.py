@@ -9,12 +9,11 @@ from rwhec_factors import se3
 from settled_models import task_of
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.noise_model import Component, NoiseOptions, refine_under_noise, under_noise
-from gtsam_rwhec.noise_model.components import SMALLEST, Sizes
-from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.likelihood import Estimate
-from gtsam_rwhec.noise_model.mixture import DRAWS, SAMPLES, Mixture
-from gtsam_rwhec.noise_model.reml import fitted, value_and_gradient
+from gtsam_rwhec.fitting import Component, NoiseOptions, refine_under_noise, under_noise
+from gtsam_rwhec.fitting.component_posterior import DRAWS, SAMPLES, Mixture, fitted, value_and_gradient
+from gtsam_rwhec.fitting.fit_options import Walk
+from gtsam_rwhec.fitting.noise_components import SMALLEST, Sizes
+from gtsam_rwhec.fitting.noise_likelihood import Estimate
 
 C = Component
 X = se3.expmap(np.array([[0.2, -0.3, 0.1, 0.5, 0.4, 0.2]]))[0]
@@ -49,7 +48,7 @@ def simulated(
 
 def refined_under(
     problem: rw.Problem, options: NoiseOptions | None = None
-) -> tuple[rw.Refined, rw.noise_model.NoiseInData]:
+) -> tuple[rw.Refined, rw.fitting.NoiseInData]:
     return refine_under_noise(problem, rw.solve(problem), options=options)
 
 

@@ -7,7 +7,7 @@ from noisy_rows import random_poses, rows_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.noise_model.rows import stations
+from gtsam_rwhec.fitting.noise_rows import stations
 
 VISITS, STATIONS = 5, 12
 X, Y = random_poses(np.random.default_rng(1), 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.noise_model.tridiagonal import ChainFactor
+from gtsam_rwhec.fitting.drift import ChainFactor
 
 
 def blocks_of(T: int, s: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

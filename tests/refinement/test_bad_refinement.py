@@ -12,7 +12,7 @@ import pytest
 from refinement_problems import KAPPA, SIGMA_M, refined, rig
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.trajectories import Trajectory
 
 PROBLEM = rig(seed=1).problem

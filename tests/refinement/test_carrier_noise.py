@@ -8,8 +8,8 @@ import pytest
 from refinement_problems import KAPPA, SIGMA_M, copied, distance, refined, rig
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.refinement.graph import CarrierVariables
-from gtsam_rwhec.refinement.pair_data import PairData, carrier_covariances
+from gtsam_rwhec.fitting.pair_data import PairData, carrier_covariances
+from gtsam_rwhec.fitting.pose_graph import CarrierVariables
 from gtsam_rwhec.simulate import Noise, general
 
 CARRIER = rw.CarrierNoise(rotation_rad=np.radians(0.5), translation_m=0.003)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.refinement.definite_inverse import SMALL, EliminationOrder
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.fitting.joint_covariance import SMALL, EliminationOrder, JointCovariance
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 
 
 def information(targets: int, sensors: int, scales: bool, chance: np.random.Generator) -> np.ndarray:

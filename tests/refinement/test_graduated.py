@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from outlier_problems import Pair, corrupted
 
 import gtsam_rwhec as rw
-import gtsam_rwhec.refinement.graduated as graduated_module
-import gtsam_rwhec.refinement.truncated_least_squares as stages_module
+import gtsam_rwhec.fitting.truncated_least_squares as graduated_module
+import gtsam_rwhec.fitting.truncated_least_squares as stages_module
 import gtsam_rwhec.solver.search as search_module
 from gtsam_rwhec.errors import (
     MeasurementsNotKeptError,
@@ -25,15 +25,16 @@ from gtsam_rwhec.errors import (
     RwhecWarning,
     ScaleError,
 )
-from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.graduated import Graduated, graduated
-from gtsam_rwhec.refinement.truncated_least_squares import (
+from gtsam_rwhec.fitting.truncated_least_squares import (
     MAX_ADMISSIONS,
     MAX_FITS,
     MAX_GRADUATIONS,
     MAX_VOTES,
+    Graduated,
+    graduated,
     truncated_weights,
 )
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 

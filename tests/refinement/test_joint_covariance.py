@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.unknowns import Unknown
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.unknowns import Unknown
 
 A, B, SCALE = (Unknown.of(name) for name in ("a", "b", "scale"))
 

@@ -8,9 +8,8 @@ from rwhec_factors import se3
 from scipy.stats import chi2
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit, weighted_fit
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.squared_residuals import Measured
-from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.simulate import Noise, Simulation, general
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)

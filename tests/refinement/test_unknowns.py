@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind, slots_of
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, slots_of
 
 
 @pytest.mark.parametrize(

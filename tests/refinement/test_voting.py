@@ -11,11 +11,9 @@ from outlier_problems import corrupted
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit, by_vote, weighted_fit
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.squared_residuals import Measured
-from gtsam_rwhec.refinement.voting import by_vote
-from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.simulate import Noise, general, perturb
 
 NOISE = Noise(sigma_m=0.01, kappa=2000.0)

@@ -9,9 +9,8 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit, at_physical_optimum, weighted_fit
 from gtsam_rwhec.problem.variance_factors import AS_STATED
-from gtsam_rwhec.refinement.squared_residuals import Measured
-from gtsam_rwhec.refinement.weighted_fit import WeightedFit, at_physical_optimum, weighted_fit
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.parts import parts_of
 

@@ -12,8 +12,9 @@ from refined_corners import two_cameras
 from rich.console import Console
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.reprojection_found import Consequence, Intrinsics
+from gtsam_rwhec.fitting.corners_as_refined import OF_CARRIERS, centre_causes, focal_cause
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.reprojection_record import Consequence, Intrinsics
 from gtsam_rwhec.report import print_corners, print_refined
 from gtsam_rwhec.report.corner_report import consequences_table, errors_table, intrinsics_sentences, intrinsics_table
 from gtsam_rwhec.report.covariance_report import (
@@ -23,7 +24,6 @@ from gtsam_rwhec.report.covariance_report import (
     refined_sentences,
     scale_and_offset_sentences,
 )
-from gtsam_rwhec.reprojection.consequences import OF_CARRIERS, centre_causes, focal_cause
 from gtsam_rwhec.results import read_result
 
 GOLDEN = Path(__file__).parents[1] / "golden"

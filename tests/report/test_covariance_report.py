@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.fitting.refined import PairNoise
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.refined import PairNoise
 from gtsam_rwhec.report import print_refined
 from gtsam_rwhec.report.covariance_report import (
     deviation_cells,

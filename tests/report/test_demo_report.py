@@ -13,7 +13,7 @@ from rich.console import Console
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.datasets.demo_log import demo_truth
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind, slots_of
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, slots_of
 from gtsam_rwhec.report.demo_report import hidden_sentences, print_demo, truth_table
 from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TrackCount
 

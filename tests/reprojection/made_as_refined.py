@@ -8,12 +8,12 @@ from simulated_cells import Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.fitting.corners_as_refined import as_refined, boards_of, intrinsics_of
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.reprojection_record import Reprojection
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.noise_model.found import NoiseInData
-from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.reprojection_found import Reprojection
-from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
-from gtsam_rwhec.reprojection.refined import CornersRefined
 
 
 @cache

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors import se3
 
-from gtsam_rwhec.reprojection.corner_graph import key_of
-from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.fitting.corner_graph import key_of
+from gtsam_rwhec.fitting.corner_model import Model, Point
 
 Array = NDArray[np.float64]
 #: GTSAM's calibration of a lens model, by its name and number of coefficients.

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors import se3
 
-from gtsam_rwhec.reprojection.corner_views import shaped
-from gtsam_rwhec.reprojection.intrinsics import Stated, prior_of
-from gtsam_rwhec.reprojection.lens import camera_with, parameters_of, pixels_of
-from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.fitting.corner_residuals import shaped
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.stated_intrinsics import camera_with, parameters_of, pixels_of, prior_of
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.targets import Checkerboard
 

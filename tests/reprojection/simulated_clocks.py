@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rwhec_factors import se3
 from simulated_cells import Cell
 
-from gtsam_rwhec.reprojection.corner_views import stacks_of
+from gtsam_rwhec.fitting.corner_residuals import stacks_of
 
 #: Speeds of the carriers about and along each axis: rad/s, m/s.
 SPEED = np.repeat([0.4, 0.2], 3)

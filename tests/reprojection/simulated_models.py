@@ -6,10 +6,9 @@ import numpy as np
 from rwhec_factors import se3
 from simulated_cells import Cell
 
-from gtsam_rwhec.reprojection.corner_views import stacks_of
-from gtsam_rwhec.reprojection.intrinsics import prior_of
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_residuals import stacks_of
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of, prior_of
 
 A_NOISE = np.repeat([1e-3, 5e-4], 3)
 CORNER_PX = 0.1

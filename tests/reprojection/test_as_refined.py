@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from made_as_refined import made
 
-from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
-from gtsam_rwhec.refinement.reprojection_found import Reprojection
-from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
-from gtsam_rwhec.reprojection.projection_uncertainty import projection_deviations
+from gtsam_rwhec.fitting.corners_as_refined import as_refined, boards_of, intrinsics_of
+from gtsam_rwhec.fitting.projection_uncertainty import projection_deviations
+from gtsam_rwhec.fitting.refinement import beyond_independent_errors
+from gtsam_rwhec.fitting.reprojection_record import Reprojection
 
 
 def test_poses_covariances_and_names_are_those_of_the_corners() -> None:

@@ -11,7 +11,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.reprojection.observations import Views
+from gtsam_rwhec.fitting.observations import Views
 from gtsam_rwhec.vision.camera import Camera
 
 UNKNOWN = rw.CornerOptions(stated="unknown")

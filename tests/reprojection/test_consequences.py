@@ -10,10 +10,10 @@ from rwhec_factors import se3
 from simulated_cells import cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.refinement.optimisation import optimise
-from gtsam_rwhec.reprojection.consequences import OF_CARRIERS, consequences_of
-from gtsam_rwhec.reprojection.corner_graph import CornerGraph
-from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.fitting.corner_graph import CornerGraph
+from gtsam_rwhec.fitting.corners_as_refined import OF_CARRIERS, consequences_of
+from gtsam_rwhec.fitting.pose_graph import optimise
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 EXACT = rw.CornerOptions(stated="calibration", carrier_noise="exact")
 

@@ -18,12 +18,12 @@ from simulated_models import A_NOISE, CORNER_PX, model_and_point
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, FrameError, OptionError
-from gtsam_rwhec.reprojection.corner_graph import CornerGraph, key_of
-from gtsam_rwhec.reprojection.corner_views import linearised, pixel_errors, stacks_of
-from gtsam_rwhec.reprojection.held_out import held_out_errors
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.model import Model, Point
-from gtsam_rwhec.reprojection.reduced import Reduced
+from gtsam_rwhec.fitting.corner_graph import CornerGraph, key_of
+from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Reduced
+from gtsam_rwhec.fitting.corner_residuals import linearised, pixel_errors, stacks_of
+from gtsam_rwhec.fitting.held_out import held_out_errors
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 LATE = {"cam_0": 4e-3, "cam_1": -2e-3}
 OPTIONS = rw.CornerOptions(stated="calibration", time_offsets=("cam_0", "cam_1"))
@@ -102,7 +102,7 @@ def test_the_sums_by_instant_have_the_graphs_information(small: Cell, about: str
 
 
 @pytest.mark.parametrize("noise", ["exact", "estimate"])
-def test_offsets_are_found_with_everything_else(late: Cell, noise: rw.refinement.CarrierPoses) -> None:
+def test_offsets_are_found_with_everything_else(late: Cell, noise: rw.fitting.CarrierPoses) -> None:
     X, Y = late.near(np.random.default_rng(0))
     options = replace(OPTIONS, carrier_noise=noise)
     refined = rw.refine_corners(late.observations, X, Y, options)

@@ -9,8 +9,8 @@ import pytest
 from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.findings import findings_of
-from gtsam_rwhec.reprojection.observations import Views
+from gtsam_rwhec.fitting.corner_findings import findings_of
+from gtsam_rwhec.fitting.observations import Views
 
 EXACT = rw.CornerOptions(carrier_noise="exact")
 

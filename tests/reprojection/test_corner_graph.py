@@ -9,9 +9,9 @@ from rwhec_factors import se3
 from simulated_cells import Cell, cell
 from simulated_models import A_NOISE, CORNER_PX, model_and_point
 
-from gtsam_rwhec.reprojection.corner_graph import CornerGraph, key_of
-from gtsam_rwhec.reprojection.model import Point
-from gtsam_rwhec.reprojection.reduced import Reduced
+from gtsam_rwhec.fitting.corner_graph import CornerGraph, key_of
+from gtsam_rwhec.fitting.corner_model import Point
+from gtsam_rwhec.fitting.corner_noise import Reduced
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from rwhec_factors import se3
 from simulated_cells import BOARD, CAMERA, Cell, cell
 
-from gtsam_rwhec.reprojection.corner_views import Stack, linearised, pixel_errors, shaped, stacks_of
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.fitting.corner_residuals import Stack, linearised, pixel_errors, shaped, stacks_of
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 Array = NDArray[np.float64]
 SHAPE = np.array([2e-3, 1e-3, -2e-3])

@@ -17,7 +17,7 @@ from simulated_cells import CAMERA, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.refinement.reprojection_found import Consequence, Reprojection, SensorReprojection, TriedModel
+from gtsam_rwhec.fitting.reprojection_record import Consequence, Reprojection, SensorReprojection, TriedModel
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_cameras
 

@@ -11,9 +11,9 @@ from simulated_cells import Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, FrameError, OptionError, OutlierError, UnderdeterminedError
-from gtsam_rwhec.reprojection.determined import told_where_it_fails
-from gtsam_rwhec.reprojection.lens import parameters_of, pixels_of
-from gtsam_rwhec.reprojection.observations import Views
+from gtsam_rwhec.fitting.corner_checks import told_where_it_fails
+from gtsam_rwhec.fitting.observations import Views
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of, pixels_of
 
 OPTIONS = [rw.CornerOptions(), rw.CornerOptions(carrier_noise="exact")]
 IDS = ["estimated", "exact"]

@@ -17,12 +17,12 @@ from simulated_models import A_NOISE, CORNER_PX, model_and_point
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, OptionError
-from gtsam_rwhec.reprojection.corner_graph import CornerGraph
-from gtsam_rwhec.reprojection.corner_views import linearised, pixel_errors, stacks_of
-from gtsam_rwhec.reprojection.held_out import held_out_errors
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.model import Model, Point
-from gtsam_rwhec.reprojection.reduced import Reduced
+from gtsam_rwhec.fitting.corner_graph import CornerGraph
+from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Reduced
+from gtsam_rwhec.fitting.corner_residuals import linearised, pixel_errors, stacks_of
+from gtsam_rwhec.fitting.held_out import held_out_errors
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 MISPRINT_M = 2e-4
 #: Covariances of poses are those of corners alone: the noise of A is more.
@@ -72,7 +72,7 @@ def test_the_sums_by_instant_have_the_graphs_information(small: Cell) -> None:
     point = replace(point, A=model.A)
     graph, reduced = CornerGraph(model, point), Reduced.of(model, point)
     joint, _ = graph.covariance(graph.values(point), reduced.slots)
-    H = reduced.information(rw.reprojection.Noise(CORNER_PX, float(A_NOISE[0]), float(A_NOISE[3])))
+    H = reduced.information(rw.fitting.Noise(CORNER_PX, float(A_NOISE[0]), float(A_NOISE[3])))
     size = np.sqrt(np.diagonal(joint))
     assert joint / np.outer(size, size) == pytest.approx(np.linalg.inv(H) / np.outer(size, size), abs=1e-6)
 

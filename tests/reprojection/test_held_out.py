@@ -9,7 +9,7 @@ from simulated_cells import cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, OptionError
-from gtsam_rwhec.reprojection.held_out import held_out_errors, left_out
+from gtsam_rwhec.fitting.held_out import held_out_errors, left_out
 
 
 def test_errors_are_those_of_the_corners_and_of_the_carriers() -> None:

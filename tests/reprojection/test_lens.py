@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from gtsam_rwhec.reprojection.lens import camera_with, parameters_of, pixels_and_derivatives, pixels_of
+from gtsam_rwhec.fitting.stated_intrinsics import camera_with, parameters_of, pixels_and_derivatives, pixels_of
 from gtsam_rwhec.vision.camera import Camera
 
 K = [[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]

@@ -9,8 +9,7 @@ from simulated_cells import Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.reprojection.determined import farthest
-from gtsam_rwhec.reprojection.leverage import GROWS, grows_by_noise
+from gtsam_rwhec.fitting.corner_checks import GROWS, farthest, grows_by_noise
 
 NOISE = (1e-3, 5e-4)
 

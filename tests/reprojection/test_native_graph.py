@@ -12,9 +12,9 @@ from rwhec_factors import se3
 from simulated_cells import CAMERA, Cell, cell
 from simulated_models import model_and_point
 
-from gtsam_rwhec.reprojection.corner_graph import CornerGraph
-from gtsam_rwhec.reprojection.model import Model, Point
-from gtsam_rwhec.reprojection.reduced import Reduced
+from gtsam_rwhec.fitting.corner_graph import CornerGraph
+from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.vision.camera import Camera
 
 SIZE = (CAMERA.width, CAMERA.height)

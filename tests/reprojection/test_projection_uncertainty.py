@@ -11,7 +11,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.reprojection.projection_uncertainty import (
+from gtsam_rwhec.fitting.projection_uncertainty import (
     by_region,
     lens_deviations_over,
     projection_deviations,

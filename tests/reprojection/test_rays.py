@@ -12,7 +12,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.reprojection.rays import findings_of_rays, without_rays
+from gtsam_rwhec.fitting.corner_checks import findings_of_rays, without_rays
 from gtsam_rwhec.vision.camera import Camera
 
 #: It folds back where r^2 = 1 / (3 * 1.5), 440 pixels from the centre; corners are seen to 570.

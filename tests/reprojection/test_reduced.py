@@ -7,8 +7,8 @@ import pytest
 from simulated_cells import cell
 from simulated_models import model_and_point
 
-from gtsam_rwhec.reprojection.model import Point
-from gtsam_rwhec.reprojection.reduced import Noise, Reduced
+from gtsam_rwhec.fitting.corner_model import Point
+from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from simulated_clocks import moving
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError
-from gtsam_rwhec.reprojection.corner_views import stacks_of
+from gtsam_rwhec.fitting.corner_residuals import stacks_of
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Covariances of poses are those of corners alone: the noise of A is more.
@@ -35,7 +35,7 @@ def made() -> tuple[Cell, rw.Problem, rw.Solution, rw.Refined]:
 def test_the_answer_is_that_of_refine_corners_on_the_same_images() -> None:
     given, problem, solution, refined = made()
     base = rw.refine(problem, solution)
-    observations = rw.reprojection.observations_of(problem)
+    observations = rw.fitting.observations_of(problem)
     for pair, view in given.observations.views.items():
         np.testing.assert_array_equal(observations.views[pair].pixels, view.pixels)
     expected = rw.refine_corners(given.observations, base.X, base.Y, CALIBRATION)

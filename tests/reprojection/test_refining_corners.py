@@ -14,8 +14,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, FrameError, OptionError
-from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.stated_intrinsics import innovation_of, wider
+from gtsam_rwhec.fitting.stated_intrinsics import innovation_of, parameters_of, wider
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gtsam_rwhec.reprojection.row_sums import Rows, few_rows
+from gtsam_rwhec.fitting.corner_model import Rows, few_rows
 
 
 @settings(max_examples=15, deadline=None)

@@ -10,9 +10,8 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.reprojection.intrinsics import Stated
-from gtsam_rwhec.reprojection.lens import parameters_of, pixels_of
-from gtsam_rwhec.reprojection.stated_intrinsics import held_by_prior
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import held_by_prior, parameters_of, pixels_of
 
 
 def refined(given: Cell, stated: Stated) -> rw.CornersRefined:

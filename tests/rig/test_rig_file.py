@@ -15,7 +15,7 @@ from places import CELL, REPOSITORY
 from rig_texts import FULL, MINIMAL
 
 from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.refinement.options import Robust
+from gtsam_rwhec.fitting.fit_options import Robust
 from gtsam_rwhec.rig import (
     AprilGridTarget,
     BundleTarget,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.fitting.reprojection_record import Regions
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.reprojection_found import Regions
 
 
 @dataclass(frozen=True, eq=False)

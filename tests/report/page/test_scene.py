@@ -15,7 +15,7 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.evidence.board_shapes import drawn_board
 from gtsam_rwhec.evidence.scene import rim_of, scene_of, standing_carrier
-from gtsam_rwhec.refinement.reprojection_found import BoardShape
+from gtsam_rwhec.fitting.reprojection_record import BoardShape
 from gtsam_rwhec.report.page import Drawing, Listing, Section, ShownResult
 from gtsam_rwhec.report.page.scene.model import scene_of_rig
 from gtsam_rwhec.report.page.sections.scene import scene_section

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.report.page.blocks import Block, Chart, Paragraph
 from gtsam_rwhec.report.page.figures import INK, svg_figure
 from gtsam_rwhec.report.plots.drawing import AXIS_COLOURS, AXIS_NAMES, plain_decades, shortened

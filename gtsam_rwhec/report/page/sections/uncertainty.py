@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.refinement.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
 from gtsam_rwhec.report.page.blocks import Block, Folded, Number, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.sections.covariance_charts import correlation_chart, deviations_chart

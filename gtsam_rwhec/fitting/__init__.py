@@ -1,0 +1,5 @@
+"""GTSAM after the certified solution: refinement from poses and from corners, noise, outliers, covariances."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

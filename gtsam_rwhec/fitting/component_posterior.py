@@ -1,0 +1,293 @@
+"""The components that fit the residuals best, and the curvature of the posterior density there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, fdtri, ndtri
+
+from gtsam_rwhec.fitting.noise_components import PRIOR, Sizes
+from gtsam_rwhec.fitting.noise_likelihood import Eliminated, Estimate, NoiseModel, average_information
+from gtsam_rwhec.geometry.poses import Array
+
+#: The step of differences of gradients, in logarithms.
+STEP = 0.05
+#: A fit ends where -2 log of the density would fall by less than this.
+ENOUGH = 1e-3
+#: At most this many evaluations are for one fit; the first of them have the average information as curvature.
+MOST, AVERAGED = 60, 6
+#: No step of the logarithms is longer than this.
+FARTHEST = 4.0
+#: A step that lowers the objective by less than this share of what it should makes the next this much shorter; above
+#: the other share they may become longer.
+POOR, SHORTER, GOOD = 0.25, 0.4, 0.75
+#: The curvature counts as this at least: a fifth of what the prior alone has.
+FLATTEST = 0.1
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Components at their most probable values.
+
+    Attributes
+    ----------
+    sizes : Sizes
+    logs : (k,) array
+        Logarithms of the standard deviations.
+    objective : float
+        -2 log of the posterior density there.
+    estimate : Estimate
+    """
+
+    sizes: Sizes
+    logs: Array
+    objective: float
+    estimate: Estimate
+
+
+def value_and_gradient(model: NoiseModel, sizes: Sizes, logs: Array) -> tuple[float, Array]:
+    """-2 log of the posterior density of the logarithms, up to a constant, and its gradient."""
+    estimate, gradient = model.value_and_gradient(sizes.values(logs), sizes.active)
+    return estimate.minus_two_log + sizes.penalty(logs), gradient + sizes.penalty_gradient(logs)
+
+
+def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENOUGH) -> Fitted:
+    """The maximum of the posterior density of the components, from a start: Newton's steps in a trusted region.
+
+    The first steps have the average information as curvature. What the density's gradients tell of it afterwards goes
+    in as in BFGS: where the noise is not as in the model, the average information may be several times too small.
+
+    Parameters
+    ----------
+    enough : float
+        It ends where another step would lower ``objective`` by less than this.
+    """
+    low, high = np.array(sizes.bounds).T
+    here = _Point.at(model, sizes, np.clip(start, low, high))
+    H, radius = here.information, FARTHEST
+    for number in range(1, MOST):
+        held = ((here.logs <= low) & (here.gradient > 0.0)) | ((here.logs >= high) & (here.gradient < 0.0))
+        step, gain = _trusted_step(H, np.where(held, 0.0, here.gradient), ~held, radius)
+        if gain < enough:
+            break
+        there = _Point.at(model, sizes, np.clip(here.logs + step, low, high))
+        step = there.logs - here.logs
+        expected = -float(here.gradient @ step + 0.5 * step @ H @ step)
+        share = (here.value - there.value) / max(expected, 1e-300)
+        H = _updated(H, step, there.gradient - here.gradient)
+        length = float(np.linalg.norm(step))
+        if share < POOR:
+            radius = SHORTER * length
+        elif share > GOOD and length > 0.8 * radius:
+            radius = min(2.0 * radius, FARTHEST)
+        if there.value < here.value:
+            here = there
+            if number < AVERAGED:
+                H = here.information
+    return Fitted(sizes, here.logs, here.value, here.estimate)
+
+
+@dataclass(frozen=True)
+class _Point:
+    """-2 log of the posterior density at some components, its gradient, and what its curvature comes from."""
+
+    sizes: Sizes
+    logs: Array
+    value: float
+    gradient: Array
+    estimate: Estimate
+    eliminated: Eliminated
+
+    @staticmethod
+    def at(model: NoiseModel, sizes: Sizes, logs: Array) -> _Point:
+        estimate, eliminated = model.eliminated(sizes.values(logs))
+        gradient = eliminated.gradient_by(sizes.active) + sizes.penalty_gradient(logs)
+        return _Point(sizes, logs, estimate.minus_two_log + sizes.penalty(logs), gradient, estimate, eliminated)
+
+    @property
+    def information(self) -> Array:
+        """The average information (k, k), and the prior's."""
+        return average_information(self.eliminated, self.sizes.active) + np.diag(2.0 / self.sizes.spread**2)
+
+
+def _trusted_step(H: Array, gradient: Array, free: np.ndarray, radius: float) -> tuple[Array, float]:
+    """Newton's step (k,) along the free components, no longer than a radius; and what a whole one would gain."""
+    step = np.zeros(len(H))
+    values, Q = np.linalg.eigh(H[np.ix_(free, free)])
+    values = np.maximum(values, FLATTEST)
+    along = Q.T @ gradient[free]
+    found, damped = along / values, 0.05
+    while np.linalg.norm(found) > radius:
+        found, damped = along / (values + damped), 2.0 * damped
+    step[free] = -(Q @ found)
+    return step, 0.5 * float(along @ (along / values))
+
+
+def _updated(H: Array, step: Array, change: Array) -> Array:
+    """The curvature after a step and the gradient's change along it (BFGS, damped as by Powell 1978)."""
+    moved = H @ step
+    before, after = float(step @ moved), float(step @ change)
+    if before <= 0.0:  # no step at all
+        return H
+    if after < 0.2 * before:
+        share = 0.8 * before / (before - after)
+        change = share * change + (1.0 - share) * moved
+        after = float(step @ change)
+    found: Array = H - np.outer(moved, moved) / before + np.outer(change, change) / after
+    return found
+
+
+def curvature(gradient: Callable[[Array], Array], at: Array, low: Array, high: Array) -> Array:
+    """The second derivative (k, k) of a function by central differences of its gradient, one-sided at the bounds."""
+    k = len(at)
+    H = np.empty((k, k))
+    for i in range(k):
+        after, before = at.copy(), at.copy()
+        after[i], before[i] = min(at[i] + STEP, high[i]), max(at[i] - STEP, low[i])
+        H[i] = (gradient(after) - gradient(before)) / (after[i] - before[i])
+    symmetric: Array = 0.5 * (H + H.T)
+    return symmetric
+
+
+#: Samples of the components.
+SAMPLES = 32
+#: Samples of the unknowns for each.
+DRAWS = 64
+#: No sample counts more than this many times the mean.
+HEAVIEST = 8.0
+#: The confidence at which the ellipsoid's size is fitted, and the fewest degrees of freedom that it may have.
+CONFIDENCE, FEWEST = 0.95, 3.0
+#: A share is found by so many bisections.
+BISECTIONS = 12
+#: A root is found by so many steps, each of which halves its error at least.
+ROOT_STEPS = 60
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """The unknowns under all probable components.
+
+    Attributes
+    ----------
+    step : (p,) array
+    covariance : (p, p) array
+    logs, weights : (n, k) and (n,) arrays
+        The samples of the components' logarithms, and their weights.
+    estimates : tuple of Estimate
+        For each sample.
+    """
+
+    step: Array
+    covariance: Array
+    logs: Array
+    weights: Array
+    estimates: tuple[Estimate, ...]
+
+    def quantiles(self, probabilities: tuple[float, ...]) -> Array:
+        """Quantiles (m, k) of the components' standard deviations."""
+        order = np.argsort(self.logs, axis=0)
+        result = np.empty((len(probabilities), self.logs.shape[1]))
+        for j in range(self.logs.shape[1]):
+            cumulative = np.cumsum(self.weights[order[:, j]])
+            result[:, j] = np.exp(np.interp(probabilities, cumulative, self.logs[order[:, j], j]))
+        return result
+
+    def draws(self, rows: Array, added: Array | None = None) -> tuple[Array, Array]:
+        """Samples (n, m) of some functions (m, p) of the unknowns, about their mean, and the samples' weights.
+
+        ``added`` (samples, m, m) are roots of covariances of something independent that comes on top.
+        """
+        chance = np.random.default_rng(0)
+        drawn = []
+        used = np.flatnonzero(rows.any(axis=0))  # few of many unknowns
+        of_used = rows[:, used]
+        for i, estimate in enumerate(self.estimates):
+            root = np.linalg.cholesky(of_used @ estimate.covariance[used[:, None], used] @ of_used.T)
+            sample = rows @ (estimate.step - self.step) + chance.normal(size=(DRAWS, len(rows))) @ root.T
+            if added is not None:
+                sample = sample + chance.normal(size=(DRAWS, added.shape[2])) @ added[i].T
+            drawn.append(sample)
+        return np.concatenate(drawn), np.repeat(self.weights, DRAWS) / DRAWS
+
+    def degrees_of_freedom(self, rows: Array) -> float:
+        """Those of an F quantile that fits the ellipsoid of functions (m, p) of the unknowns; inf for chi-square."""
+        m = len(rows)
+        found = _quantile(*self.draws(rows), rows @ self.covariance @ rows.T)
+        if found <= chdtri(m, 1.0 - CONFIDENCE) * 1.01:
+            return float(np.inf)
+        if found >= m * fdtri(m, FEWEST, CONFIDENCE):
+            return FEWEST
+        low, high = np.log(FEWEST), np.log(1e6)
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            is_large = m * fdtri(m, np.exp(middle), CONFIDENCE) > found
+            low, high = (middle, high) if is_large else (low, middle)
+        return float(np.exp(low))
+
+    def share_of(self, rows: Array, added: Array, probability: float = 1.0) -> float:
+        """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
+
+        The posterior of a standard deviation that the data hardly show has a long tail. Its mean square would make the
+        ellipsoid far too large, its mode too small. ``probability`` is that of ``added`` being there at all.
+        """
+        samples, weights = self.draws(rows, added)
+        if probability < 1.0:
+            without, as_often = self.draws(rows)
+            samples = np.concatenate([samples, without])
+            weights = np.concatenate([probability * weights, (1.0 - probability) * as_often])
+        plain = rows @ self.covariance @ rows.T
+        mean = np.einsum("n,nij,nkj->ik", self.weights, added, added)
+        wanted = chdtri(len(rows), 1.0 - CONFIDENCE)
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            is_small = _quantile(samples, weights, plain + middle * mean) > wanted
+            low, high = (middle, high) if is_small else (low, middle)
+        return high
+
+
+def _quantile(samples: Array, weights: Array, covariance: Array) -> float:
+    """The quantile of x' covariance^-1 x at ``CONFIDENCE``."""
+    whitened = samples @ np.linalg.inv(np.linalg.cholesky(covariance)).T
+    squares = (whitened**2).sum(axis=1)
+    order = np.argsort(squares)
+    return float(np.interp(CONFIDENCE, np.cumsum(weights[order]), squares[order]))
+
+
+def normal_points(count: int, dimension: int) -> Array:
+    """Points (n, k) that are spread as a normal distribution is, the first at its mean: an additive recurrence.
+
+    (Its step is the powers of 1 / g, g^(k + 1) = g + 1: Roberts 2018, the R_d sequence.)
+    """
+    g = 1.5
+    for _ in range(ROOT_STEPS):
+        g = (1.0 + g) ** (1.0 / (dimension + 1.0))
+    step = g ** -np.arange(1.0, dimension + 1.0)
+    points: Array = ndtri((0.5 + np.arange(count)[:, None] * step) % 1.0)
+    return points
+
+
+def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int = SAMPLES) -> Mixture:
+    """The mixture about the most probable components; the unknowns are those of the ``whole`` model."""
+    k = len(fit.logs)
+    low, high = np.array(fit.sizes.bounds).T
+    H = 0.5 * curvature(lambda logs: value_and_gradient(model, fit.sizes, logs)[1], fit.logs, low, high)
+    values, vectors = np.linalg.eigh(H)
+    spread = vectors / np.sqrt(np.maximum(values, 0.5 / PRIOR**2))
+    drawn = normal_points(samples, k)
+    logs = np.clip(fit.logs + drawn @ spread.T, low, high)
+    estimates = [model.evaluate(fit.sizes.values(at)) for at in logs]
+    heights = np.array([e.minus_two_log for e in estimates]) + np.array([fit.sizes.penalty(at) for at in logs])
+    if whole is not model:
+        estimates = [whole.evaluate(fit.sizes.values(at)) for at in logs]
+    weights = np.exp(-0.5 * (heights - fit.objective) + 0.5 * (drawn**2).sum(axis=1))
+    weights = np.minimum(weights / weights.mean(), HEAVIEST)
+    weights /= weights.sum()
+    steps = np.array([e.step for e in estimates])
+    mean = weights @ steps
+    away = steps - mean
+    covariance = np.einsum("n,nij->ij", weights, np.array([e.covariance for e in estimates]))
+    covariance += (weights[:, None] * away).T @ away
+    return Mixture(mean, covariance, logs, weights, tuple(estimates))

@@ -1,0 +1,312 @@
+"""The rows at one point, summed by instant: what the noise's likelihood and the covariance need of them.
+
+All sums are in pixels: rows are not divided by the corners' deviation. With the common unknowns theta (poses, cameras,
+shapes) and the carriers' errors a_i at the instants, to first order
+
+    r = r_0 + J theta + J_i a_i + noise,    a_i ~ N(0, S),
+
+so the sums G = J'J, C_i = J_i'J, M_i = J_i'J_i, g = J'r_0, b_i = J_i'r_0 and r_0'r_0 are all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TypeAlias
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.fitting.corner_model import Model, Point, Rows
+from gtsam_rwhec.geometry.poses import Array
+
+Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
+
+#: Noise is looked for between these standard deviations: pixels of a corner; rad, and m, of the carriers' poses.
+CORNER_PX = (1e-3, 30.0)
+CARRIER = (1e-7, 0.1)
+#: Deviations below this (rad, m) move no corner.
+NOTHING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations: of a corner (pixels), and of A's right perturbation (rad, m); 0: A is exact."""
+
+    corner_px: float
+    carrier_rad: float
+    carrier_m: float
+
+    @property
+    def carrier(self) -> Array | None:
+        """The deviations of [omega, v] (6,), or None for exact poses."""
+        if self.carrier_rad == 0.0 and self.carrier_m == 0.0:
+            return None
+        return np.repeat([self.carrier_rad, self.carrier_m], 3)
+
+    def change(self, before: Noise) -> float:
+        """The largest change of a deviation since before, as a share; deviations that move nothing do not count."""
+        pairs = [(getattr(before, field.name), getattr(self, field.name)) for field in fields(self)]
+        return max(abs(b - a) / max(a, b) if max(a, b) > NOTHING else 0.0 for a, b in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class _WithoutCarriers:
+    """H, h, r'F^-1 r and log |F| without the carriers' errors; K (I, 6, 6), K C / s^2 and K b / s^2."""
+
+    H: Array
+    h: Array
+    rr: float
+    log_det: float
+    K: Array
+    KC: Array
+    Kb: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """Sums of the rows.
+
+    Attributes
+    ----------
+    slots : dict of (letter, name) to slice
+        "x", "y", "k", "b", "t", "p" with the frame's name: its rows in theta.
+    G, g : (d, d) and (d,) arrays
+    C, M, b : (I, 6, d), (I, 6, 6) and (I, 6) arrays
+    rr : float
+    count : float
+        Number of residuals, weights counted.
+    prior : (d,) array
+        Precisions of the priors on theta, and `prior_off` (d,) how far the point is from their means.
+    """
+
+    slots: Mapping[tuple[str, str], slice]
+    G: Array
+    g: Array
+    C: Array
+    M: Array
+    b: Array
+    rr: float
+    count: float
+    prior: Array
+    prior_off: Array
+
+    @staticmethod
+    def of(model: Model, point: Point) -> Reduced:
+        """The sums at a point. The errors of its A are taken off the residuals, to first order."""
+        slots: dict[tuple[str, str], slice] = {}
+        size = 0
+
+        def add(letter: str, name: str, number: int) -> None:
+            nonlocal size
+            slots[letter, name] = slice(size, size + number)
+            size += number
+
+        for name in model.targets:
+            add("x", name, 6)
+        for name in model.sensors:
+            add("y", name, 6)
+        for name, (mean, _) in model.camera_priors.items():
+            add("k", name, len(mean))
+        for name in model.shape_priors:
+            add("b", name, len(model.free_shape(name)))
+        for name in model.offset_priors:
+            add("t", name, 1)
+        for name in model.corner_priors:
+            add("p", name, point.corners[name].size)
+        count = len(model.A)
+        G, g = np.zeros((size, size)), np.zeros(size)
+        C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
+        rr = number = 0.0
+        to_right = model.to_right
+        at = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
+        for stack, weights in zip(model.stacks, model.weights, strict=True):
+            rows = model.linearised(stack, point)
+            parts = {("x", stack.target): rows.by_X, ("y", stack.sensor): rows.by_Y}
+            parts["k", model.camera_of[stack.sensor]] = rows.by_camera
+            if ("b", stack.target) in slots:
+                parts["b", stack.target] = rows.by_shape
+            if ("t", stack.sensor) in slots:
+                parts["t", stack.sensor] = rows.by_time
+            names = list(parts) + [("p", stack.target)] * (("p", stack.target) in slots)
+            where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in names])
+            root = np.repeat(np.sqrt(weights), 2, axis=1)
+            by_A = rows.by_A @ to_right[stack.instant]
+            off_A = np.einsum("vni,vi->vn", by_A, at[stack.instant])
+            of_stack = Rows(
+                np.concatenate(list(parts.values()), axis=2) * root[..., None],
+                rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if len(names) > len(parts) else None,
+                (rows.residual - off_A) * root,
+            )
+            J_A = by_A * root[..., None]
+            squares, of_A = of_stack.squares(), of_stack.times(J_A)
+            G[np.ix_(where, where)] += squares[:-1, :-1]
+            g[where] += squares[:-1, -1]
+            rr += float(squares[-1, -1])
+            number += 2.0 * float(weights[stack.known].sum())
+            of_view = np.zeros((len(stack.instant), 6, size))
+            of_view[:, :, where] = of_A[..., :-1]
+            np.add.at(C, stack.instant, of_view)
+            np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
+            np.add.at(b, stack.instant, of_A[..., -1])
+        prior, off = np.zeros(size), np.zeros(size)
+        for name, (mean, deviation) in model.camera_priors.items():
+            prior[slots["k", name]] = deviation**-2.0
+            off[slots["k", name]] = point.cameras[name] - mean
+        for name, deviation in model.shape_priors.items():
+            free = model.free_shape(name)
+            prior[slots["b", name]] = deviation[free] ** -2.0
+            off[slots["b", name]] = point.shapes[name][free]
+        for name, in_s in model.offset_priors.items():
+            prior[slots["t", name]] = in_s**-2.0
+            off[slots["t", name]] = point.offsets_s.get(name, 0.0)
+        for name, in_m in model.corner_priors.items():
+            prior[slots["p", name]] = in_m**-2.0
+            off[slots["p", name]] = point.corners[name].ravel()
+        return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
+
+    def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
+        """Restricted: theta integrated out; and its derivatives by the logarithms of the three deviations.
+
+        With K_i = (S^-1 + M_i / s^2)^-1 the carriers' errors are eliminated:
+
+            H = G / s^2 - sum C_i' K_i C_i / s^4 + prior,    -2 log L = r' F^-1 r - h' H^-1 h + log |F| + log |H|.
+
+        The derivative by a component's log variance is its number less its squares, as estimated and as uncertain, over
+        its variance (Patterson and Thompson's equations).
+        """
+        s2, S = noise.corner_px**2, noise.carrier
+        at = self._without_carriers(noise)
+        H, h, K, KC, Kb = at.H, at.h, at.K, at.KC, at.Kb
+        size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+        sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
+        if sign <= 0.0:
+            return np.inf, np.zeros(3)
+        inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
+        theta = -inverse @ h
+        value = at.rr + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
+        free = len(H) - float(self.prior @ np.diagonal(inverse))
+        squares = self.rr + 2.0 * float(self.g @ theta) + float(theta @ self.G @ theta)
+        gradient = np.zeros(3)
+        if S is not None:
+            a = -(Kb + KC @ theta)
+            variances = np.diagonal(K, axis1=1, axis2=2) + np.einsum("nid,de,nie->ni", KC, inverse, KC, optimize=True)
+            squares += float(np.einsum("ni,nij,nj->", a, self.M, a)) + 2.0 * float(
+                (a * (self.b + self.C @ theta)).sum()
+            )
+            free += float((1.0 - variances / S**2).sum())
+            off = 2.0 * (len(a) - (a**2 + variances).sum(axis=0) / S**2)
+            gradient[1:] = off[:3].sum(), off[3:].sum()
+        gradient[0] = 2.0 * (self.count - squares / s2 - free)
+        return value, gradient
+
+    def _without_carriers(self, noise: Noise) -> _WithoutCarriers:
+        s2, S = noise.corner_px**2, noise.carrier
+        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, self.count * np.log(s2)
+        K, KC, Kb = np.zeros_like(self.M), np.zeros_like(self.C), np.zeros_like(self.b)
+        if S is not None:
+            # K = D (I + D M D / s2)^-1 D, D = diag(S)
+            inner = np.eye(6) + self.M * S[:, None] * S / s2
+            K = np.linalg.inv(inner) * S[:, None] * S
+            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
+            flat = self.C.reshape(-1, len(H))
+            H = H - flat.T @ KC.reshape(flat.shape) / s2
+            h = h - flat.T @ Kb.ravel() / s2
+            rr -= float((self.b * Kb).sum()) / s2
+            log_det += float(np.linalg.slogdet(inner)[1].sum())
+        H = H + np.diag(self.prior)
+        h = h + self.prior * self.prior_off
+        return _WithoutCarriers(H, h, rr + float(self.prior @ self.prior_off**2), log_det, K, KC, Kb)
+
+    def information(self, noise: Noise) -> Array:
+        """The information (d, d) of theta under a noise, the carriers' errors eliminated."""
+        return self._without_carriers(noise).H
+
+    def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
+        """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""
+        number = 3 if carrier else 1
+        begin = np.log([start.corner_px, max(start.carrier_rad, 1e-5), max(start.carrier_m, 1e-5)])[:number]
+
+        def noise(x: Vector) -> Noise:
+            px, *of_carrier = np.exp(x).tolist()
+            return Noise(px, *of_carrier) if carrier else replace(start, corner_px=px)
+
+        def cost(x: Vector) -> tuple[float, Array]:
+            value, gradient = self.minus_two_log_likelihood(noise(x))
+            return value, gradient[:number]
+
+        bounds = [(np.log(low), np.log(high)) for low, high in (CORNER_PX, CARRIER, CARRIER)[:number]]
+        from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
+
+        found = minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11})
+        return noise(found.x)
+
+
+#: The step of numeric derivatives by the logarithm of a deviation.
+STEP = 1e-3
+#: Fewer degrees of freedom than this are not told from noise.
+FEWEST = 3.0
+
+
+def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict[tuple[str, str], float]:
+    """Of each unknown's covariance; with `carrier` false only the corners' noise was estimated."""
+    deviations = np.array([noise.corner_px, noise.carrier_rad, noise.carrier_m])
+    free = [0, *(i for i in (1, 2) if carrier and deviations[i] > NOTHING)]
+
+    def at(step: Array) -> Noise:
+        moved = deviations.copy()
+        moved[free] *= np.exp(step)
+        return Noise(*moved.tolist())
+
+    steps = STEP * np.eye(len(free))
+    gradients = [
+        (reduced.minus_two_log_likelihood(at(step))[1] - reduced.minus_two_log_likelihood(at(-step))[1])[free]
+        for step in steps
+    ]
+    # by log v = 2 log s
+    hessian = np.array(gradients) / (2.0 * STEP) / 4.0
+    values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+    V = (vectors * (2.0 / np.maximum(values, 1e-6))) @ vectors.T
+    above, below = ([np.linalg.inv(reduced.information(at(sign * step))) for step in steps] for sign in (1.0, -1.0))
+    result = {}
+    for name, rows in reduced.slots.items():
+        size = rows.stop - rows.start
+        w = np.array([
+            (np.linalg.slogdet(up[rows, rows])[1] - np.linalg.slogdet(down[rows, rows])[1]) / (2.0 * STEP) / 2.0 / size
+            for up, down in zip(above, below, strict=True)
+        ])  # fmt: skip
+        variance = float(w @ V @ w)
+        result[name] = max(2.0 / variance, FEWEST) if variance > 0.0 else float("inf")
+    return result
+
+
+#: A corner with an error of more deviations is left out: of good ones, whose errors are Rayleigh's, 1 in 10,000.
+LIMIT = 4.3
+#: In the first round outliers are in the fit: the limit is wider by this factor.
+LOOSE = 1.5
+#: The median of Rayleigh's distribution of unit deviation.
+MEDIAN = 1.1774
+
+
+def errors_px(model: Model, point: Point) -> list[Array]:
+    """Lengths (V, n) of all corners' errors, in pixels, by stack; zero where a corner was not seen."""
+    every = replace(model, weights=tuple(stack.known.astype(float) for stack in model.stacks), corner_px=1.0)
+    return [
+        np.linalg.norm(error.reshape(*stack.known.shape, 2), axis=2)
+        for stack, error in zip(model.stacks, every.errors(point), strict=True)
+    ]
+
+
+def weights_of(model: Model, point: Point, corner_px: float, *, first: bool) -> tuple[Array, ...]:
+    """1 for corners that count, 0 for outliers and for corners that were not seen, by stack.
+
+    In the first round the corners' deviation is told by the median error, which outliers hardly move.
+    """
+    errors = errors_px(model, point)
+    limit = LIMIT * corner_px
+    if first:
+        seen = np.concatenate([error[stack.known] for error, stack in zip(errors, model.stacks, strict=True)])
+        limit = LOOSE * LIMIT * float(np.median(seen)) / MEDIAN
+    return tuple(
+        (stack.known & (error <= limit)).astype(float) for error, stack in zip(errors, model.stacks, strict=True)
+    )

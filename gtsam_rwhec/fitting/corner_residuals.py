@@ -1,0 +1,289 @@
+"""Corners in images as residuals: pixel errors over their deviation, with derivatives by everything that is not known.
+
+A corner p of a target's board is seen by a sensor at the pixel of P = Y^-1 A X p', by the camera's parameters. The
+board may be larger than stated, and bent: p' = (1 + s) p + (w_x (x / l)^2 + w_y (y / l)^2) e_z, l the largest distance
+of a corner from the board's origin; and each corner may be off its place: p' + d. A is the carriers' pose at the
+instant of the image. Where the sensor's clock is off by t seconds, it is the pose at that time: A Expmap(t twist), with
+the carriers' velocity at the instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives, pixels_of
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.camera import Camera
+
+#: The shape of a board: s (a share), w_x and w_y (metres).
+SHAPE = 3
+#: A corner must be this far in front of its camera, metres.
+NEAREST_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """All images of one target by one sensor.
+
+    Attributes
+    ----------
+    target, sensor : str
+    instant : (V,) integers
+        Which pose of the carriers each image has.
+    points : (n, 3) array
+        Corners in the target's frame, metres.
+    pixels : (V, n, 2) array
+        Zero where a corner was not seen.
+    known : (V, n) booleans
+    camera : Camera
+        Its model; its parameters are a variable.
+    twist : (V, 6) array, optional
+        The carriers' velocity at each image, [omega rad/s, v m/s].
+    """
+
+    target: str
+    sensor: str
+    instant: np.ndarray
+    points: Array
+    pixels: Array
+    known: np.ndarray
+    camera: Camera
+    twist: Array | None = None
+
+    def selected(self, which: np.ndarray) -> Stack:
+        """The images that a mask or an index array selects."""
+        twist = None if self.twist is None else self.twist[which]
+        return replace(
+            self, instant=self.instant[which], pixels=self.pixels[which], known=self.known[which], twist=twist
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Residuals of a stack (V, 2n), in pixels, and their derivatives (V, 2n, m) by each variable.
+
+    Poses move as T Expmap([omega, v]), A at its instant. All of them move the target's pose in the sensor's frame, B =
+    Y^-1 A Expmap(t w) X, so the derivatives by B turn into theirs by adjoints, when they are asked for. A residual is
+    infinite where a corner is behind its camera.
+
+    Attributes
+    ----------
+    residual : (V, 2n) array
+    by_B : (V, 2n, 6) array
+    by_camera : (V, 2n, m) array
+    B : (V, 4, 4) array
+    X : (4, 4) array
+    shapes : (n, 3, k) array
+        Derivatives of the corners' places by the numbers of the shape.
+    twist : (V, 6) array, optional
+    offset_s : float
+    """
+
+    residual: Array
+    by_B: Array
+    by_camera: Array
+    B: Array
+    X: Array
+    shapes: Array
+    twist: Array | None
+    offset_s: float
+
+    @property
+    def by_X(self) -> Array:
+        """By X: B Expmap(xi)."""
+        return self.by_B
+
+    @property
+    def by_Y(self) -> Array:
+        """By Y: Expmap(-xi) B = B Expmap(-Ad(B^-1) xi)."""
+        return -(self.by_B @ se3.adjoint(se3.inverse(self.B)))
+
+    @property
+    def by_A(self) -> Array:
+        """By A at its instant: A Expmap(xi) Expmap(t w) = A Expmap(t w) Expmap(Ad xi), the adjoint of Expmap(-t w)."""
+        later = self._by_later_A
+        if self.twist is None or self.offset_s == 0.0:
+            return later
+        return later @ se3.adjoint(se3.expmap(-self.offset_s * self.twist))
+
+    @property
+    def by_time(self) -> Array:
+        """By the time offset (V, 2n, 1): Expmap((t + e) w) = Expmap(t w) Expmap(e w). Zero of a stack without w."""
+        if self.twist is None:
+            return np.zeros((*self.residual.shape, 1))
+        return self._by_later_A @ self.twist[..., None]
+
+    @property
+    def by_corners(self) -> Array:
+        """Each corner's residuals by its own place (V, n, 2, 3)."""
+        V, n = len(self.residual), len(self.shapes)
+        return self.by_B[..., 3:].reshape(V, n, 2, 3)
+
+    @property
+    def by_shape(self) -> Array:
+        """By the numbers of the shape."""
+        return (self.by_corners @ self.shapes).reshape(*self.residual.shape, -1)
+
+    @property
+    def _by_later_A(self) -> Array:
+        """By A at the image's own time."""
+        return self.by_B @ se3.adjoint(se3.inverse(self.X)[None])
+
+
+def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
+    """The stacks of observations, and the carriers' poses A (I, 4, 4) at all instants: equal poses are one instant."""
+    every = np.concatenate([view.A for view in observations.views.values()])
+    _, first, index = np.unique(every.reshape(len(every), 16), axis=0, return_index=True, return_inverse=True)
+    # in the order of first appearance
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    instant = rank[index.ravel()]
+    result, begin = [], 0
+    for (target, sensor), view in observations.views.items():
+        end = begin + len(view.A)
+        known = view.known
+        result.append(
+            Stack(
+                target,
+                sensor,
+                instant[begin:end],
+                observations.corners[target],
+                np.where(known[:, :, None], view.pixels, 0.0),
+                known,
+                observations.cameras[sensor],
+                view.twist,
+            )
+        )
+        begin = end
+    return tuple(result), every[first[order]]
+
+
+def shaped(points: Array, shape: Array) -> tuple[Array, Array]:
+    """The corners (n, 3) of a board with a shape (3,), and their derivatives (n, 3, 3) by it."""
+    squared = (points[:, :2] / np.linalg.norm(points, axis=1).max()) ** 2
+    by_shape = np.zeros((len(points), 3, SHAPE))
+    by_shape[:, :, 0] = points
+    by_shape[:, 2, 1:] = squared
+    return points + by_shape @ shape, by_shape
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A stack's corners on their way to the camera.
+
+    Attributes
+    ----------
+    p : (n, 3) array
+        In the target's frame, shaped; `by_shape` (n, 3, 3) are its derivatives.
+    B : (V, 4, 4) array
+        Poses T_sensor_target.
+    P, z, x : (V, n, 3), (V, n) and (V, n, 2) arrays
+        In the sensor's frame, their depths, and normalised coordinates; 1 and 0 for corners that were not seen.
+    behind : (V, n) booleans
+        Seen, and behind the camera.
+    """
+
+    p: Array
+    by_shape: Array
+    B: Array
+    P: Array
+    z: Array
+    x: Array
+    behind: np.ndarray
+
+    def errors(self, stack: Stack, pixels: Array) -> Array:
+        error = np.where(stack.known[..., None], pixels - stack.pixels, 0.0)
+        error[self.behind] = np.inf
+        return error.reshape(len(error), -1)
+
+
+def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float, moved: Array | None) -> _Seen:
+    p, by_shape = shaped(stack.points, shape)
+    if moved is not None:
+        p = p + moved
+    B = se3.inverse(Y) @ A[stack.instant]
+    if stack.twist is not None and offset_s != 0.0:
+        B = B @ se3.expmap(offset_s * stack.twist)
+    B = B @ X
+    P = p @ B[:, :3, :3].transpose(0, 2, 1) + B[:, None, :3, 3]
+    behind = stack.known & (P[..., 2] < NEAREST_M)
+    z = np.where(stack.known & ~behind, P[..., 2], 1.0)
+    x = np.where(stack.known[..., None], P[..., :2] / z[..., None], 0.0)
+    return _Seen(p, by_shape, B, P, z, x, behind)
+
+
+def pixel_errors(
+    stack: Stack,
+    X: Array,
+    Y: Array,
+    A: Array,
+    parameters: Array,
+    shape: Array,
+    offset_s: float = 0.0,
+    moved: Array | None = None,
+) -> Array:
+    """Errors (V, 2n) of a stack in pixels: as `linearised`, without derivatives."""
+    seen = _seen(stack, X, Y, A, shape, offset_s, moved)
+    pixels = pixels_of(stack.camera, parameters, seen.x)
+    return seen.errors(stack, pixels)
+
+
+def depths(
+    stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0, moved: Array | None = None
+) -> Array:
+    """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
+    return _seen(stack, X, Y, A, shape, offset_s, moved).z
+
+
+def off_axis(
+    stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0, moved: Array | None = None
+) -> Array:
+    """Normalised radii (V, n) at which a stack's corners are; 0 where a corner was not seen."""
+    return np.asarray(np.linalg.norm(_seen(stack, X, Y, A, shape, offset_s, moved).x, axis=2))
+
+
+def linearised(
+    stack: Stack,
+    X: Array,
+    Y: Array,
+    A: Array,
+    parameters: Array,
+    shape: Array,
+    offset_s: float = 0.0,
+    moved: Array | None = None,
+) -> Linear:
+    """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape.
+
+    `moved` (n, 3) is how far corners are off their places on the board, metres. The images were taken `offset_s` after
+    their instants.
+    """
+    V, n = stack.known.shape
+    at = _seen(stack, X, Y, A, shape, offset_s, moved)
+    x, z = at.x, at.z
+    pixels, by_x, by_parameters = pixels_and_derivatives(stack.camera, parameters, x)
+    by_P = np.empty((V, n, 2, 3))  # d x / d P = [I, -x] / z
+    by_P[..., :2] = by_x
+    by_P[..., 2] = -(by_x[..., 0] * x[..., :1] + by_x[..., 1] * x[..., 1:])
+    by_P *= (stack.known / z)[..., None, None]
+    by_B = np.empty((V, n, 2, 6))
+    by_p = (by_P.reshape(V, 2 * n, 3) @ at.B[:, :3, :3]).reshape(V, n, 2, 3)
+    by_B[..., 3:] = by_p
+    p = at.p[:, None]  # row' (omega x p) = omega' (p x row)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        by_B[..., i] = p[..., j] * by_p[..., k] - p[..., k] * by_p[..., j]
+    by_parameters *= stack.known[..., None, None]
+    return Linear(
+        at.errors(stack, pixels),
+        by_B.reshape(V, 2 * n, 6),
+        by_parameters.reshape(V, 2 * n, -1),
+        at.B,
+        X,
+        at.by_shape,
+        stack.twist,
+        offset_s,
+    )

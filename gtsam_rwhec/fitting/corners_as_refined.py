@@ -1,0 +1,353 @@
+"""A refinement from corners in the form of every refinement: poses, joint covariance, GTSAM graph; and in numbers.
+
+What the poses' noise model found beyond independent errors of A widens the covariance. Errors that vary with the
+configuration of the arm, and their constant part, go through the linear answer of the corners (`systematic`). Errors
+that are alike in neighbours in time make N images worth W: the covariance grows by N / W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from gtsam_rwhec.fitting.corner_noise import Reduced
+from gtsam_rwhec.fitting.corner_residuals import SHAPE
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions, Stated
+from gtsam_rwhec.fitting.held_out import HeldOut
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.projection_uncertainty import by_region
+from gtsam_rwhec.fitting.refined import PairNoise, Refined
+from gtsam_rwhec.fitting.refinement_from_poses import movements
+from gtsam_rwhec.fitting.reprojection_record import (
+    SIZE,
+    BoardShape,
+    Consequence,
+    Intrinsics,
+    Regions,
+    Reprojection,
+    SensorReprojection,
+    TriedModel,
+)
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import ScaleMode
+
+#: The numbers of a board's shape.
+SHAPE_NAMES = (SIZE, "warp_x", "warp_y")
+assert len(SHAPE_NAMES) == SHAPE
+
+
+def as_refined(
+    base: Refined,
+    corners: CornersRefined,
+    reprojection: Reprojection,
+    intrinsics: Mapping[str, Intrinsics],
+    more: Array | None = None,
+) -> Refined:
+    """The poses, covariances and graph of a refinement from corners, in the place of those from poses.
+
+    Parameters
+    ----------
+    base : Refined
+        The refinement from the same images' poses.
+    corners : CornersRefined
+    reprojection, intrinsics
+        The same in numbers.
+    more : (d, d) array, optional
+        Covariance of `corners`' unknowns beyond its own.
+    """
+    if more is not None:
+        corners = replace(corners, joint=corners.joint + more)
+        reprojection = replace(reprojection, boards=boards_of(corners))
+    joint = _joint(base, corners)
+    freedom = min((value for (letter, _), value in corners.freedom.items() if letter in "xy"), default=np.inf)
+    cost = float(corners.graph.graph.error(corners.graph.values(corners.point)))
+    graph = corners.graph
+    keys = {name: key for keys in (graph.x, graph.y) for name, key in keys.items()}
+    keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
+    keys |= {f"shape:{name}": key for name, key in graph.b.items()}
+    keys |= {f"time_offset:{name}": key for name, key in graph.t.items()}
+    keys |= {f"corners:{name}": key for name, key in graph.p.items()}
+    refined = replace(
+        base,
+        X=corners.X,
+        Y=corners.Y,
+        scale=_scale(base, corners),
+        scale_mode=_scale_mode(base, corners),
+        time_offsets_s=base.time_offsets_s | corners.time_offsets_s,
+        graph=graph.graph,
+        values=graph.values(corners.point),
+        keys=keys,
+        noise_source="estimated",
+        noise={
+            pair: PairNoise(noise.rotation_rad, noise.translation_m, (freedom, freedom))
+            for pair, noise in base.noise.items()
+        },
+        cost=cost,
+        initial_cost=cost,
+        iterations=corners.iterations,
+        moved=movements(base.solution, corners.X, corners.Y),
+        joint=joint,
+        reprojection=reprojection,
+        intrinsics=dict(intrinsics),
+    )
+    return replace(refined, intrinsics={name: _projected(refined, corners, name) for name in refined.intrinsics})
+
+
+def _projected(refined: Refined, corners: CornersRefined, sensor: str) -> Intrinsics:
+    """A sensor's intrinsics with how sure projections are at the depth where it saw its corners."""
+    intrinsics, seen = refined.intrinsics[sensor], []
+    for stack in corners.graph.model.stacks:
+        if stack.sensor == sensor:
+            z = corners.graph.model.depths(stack, corners.point)[stack.known]
+            x = intrinsics.camera.undistort(stack.pixels[stack.known])
+            seen.append(z[:, None] * np.concatenate([x, np.ones((len(x), 1))], axis=1))
+    points = np.concatenate(seen)
+    points = points[np.isfinite(points).all(axis=1)]
+    distance_m = float(np.median(points[:, 2]))
+    regions = by_region(intrinsics.camera, refined.covariance(f"intrinsics:{sensor}"), points, distance_m)
+    deviations = tuple(np.sqrt(np.diagonal(refined.covariance(f"intrinsics:{sensor}"))).tolist())
+    return replace(intrinsics, standard_deviations=deviations, projection_px=regions, projection_m=distance_m)
+
+
+def boards_of(corners: CornersRefined) -> dict[str, BoardShape]:
+    """What is free of each board, with its deviations."""
+    found = {}
+    for name in corners.X:
+        free = corners.graph.model.free_shape(name)
+        board = BoardShape((), (), ())
+        if len(free):
+            board = BoardShape(
+                tuple(SHAPE_NAMES[i] for i in free),
+                tuple(corners.shapes[name][free].tolist()),
+                tuple(np.sqrt(np.diagonal(corners.covariance(f"shape:{name}"))).tolist()),
+            )
+        if name in corners.point.corners:
+            deviations = np.sqrt(np.diagonal(corners.covariance(f"corners:{name}"))).reshape(-1, 3)
+            off = corners.point.corners[name]
+            board = replace(board, corners_off_m=_in_rows(off), corners_deviations_m=_in_rows(deviations))
+        if board.names or board.corners_off_m:
+            found[name] = board
+    return found
+
+
+def _in_rows(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, values.tolist()))
+
+
+def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict[str, Intrinsics]:
+    """Each sensor's intrinsics in numbers, without the projection's uncertainty; `stated` says where they are from."""
+    found = {}
+    camera_of = corners.graph.model.camera_of
+    for name, refined in corners.intrinsics.items():
+        camera, mean = refined.camera, corners.graph.model.camera_priors[camera_of[name]][0]
+        found[name] = Intrinsics(
+            model=camera.model,
+            width=camera.width,
+            height=camera.height,
+            shared_with=tuple(other for other in camera_of if other != name and camera_of[other] == camera_of[name]),
+            names=refined.names,
+            values=tuple(corners.point.cameras[camera_of[name]].tolist()),
+            standard_deviations=refined.standard_deviations,
+            stated=tuple(mean.tolist()),
+            stated_deviations=tuple(refined.stated_deviations.tolist()),
+            stated_as=stated[name],
+            widened=refined.widened,
+            innovation_deviations=refined.innovation.deviations,
+            held_by_prior=refined.held_by_prior,
+            rms_px=refined.rms_px,
+        )
+    return found
+
+
+def _joint(base: Refined, corners: CornersRefined) -> JointCovariance:
+    """The covariance of frames, scales, offsets, intrinsics and shapes, in GTSAM's order of the unknowns.
+
+    Sensors that share a camera have its rows each: the covariance is singular there, as it is. Places of single corners
+    are left out: they are unknowns of the graph, and of no interest beside a board's.
+    """
+    parts: list[tuple[Unknown, slice, float | Array]] = []
+    for name, (letter, owner) in corners.names.items():
+        rows = corners.slots[letter, owner]
+        if letter in "xy":
+            parts.append((Unknown(UnknownKind.FRAME, owner), rows, 1.0))
+        elif letter == "b":
+            free = corners.graph.model.free_shape(owner)
+            first = rows.start
+            if free[0] == 0:  # the size: scale = stated / true = 1 / (1 + s)
+                by_s = -1.0 / (1.0 + corners.shapes[owner][0]) ** 2
+                parts.append((Unknown(UnknownKind.SCALE, owner), slice(first, first + 1), by_s))
+                first += 1
+            if first < rows.stop:
+                parts.append((Unknown(UnknownKind.SHAPE, owner), slice(first, rows.stop), 1.0))
+        elif letter == "k":
+            parts.append((Unknown(UnknownKind.INTRINSICS, name.partition(":")[2]), rows, 1.0))
+        elif letter == "t":
+            parts.append((Unknown(UnknownKind.TIME_OFFSET, owner), rows, 1.0))
+    slots: dict[Unknown, slice] = {}
+    index: list[int] = []
+    factors: list[Array] = []
+    end = 0
+    for unknown, rows, factor in parts:
+        width = rows.stop - rows.start
+        slots[unknown] = slice(end, end + width)
+        index += range(rows.start, rows.stop)
+        factors.append(np.full(width, factor))
+        end += width
+    scaling = np.concatenate(factors)
+    finite = corners.joint[np.ix_(index, index)] * np.outer(scaling, scaling)
+    length = float(base.joint.unit[base.joint.slots[Unknown(UnknownKind.FRAME, next(iter(corners.X)))]][3])
+    unit = np.ones(end)
+    for unknown, rows in slots.items():
+        if unknown.kind is UnknownKind.FRAME:
+            unit[rows.start + 3 : rows.stop] = length
+    return JointCovariance(slots, finite, np.zeros((end, 0)), unit)
+
+
+def _scale(base: Refined, corners: CornersRefined) -> float | dict[str, float]:
+    """Stated / true lengths: those that are free here, else as before."""
+    model = corners.graph.model
+    free = {
+        name: 1.0 / (1.0 + float(shape[0])) for name, shape in corners.shapes.items() if 0 in model.free_shape(name)
+    }
+    if isinstance(base.scale, float):
+        return dict.fromkeys(corners.X, base.scale) | free if free else base.scale
+    return base.scale | free
+
+
+def _scale_mode(base: Refined, corners: CornersRefined) -> ScaleMode:
+    return "known" if isinstance(_scale(base, corners), float) else "per_target"
+
+
+def numbers_of(
+    observations: Observations,
+    corners: CornersRefined,
+    options: CornerOptions,
+    held_out: Mapping[str, HeldOut] | None = None,
+    tried: tuple[TriedModel, ...] = (),
+) -> Reprojection:
+    """Errors of all corners and by sensor, noise, boards, and what errors of what is kept would do.
+
+    Parameters
+    ----------
+    observations, options
+        What was refined from, and how.
+    corners : CornersRefined
+    held_out : dict of str to HeldOut, optional
+        Errors in images that were left out, by sensor.
+    tried : tuple of TriedModel
+        Models that were compared.
+    """
+    there = held_out or {}
+    sensors = {name: _of_sensor(name, observations, corners, there.get(name)) for name in corners.Y}
+    squares = sum(one.corners * one.rms_px**2 for one in sensors.values())
+    given = isinstance(options.carrier_noise, CarrierNoise)
+    return Reprojection(
+        rms_px=float(np.sqrt(squares / max(sum(one.corners for one in sensors.values()), 1))),
+        corner_px=corners.noise.corner_px,
+        carrier_poses="exact" if corners.noise.carrier is None else "given" if given else "estimated",
+        carrier_rotation_rad=corners.noise.carrier_rad,
+        carrier_translation_m=corners.noise.carrier_m,
+        sensors=sensors,
+        boards=boards_of(corners),
+        tried=tried,
+        consequences=consequences_of(corners),
+    )
+
+
+def _of_sensor(
+    name: str, observations: Observations, corners: CornersRefined, held_out: HeldOut | None
+) -> SensorReprojection:
+    views = {pair: view for pair, view in observations.views.items() if pair[1] == name}
+    left_out = sum(int(corners.left_out[pair].sum()) for pair in views)
+    return SensorReprojection(
+        images=sum(len(view.A) for view in views.values()),
+        corners=sum(int(view.known.sum()) for view in views.values()) - left_out,
+        left_out=left_out,
+        rms_px=corners.intrinsics[name].rms_px,
+        held_out_px=None if held_out is None else held_out.rms_px,
+        held_out_mm=None if held_out is None else held_out.rms_mm,
+        regions_px=() if held_out is None else _regions(held_out),
+        expected_px=None if held_out is None else held_out.expected_px,
+    )
+
+
+def _regions(held_out: HeldOut) -> Regions:
+    return tuple(
+        tuple(None if np.isnan(value) else float(value) for value in row) for row in held_out.regions_px.tolist()
+    )
+
+
+#: What is asked: pixels of the centre, a share of the focal length, radians of A's rotation about each axis.
+CENTRE_PX, FOCAL_SHARE, CARRIER_RAD = 1.0, 1e-3, np.radians(0.1)
+
+
+#: The cause of A's, in words: how they begin.
+OF_CARRIERS = f"{np.degrees(CARRIER_RAD):.1f} degrees of A's noise about each axis"
+
+
+def carrier_cause(refined: CornersRefined) -> str:
+    """A's noise, in words: rotations of A leave the origin of one of the two carriers where it is."""
+    about = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}[refined.graph.model.about]
+    return f"{OF_CARRIERS} (one standard deviation; A turns about the origin of the {about})"
+
+
+def centre_causes(sensor: str) -> tuple[str, str]:
+    """Errors of a camera's centre, in words."""
+    return f"{CENTRE_PX:g} pixel of {sensor}'s cx", f"{CENTRE_PX:g} pixel of {sensor}'s cy"
+
+
+def focal_cause(sensor: str) -> str:
+    """An error of a camera's focal length, in words."""
+    return f"{FOCAL_SHARE:.1%} of {sensor}'s focal length"
+
+
+def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
+    """What one pixel of c, one part in a thousand of f and 0.1 degrees of A's noise would do to each frame."""
+    slots = refined.slots
+    information = np.linalg.inv(refined.joint)
+    poses = {name: at for (letter, name), at in slots.items() if letter in "xy"}
+    rest = np.concatenate([np.arange(at.start, at.stop) for (letter, _), at in slots.items() if letter != "k"])
+    result = []
+    for (letter, name), at in slots.items():
+        if letter != "k":
+            continue
+        focal = refined.intrinsics[name].camera.K[[0, 1], [0, 1]]
+        of_cx, of_cy = centre_causes(name)
+        steps: dict[str, tuple[int | slice, float | Array]] = {
+            of_cx: (2, CENTRE_PX),
+            of_cy: (3, CENTRE_PX),
+            focal_cause(name): (slice(0, 2), FOCAL_SHARE * focal),
+        }
+        for cause, (which, size) in steps.items():
+            dk = np.zeros(at.stop - at.start)
+            dk[which] = size
+            moved = np.zeros(len(information))
+            moved[rest] = -np.linalg.solve(information[np.ix_(rest, rest)], information[rest, at] @ dk)
+            result += [_moved(frame, cause, moved[rows]) for frame, rows in poses.items()]
+    covariance, cause = _of_carrier_noise(refined), carrier_cause(refined)
+    for frame, rows in poses.items():
+        block = covariance[rows, rows]
+        worst = [np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (block[:3, :3], block[3:, 3:])]
+        result.append(Consequence(frame, cause, float(np.degrees(worst[0])), float(1e3 * worst[1])))
+    return tuple(result)
+
+
+def _moved(frame: str, cause: str, xi: Array) -> Consequence:
+    return Consequence(frame, cause, float(np.degrees(np.linalg.norm(xi[:3]))), float(1e3 * np.linalg.norm(xi[3:])))
+
+
+def _of_carrier_noise(refined: CornersRefined) -> Array:
+    """The covariance of all unknowns from errors of A about each axis, where A is taken as exact."""
+    model = refined.graph.model
+    reduced = Reduced.of(model, replace(refined.point, A=model.A))
+    s2 = refined.noise.corner_px**2
+    inverse = np.linalg.inv(reduced.G / s2 + np.diag(reduced.prior))
+    C = reduced.C[:, :3] / s2 * CARRIER_RAD
+    flat = C.reshape(-1, C.shape[2])
+    covariance: Array = inverse @ (flat.T @ flat) @ inverse
+    return covariance

@@ -1,0 +1,182 @@
+"""."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from scipy.special import chdtri, fdtri
+
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.fitting.corner_graph import CornerGraph
+from gtsam_rwhec.fitting.corner_model import Point
+from gtsam_rwhec.fitting.corner_noise import Noise
+from gtsam_rwhec.fitting.stated_intrinsics import Innovation, held_by_prior
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import is_real
+from gtsam_rwhec.vision.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedIntrinsics:
+    """A camera's intrinsics.
+
+    Attributes
+    ----------
+    camera : Camera
+    covariance : (m, m) array
+        Of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
+    stated_deviations : (m,) array
+        Of the prior, as widened.
+    widened : float
+        By how much: 1 where the images do not contradict what was stated.
+    innovation : Innovation
+        The test of the intrinsics as they were stated.
+    rms_px : float
+        Of the corners that count, along each axis.
+    """
+
+    camera: Camera
+    covariance: Array
+    stated_deviations: Array
+    widened: float
+    innovation: Innovation
+    rms_px: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return self.camera.parameter_names
+
+    @property
+    def standard_deviations(self) -> tuple[float, ...]:
+        """Of the parameters."""
+        return tuple(np.sqrt(np.diagonal(self.covariance)).tolist())
+
+    @property
+    def held_by_prior(self) -> tuple[str, ...]:
+        """Parameters that the images do not determine: what is known of them is what was stated."""
+        held = held_by_prior(self.stated_deviations, self.covariance)
+        return tuple(name for name, is_held in zip(self.names, held, strict=True) if is_held)
+
+
+@dataclass(frozen=True, eq=False)
+class CornersRefined:
+    """Poses, cameras and boards refined from corners, with their joint covariance.
+
+    Attributes
+    ----------
+    X, Y : dict of str to gtsam.Pose3
+        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
+    intrinsics : dict of str to RefinedIntrinsics
+        By sensor.
+    shapes : dict of str to (3,) array
+        By target: its size less the stated one, a share; heights of its edge over its middle along x and y, metres.
+    corners : dict of str to (n, 3) array
+        By target: its corners in its frame, with its size, its bend and what each is off its place, metres.
+    time_offsets_s : dict of str to float
+        By sensor whose clock's offset was free: its images were taken that long after the times of their A.
+    noise : Noise
+    joint : (d, d) array
+        Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
+    freedom : dict of (letter, name) to float
+        Degrees of freedom of each unknown's covariance, whose noise was estimated.
+    left_out : dict of (target, sensor) to (V, n) booleans
+        Corners that disagree with all others.
+    graph : CornerGraph
+        The GTSAM graph at the optimum's noise, with its model and its variables' keys.
+    point : Point
+        The values of all variables, with the carriers' poses at the instants.
+    iterations : int
+        Levenberg-Marquardt steps, in all rounds together.
+    last_step : float
+        What one more Gauss-Newton step would move, in deviations: it is far below 1 at an optimum.
+    findings : tuple of str
+        What is doubtful, in words with the figures, the gravest first; empty where nothing is.
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    intrinsics: dict[str, RefinedIntrinsics]
+    shapes: dict[str, Array]
+    corners: dict[str, Array]
+    time_offsets_s: dict[str, float]
+    noise: Noise
+    joint: Array = field(repr=False)
+    slots: Mapping[tuple[str, str], slice] = field(repr=False)
+    freedom: Mapping[tuple[str, str], float] = field(repr=False)
+    left_out: dict[tuple[str, str], np.ndarray] = field(repr=False)
+    graph: CornerGraph = field(repr=False)
+    point: Point = field(repr=False)
+    iterations: int
+    last_step: float
+    findings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """What was refined from what, how well it fits, and what is doubtful, in a few sentences."""
+        stacks, noise = self.graph.model.stacks, self.noise
+        images = sum(len(stack.pixels) for stack in stacks)
+        seen = sum(int(stack.known.sum()) for stack in stacks)
+        left_out = sum(int(mask.sum()) for mask in self.left_out.values())
+        rms = ", ".join(f"{name} {of.rms_px:.3f}" for name, of in self.intrinsics.items())
+        size = f"{rounded(np.degrees(noise.carrier_rad))} degrees and {rounded(1e3 * noise.carrier_m)} mm for each axis"
+        of_A = "A counts as exact" if noise.carrier is None else f"noise of A {size}"
+        findings = " ".join(self.findings) or "No findings."
+        return (
+            f"Refined from {seen - left_out} corners in {images} images of {', '.join(self.X)} by {', '.join(self.Y)}; "
+            f"{left_out} corners left out. rms in pixels along each axis: {rms}; {of_A}. {findings}"
+        )
+
+    def __repr__(self) -> str:
+        return f"<CornersRefined: {self}>"
+
+    def covariance(self, *names: str) -> Array:
+        """The joint covariance of unknowns, in the order given; without names, of all.
+
+        Frames have six rows each, rotation first (rad, m, in the frame's own axes); ``intrinsics:SENSOR`` a camera's
+        parameters in the order of `RefinedIntrinsics.names` (pixels; coefficients have no unit); ``shape:TARGET`` the
+        numbers that are free of the size and the two heights of the edge; ``time_offset:SENSOR`` one row, s^2;
+        ``corners:TARGET`` three rows a corner, m^2.
+
+        Raises
+        ------
+        FrameError
+            A name is none of the unknowns.
+        """
+        there = self.names
+        rows: list[int] = []
+        for name in names or tuple(there):
+            if name not in there:
+                raise FrameError(f"{name!r} is not among the unknowns; they are {', '.join(there)}")
+            at = self.slots[there[name]]
+            rows += range(at.start, at.stop)
+        return self.joint[np.ix_(rows, rows)]
+
+    def squared_radius(self, name: str, confidence: float = 0.95) -> float:
+        """The largest error' covariance^-1 error of an unknown inside its confidence ellipsoid: by an F quantile.
+
+        Raises
+        ------
+        FrameError
+            The name is none of the unknowns.
+        OptionError
+            The confidence is not between 0 and 1.
+        """
+        if not (is_real(confidence) and 0.0 < confidence < 1.0):
+            raise OptionError(f"confidence={brief(confidence)}; give one between 0 and 1")
+        dimension, freedom = len(self.covariance(name)), self.freedom[self.names[name]]
+        if np.isinf(freedom):
+            return float(chdtri(dimension, 1.0 - confidence))
+        return float(dimension * fdtri(dimension, freedom, confidence))
+
+    @property
+    def names(self) -> dict[str, tuple[str, str]]:
+        """The unknowns' names."""
+        frames = {name: (letter, name) for letter, name in self.slots if letter in "xy"}
+        cameras = {f"intrinsics:{name}": ("k", self.graph.model.camera_of[name]) for name in self.Y}
+        others = {"b": "shape", "t": "time_offset", "p": "corners"}
+        return frames | cameras | {f"{others[at[0]]}:{at[1]}": at for at in self.slots if at[0] in others}

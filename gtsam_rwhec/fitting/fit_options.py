@@ -1,0 +1,333 @@
+"""The options of a refinement, and the noise of carrier poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from gtsam_rwhec.errors import NoiseError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
+from gtsam_rwhec.problem.pairs import ByPair
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+NoiseSource = Literal["auto", "given", "estimate"]
+NoiseGroups = Literal["all", "sensor", "pair"]
+ResidualKind = Literal["geodesic", "chordal"]
+Robust = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"]
+CarrierModel = Literal["auto", "propagated", "variables"]
+About = Literal["targetcarrier", "sensorcarrier"]
+ObservationKind = Literal["poses", "corners"]
+
+
+@dataclass(frozen=True)
+class CarrierNoise:
+    """Noise of the carrier poses A = T_sensorcarrier_targetcarrier, from kinematics or motion capture.
+
+    Attributes
+    ----------
+    rotation_rad, translation_m : float
+        Standard deviations about each axis, rad, and along each axis, m.
+    covariances : dict of (target, sensor) to (N, 6, 6) array, optional
+        A covariance for each measurement, in place of the standard deviations; rotation first.
+    about : "targetcarrier" or "sensorcarrier"
+        The carrier whose axes and origin the perturbation has: A Expmap(xi) for the target carrier (the error of an
+        arm's hand in its own frame, with A = T_base_hand), Expmap(xi) A for the sensor carrier.
+    """
+
+    rotation_rad: float = 0.0
+    translation_m: float = 0.0
+    covariances: ByPair[Array] | None = None
+    about: About = "targetcarrier"
+
+    def __post_init__(self) -> None:
+        if not is_one_of(self.about, get_args(About)):
+            raise OptionError(
+                f"CarrierNoise.about={brief(self.about)} is not one of {', '.join(map(repr, get_args(About)))}"
+            )
+        if self.covariances is not None:
+            if self.rotation_rad or self.translation_m:
+                raise NoiseError(
+                    f"CarrierNoise has covariances, and also rotation_rad={self.rotation_rad!r} and "
+                    f"translation_m={self.translation_m!r}; give covariances or standard deviations, not both"
+                )
+            return
+        for name in ("rotation_rad", "translation_m"):
+            value = getattr(self, name)
+            if not (is_real(value) and 0.0 < value <= np.finfo(np.float64).max):
+                raise NoiseError(
+                    f"CarrierNoise.{name} is {brief(value)}; give a positive standard deviation (or no CarrierNoise at "
+                    "all, if A is exact)"
+                )
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """The options of ``refine``.
+
+    Attributes
+    ----------
+    noise : "auto", "given" or "estimate"
+        The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": these times variance
+        factors, one for rotations and one for translations, estimated from the residuals. "auto": given if there are
+        weights, else estimated.
+    noise_groups : "all", "sensor" or "pair"
+        The groups of residuals that share a variance factor.
+    residual : "geodesic" or "chordal"
+        "geodesic": Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements. "chordal": the certified
+        cost's residual, from moments alone; then GTSAM's optimum is the certified optimum.
+    robust : "none", "huber", "cauchy", "tukey", "geman_mcclure" or "gnc"
+        GTSAM's losses start at the certified solution, by way of "huber", and have 95 % efficiency for Gaussian noise.
+        Many gross outliers pull this start away. "gnc" is graduated truncated least squares around the certified
+        solver. It needs no good start, and leaves outliers out.
+    inlier_confidence : float
+        With "gnc": probability that a good measurement is kept, at least: all good ones together are kept with 95 %.
+    carrier_noise : CarrierNoise, optional
+        The noise of A. Without it A counts as exact; if A is not exact, covariances are then too small.
+    carrier_model : "auto", "propagated" or "variables"
+        "propagated": A's noise is propagated into each residual to first order. "variables": each A is a variable,
+        shared by the measurements of one stamp. "auto": variables if measurements share a stamp; else propagated, which
+        is then the same.
+    time_offsets : bool or tuple of str
+        Estimate the clock offset of each sensor, or of the named sensors: a sensor's stamp t is the carriers' t +
+        offset (Kalibr's convention). The measurements need stamps.
+    carrier_path : Trajectory, optional
+        T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Time offsets move A
+        along this path. Without it the measurements' own A give the carriers' motion.
+    max_iterations : int
+        Largest number of Levenberg-Marquardt steps.
+    observations : "poses" or "corners"
+        What is refined from: the measured poses B, or, from there on, the corners of the images that the problem holds
+        (``problem.add_corners``). The other options are then those of the poses, of which outliers among images are
+        left out too (``robust="gnc"``); ``rw.CornerOptions`` has those of the corners.
+    """
+
+    noise: NoiseSource = "auto"
+    noise_groups: NoiseGroups = "all"
+    residual: ResidualKind = "geodesic"
+    robust: Robust = "none"
+    inlier_confidence: float = 0.997
+    carrier_noise: CarrierNoise | None = None
+    carrier_model: CarrierModel = "auto"
+    time_offsets: bool | tuple[str, ...] = False
+    carrier_path: Trajectory | None = None
+    max_iterations: int = 100
+    observations: ObservationKind = "poses"
+
+    def __post_init__(self) -> None:
+        for name, choices in _REFINE_CHOICES.items():
+            if not is_one_of(getattr(self, name), get_args(choices)):
+                raise OptionError(
+                    f"RefineOptions.{name}={brief(getattr(self, name))} is not one of "
+                    f"{', '.join(map(repr, get_args(choices)))}"
+                )
+        if not (isinstance(self.inlier_confidence, float) and 0.5 < self.inlier_confidence < 1.0):
+            raise OptionError(
+                f"RefineOptions.inlier_confidence={brief(self.inlier_confidence)}; give one between 0.5 and 1"
+            )
+        if not isinstance(self.time_offsets, (bool, tuple)):
+            raise OptionError(
+                f"RefineOptions.time_offsets={brief(self.time_offsets)}; give True, or a tuple of sensors' names: "
+                "('cam_0',)"
+            )
+        if not is_whole(self.max_iterations, 1):
+            raise OptionError(
+                f"RefineOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "
+                f"{LARGEST_WHOLE}"
+            )
+        if self.carrier_noise is not None and not isinstance(self.carrier_noise, CarrierNoise):
+            raise OptionError(
+                f"RefineOptions.carrier_noise is a {type(self.carrier_noise).__name__}; give "
+                "CarrierNoise(rotation_rad=..., translation_m=...)"
+            )
+        if self.carrier_path is not None and not self.time_offsets:
+            raise OptionError("RefineOptions.carrier_path has no use without time_offsets; give time_offsets too")
+        if self.residual == "chordal":
+            for name, value in (
+                ("carrier_noise", self.carrier_noise),
+                ("time_offsets", self.time_offsets),
+                ("robust", None if self.robust in ("none", "gnc") else self.robust),
+            ):
+                if value:
+                    raise OptionError(
+                        f"RefineOptions.{name}={value!r} needs residual='geodesic'; the chordal one has moments only"
+                    )
+
+
+_REFINE_CHOICES = {
+    "noise": NoiseSource,
+    "noise_groups": NoiseGroups,
+    "residual": ResidualKind,
+    "robust": Robust,
+    "carrier_model": CarrierModel,
+    "observations": ObservationKind,
+}
+
+
+class Component(StrEnum):
+    """A kind of noise; the unit is that of its standard deviation."""
+
+    #: B's rotation about each axis, rad (a factor, where covariances are stated).
+    ROTATION = "rotation of B"
+    #: B's translation along each axis, m (a factor, where covariances are stated).
+    TRANSLATION = "translation of B"
+    #: B's translation along the sensor's z axis, on top, m.
+    DEPTH = "depth of B"
+    #: A's rotation about each axis, rad.
+    CARRIER_ROTATION = "rotation of A"
+    #: A's translation along each axis, m.
+    CARRIER_TRANSLATION = "translation of A"
+    #: Jitter of clocks, s.
+    JITTER = "jitter"
+    #: Drift of a sensor's track in a step: rotation, rad.
+    DRIFT_ROTATION = "drift of rotation"
+    #: Drift in a step: translation, m.
+    DRIFT_TRANSLATION = "drift of translation"
+    #: Drift in a step: logarithm of the scale.
+    DRIFT_SCALE = "drift of scale"
+    #: Errors of the carriers' poses that vary with the configuration: rotation, rad.
+    SYSTEMATIC_ROTATION = "systematic rotation of A"
+    #: The same: translation, m.
+    SYSTEMATIC_TRANSLATION = "systematic translation of A"
+
+
+#: Whose frame an error is made in; "detection": rotations in the target's axes, translations along the sensor's.
+DriftFrame = Literal["sensor", "target", "detection"]
+
+
+class Walk(NamedTuple):
+    """A kind of drift: the correlation of errors from step to step (1: a random walk), and whose frame they are in."""
+
+    correlation: float
+    frame: DriftFrame
+
+
+#: Whether a track drifts: found out, a random walk, errors with a correlation time, or neither.
+Drift = Literal["auto", "walk", "correlated", "none"]
+
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """The options of ``modelled``; each one overrules a choice that the data make.
+
+    Attributes
+    ----------
+    stated : dict of Component to float
+        Standard deviations that are known. Those of B are factors of the covariances that the problem states.
+    carrier : bool
+        Whether A has noise.
+    systematic : bool
+        Whether A has errors that vary smoothly with the configuration.
+    drift : "auto", "walk", "correlated", "none" or Walk
+        "auto": as the residuals' correlation in time shows. A ``Walk``: this kind, which was found before.
+    side : "targetcarrier", "sensorcarrier" or None
+        Which carrier the errors of A are fixed to: an arm's hand. None: as the data show.
+    """
+
+    stated: dict[Component, float] = field(default_factory=dict)
+    carrier: bool = True
+    systematic: bool = True
+    drift: Drift | Walk = "auto"
+    side: About | None = None
+
+
+CarrierPoses = Literal["exact", "estimate"]
+
+
+@dataclass(frozen=True)
+class CornerOptions:
+    """The options of `refine_corners`.
+
+    Attributes
+    ----------
+    stated : "exact", "calibration", "nominal" or "unknown", or a dict of them by sensor
+        Where the stated intrinsics come from. A calibration's are right to 0.3 % of f and 3 pixels of c, nominal ones
+        to 3 % and to 30 pixels or 2 % of the width; the images alone say unknown ones, and exact ones are held. Sensors
+        that a dict lacks are nominal. Where the images contradict what is stated, the deviation is widened, and the
+        result says so.
+    shared : tuple of tuple of str
+        Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
+    size_share : float, or dict of str to float
+        Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated, as are those of targets
+        that a dict lacks.
+    warp_m : float
+        Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
+    corners_m : float
+        Standard deviation of each corner's place on its board along each axis, metres, such as a printer's 1e-4; 0:
+        they are where the board has them. With n corners there are 3n more unknowns: time grows with their square.
+    carrier_noise : CarrierNoise, "estimate" or "exact"
+        The noise of the carriers' poses A: given (standard deviations), estimated, or none.
+    about : "targetcarrier" or "sensorcarrier"
+        The carrier whose axes and origin A's noise has, where it is estimated: the one that moves.
+    time_offsets : tuple of str
+        Sensors whose clock's offset is free: images were taken that long after the times of their A, at which the views
+        have the carriers' velocity (`Views.twist`). A prior of 1 s about no offset keeps it finite. Offsets above some
+        milliseconds want A taken at the new time, and another refinement. A rolling shutter, whose rows are seen one
+        after the other, is not modelled: an offset is that of the mean row.
+    outliers : bool
+        Leave corners out that disagree with all others.
+    max_iterations : int
+        Largest number of Levenberg-Marquardt steps of one round.
+    """
+
+    stated: Stated | Mapping[str, Stated] = "nominal"
+    shared: tuple[tuple[str, ...], ...] = field(default=())
+    size_share: float | Mapping[str, float] = 0.0
+    warp_m: float = 0.0
+    corners_m: float = 0.0
+    carrier_noise: CarrierNoise | CarrierPoses = "estimate"
+    about: About = "targetcarrier"
+    time_offsets: tuple[str, ...] = ()
+    outliers: bool = True
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        every = self.stated.values() if isinstance(self.stated, Mapping) else (self.stated,)
+        for value, words, choices in (*((each, "stated", Stated) for each in every), (self.about, "about", About)):
+            if not is_one_of(value, get_args(choices)):
+                raise OptionError(
+                    f"CornerOptions.{words}={brief(value)} is not one of {', '.join(map(repr, get_args(choices)))}"
+                )
+        shares = self.size_share.values() if isinstance(self.size_share, Mapping) else (self.size_share,)
+        others = (("warp_m", self.warp_m), ("corners_m", self.corners_m))
+        for name, deviation in (*(("size_share", each) for each in shares), *others):
+            if not (is_real(deviation) and 0.0 <= deviation < np.inf):
+                raise OptionError(f"CornerOptions.{name}={brief(deviation)}; give a standard deviation, or 0")
+        noise = self.carrier_noise
+        if not isinstance(noise, CarrierNoise) and not is_one_of(noise, get_args(CarrierPoses)):
+            raise OptionError(
+                f"CornerOptions.carrier_noise={brief(noise)}; give CarrierNoise(rotation_rad=..., translation_m=...), "
+                "'estimate' or 'exact'"
+            )
+        if isinstance(noise, CarrierNoise) and noise.covariances is not None:
+            raise OptionError("CornerOptions.carrier_noise has covariances; give rotation_rad and translation_m")
+        offsets = self.time_offsets
+        if not (isinstance(offsets, tuple) and all(isinstance(name, str) for name in offsets)):
+            raise OptionError(
+                f"CornerOptions.time_offsets={brief(offsets)}; give a tuple of sensors' names, such as ('cam_0',)"
+            )
+        if not is_whole(self.max_iterations, 1):
+            raise OptionError(
+                f"CornerOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "
+                f"{LARGEST_WHOLE}"
+            )
+
+    def stated_of(self, sensor: str) -> Stated:
+        """Where a sensor's intrinsics come from."""
+        return self.stated.get(sensor, "nominal") if isinstance(self.stated, Mapping) else self.stated
+
+    def size_share_of(self, target: str) -> float:
+        """The standard deviation of a target's size, a share of 1."""
+        return self.size_share.get(target, 0.0) if isinstance(self.size_share, Mapping) else self.size_share
+
+    def camera_of(self, sensor: str) -> str:
+        """The sensor whose intrinsics this sensor has: its own, or the first one's of its group."""
+        return next((group[0] for group in self.shared if sensor in group), sensor)
+
+
+Stated = Literal["exact", "calibration", "nominal", "unknown"]

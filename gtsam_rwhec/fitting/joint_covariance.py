@@ -1,0 +1,272 @@
+"""Covariances from an information matrix with free directions: infinite along these, finite elsewhere.
+
+F are the free directions (``FreeSpace``), and Q spans their orthogonal complement. With a prior of variance tau along F
+the covariance is, for tau to infinity,
+
+    tau F F' + Q (Q' Lambda Q)^-1 Q'
+
+so it is finite for every function that F does not change, and infinite for the others. For such a matrix GTSAM's
+Marginals raise an error or return 1e18.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+from scipy.linalg import block_diag
+from scipy.linalg.lapack import dpotri
+
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.fitting.unknowns import Unknown, rows_of, slots_of
+from gtsam_rwhec.geometry.poses import Array
+
+#: A linear function is determined when its share along the free directions is below this. (A free direction's sentence
+#: leaves out frames below the same share.)
+SHARE = 0.05
+#: An estimate counts as this far from the truth along a free direction, in units (the typical length).
+DISPLACED = 1.0
+#: An eigenvalue of an equilibrated information is rounding error below this share of the largest one.
+ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """The covariance of all unknowns together: dense, d x d.
+
+    Attributes
+    ----------
+    slots : dict of Unknown to slice
+        The rows of each unknown.
+    finite : (d, d) array
+        Q (Q' Lambda Q)^-1 Q'.
+    free : (d, k) array
+        Directions of infinite variance, orthonormal in units of ``unit``.
+    unit : (d,) array
+        The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
+    """
+
+    slots: dict[Unknown, slice]
+    finite: Array
+    free: Array
+    unit: Array
+
+    @staticmethod
+    def of(unknowns: tuple[Unknown, ...], information: Array, free: Array, unit: Array) -> JointCovariance:
+        """The inverse of an information (d, d) of the unknowns in their order.
+
+        ``free`` (d, k) are the free directions in the parameters' own units; k may be 0.
+        """
+        scaled = information * unit[:, None] * unit
+        scaled = 0.5 * (scaled + scaled.T)
+        basis = _orthonormal(free / unit[:, None])
+        has_free = bool(basis.shape[1])
+        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if has_free else np.eye(len(unit))
+        inside = Q.T @ scaled @ Q if has_free else scaled
+        # Equilibrated, so that each parameter's own information is the scale of its rounding.
+        # What is below the rounding of the largest, once directions are mixed, is nothing.
+        diagonal = np.diagonal(inside)
+        least = ROUNDING**2 * diagonal.max(initial=0.0) if has_free else 0.0
+        size = np.sqrt(np.maximum(diagonal, max(least, 1e-300)))
+        inside = inside / size[:, None] / size
+        if not has_free and len(unit) > SMALL:
+            inverse = _surely_definite_inverse(inside)
+            if inverse is not None:
+                share = unit / size
+                return JointCovariance(slots_of(unknowns), inverse * share[:, None] * share, basis, unit)
+        values, vectors = np.linalg.eigh(inside)
+        lost = values <= ROUNDING * values.max(initial=0.0)
+        if lost.any():  # no measurement depends on these directions
+            more = Q @ (vectors[:, lost] / size[:, None])
+            more /= np.abs(more).max(axis=0)  # a parameter without information has a size of 1e-150
+            return JointCovariance.of(unknowns, information, np.hstack([free, more * unit[:, None]]), unit)
+        root = Q @ (vectors / np.sqrt(values) / size[:, None])
+        finite = (root @ root.T) * np.outer(unit, unit)
+        return JointCovariance(slots_of(unknowns), finite, basis, unit)
+
+    def rows(self, unknowns: tuple[Unknown, ...]) -> np.ndarray:
+        """The row indices of some unknowns, in the order given; FrameError for any other name."""
+        for unknown in unknowns:
+            if unknown not in self.slots:
+                there = ", ".join(map(str, self.slots))
+                raise FrameError(f"{str(unknown)!r} is not among the unknowns; they are {there}")
+        return rows_of(self.slots, unknowns)
+
+    def selector(self, unknowns: tuple[Unknown, ...]) -> Array:
+        """The matrix (m, d) that selects the rows of some unknowns."""
+        rows = self.rows(unknowns)
+        selected: Array = np.zeros((len(rows), len(self.unit)))
+        selected[np.arange(len(rows)), rows] = 1.0
+        return selected
+
+    def reach(self, G: Array) -> Array:
+        """The movement (m, k) of the rows of G along each free direction that moves one parameter by a unit."""
+        if self.free.shape[1] == 0:
+            return np.zeros((len(G), 0))
+        # The largest entry sets the length: a direction may move many frames.
+        largest = np.linalg.norm(self.free, axis=1).max()
+        moved: Array = (G * self.unit) @ self.free / largest
+        return moved
+
+    def covariance_of(self, G: Array) -> Array:
+        """The covariance (m, m) of the linear functions G (m, d) of the unknowns.
+
+        The variance of every row that a free direction changes is infinite. If a direction changes two
+        rows, their covariance is infinite too, with the sign of their correlation. A row that a direction changes by
+        less than ``SHARE`` keeps a finite variance, which includes a displacement by ``DISPLACED`` units along the
+        direction.
+        """
+        moved = self.reach(G)
+        length = np.linalg.norm(G * self.unit, axis=1)
+        shares = moved / np.where(length > 0.0, length, 1.0)[:, None]
+        touched = np.linalg.norm(shares, axis=1) > SHARE
+        used = np.flatnonzero(G.any(axis=0))  # few of many unknowns
+        of_used = G[:, used]
+        covariance: Array = of_used @ self.finite[used[:, None], used] @ of_used.T + DISPLACED**2 * moved @ moved.T
+        along = shares @ shares.T
+        reached = touched[:, None] & touched & (np.abs(along) > SHARE**2 * 1e-3)
+        covariance[reached] = np.inf * np.sign(along[reached])
+        return covariance
+
+    def information_of(self, unknowns: tuple[Unknown, ...]) -> Array:
+        """The marginal information (m, m): the inverse of the finite covariance, and 0 along free directions."""
+        chosen = self.selector(unknowns)
+        unit = self.unit[self.rows(unknowns)]
+        moved = self.reach(chosen) / unit[:, None]
+        # Functions of these unknowns that free directions change, strongest first; those below SHARE are displaced.
+        U, s, _ = np.linalg.svd(moved, full_matrices=True)
+        rank = int((s > SHARE).sum())
+        turned = block_diag(*(self.turned(unknown) for unknown in unknowns))
+        finite = (chosen @ self.finite @ chosen.T + turned) / unit[:, None] / unit
+        finite += DISPLACED**2 * moved @ moved.T
+        Q = U[:, rank:]
+        inside: Array = Q @ np.linalg.inv(Q.T @ finite @ Q) @ Q.T
+        marginal: Array = inside / unit[:, None] / unit
+        return marginal
+
+    def turned(self, unknown: Unknown) -> Array:
+        """The covariance (m, m) that a rotation's error adds to a frame that is displaced along a free direction.
+
+        An error omega of the rotation turns the free direction with it: a frame displaced by f moves by omega x f. The
+        term is of second order, but f is not small.
+        """
+        rows = self.rows((unknown,))
+        result = np.zeros((len(rows), len(rows)))
+        if len(rows) == 6:
+            for f in DISPLACED * self.reach(self.selector((unknown,)))[3:].T:
+                across = se3.hat(f)
+                result[3:, 3:] += across @ self.finite[np.ix_(rows[:3], rows[:3])] @ across.T
+        return result
+
+
+def _surely_definite_inverse(information: Array) -> Array | None:
+    """The inverse, without eigenvalues; None where one of these may be rounding error."""
+    try:
+        inverse, _ = EliminationOrder.of(information).inverse(information)
+    except np.linalg.LinAlgError:
+        return None
+    largest, smallest = (np.abs(each).sum(axis=0).max() for each in (information, inverse))  # at least, and its inverse
+    return inverse if ROUNDING * largest * smallest < 1.0 else None
+
+
+def _orthonormal(basis: Array) -> Array:
+    """An orthonormal basis of the columns' span."""
+    if basis.shape[1] == 0:
+        return basis
+    U, s, _ = np.linalg.svd(basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-300), full_matrices=False)
+    span: Array = U[:, s > 1e-9 * max(s[0], 1e-300)]
+    return span
+
+
+#: Smaller matrices are inverted as a whole.
+SMALL = 120
+#: Blocks are eliminated together where they are at least this share of what is left.
+WORTH_IT = 0.3
+
+
+@dataclass(frozen=True)
+class EliminationOrder:
+    """Which parameters are eliminated at once.
+
+    Attributes
+    ----------
+    size : int
+        The number of all parameters.
+    levels : tuple of (n, w) arrays
+        n blocks of w parameters which nothing ties to one another once the levels before are eliminated.
+    """
+
+    size: int
+    levels: tuple[np.ndarray, ...] = ()
+
+    @staticmethod
+    def of(matrix: Array) -> EliminationOrder:
+        """For matrices (d, d) that are zero where this one is; its parameters with the same ties are blocks."""
+        size, levels = len(matrix), []
+        if size > SMALL:
+            tied = (matrix != 0.0) | np.eye(size, dtype=bool)
+            _, first, member = np.unique(np.packbits(tied, axis=1), axis=0, return_index=True, return_inverse=True)
+            neighbours = tied[np.ix_(first, first)]
+            np.fill_diagonal(neighbours, val=False)
+            widths = np.bincount(member.ravel())
+            blocks = np.split(np.argsort(member.ravel(), kind="stable"), np.cumsum(widths)[:-1])
+            left = np.ones(len(blocks), dtype=bool)
+            while widths[left].sum() > SMALL:
+                chosen = _independent(neighbours, widths, left)
+                if len(chosen) < 2 or widths[chosen].sum() < WORTH_IT * widths[left].sum():
+                    break
+                levels.append(np.array([blocks[number] for number in chosen]))
+                left[chosen] = False
+                ties = neighbours[chosen].astype(np.float64)  # through these, their neighbours are tied
+                neighbours |= ties.T @ ties > 0.0
+                np.fill_diagonal(neighbours, val=False)
+        return EliminationOrder(size, tuple(levels))
+
+    def inverse(self, matrix: Array) -> tuple[Array, float]:
+        """The inverse of a matrix of this pattern, and log|matrix|; LinAlgError if it is not positive definite."""
+        return _inverse(matrix, self.levels, np.arange(self.size))
+
+
+def _independent(neighbours: np.ndarray, widths: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Blocks of one width that are no neighbours, those with few neighbours first."""
+    best = np.zeros(0, dtype=np.int64)
+    degree = (neighbours & left).sum(axis=1)
+    for width in np.unique(widths[left]):
+        found, is_free = [], left & (widths == width)
+        for number in np.argsort(degree, kind="stable"):
+            if is_free[number]:
+                found.append(number)
+                is_free &= ~neighbours[number]
+        if len(found) * width > len(best) * (widths[best[0]] if len(best) else 1):
+            best = np.array(found)
+    return best
+
+
+def _inverse(matrix: Array, levels: tuple[np.ndarray, ...], names: np.ndarray) -> tuple[Array, float]:
+    """``names`` are the parameters of the rows, in order."""
+    if not levels:
+        L = np.linalg.cholesky(matrix)
+        log_det = 2.0 * float(np.log(np.diagonal(L)).sum())
+        if not len(L):
+            return L, log_det
+        lower = np.tril(dpotri(L, lower=1)[0])
+        whole: Array = lower + np.tril(lower, -1).T
+        return whole, log_det
+    own = np.searchsorted(names, levels[0])
+    is_rest = np.ones(len(matrix), dtype=bool)
+    is_rest[own] = False
+    rest, flat = np.flatnonzero(is_rest), own.ravel()
+    blocks, ties = matrix[own[:, :, None], own[:, None]], matrix[flat[:, None], rest]
+    log_det = 2.0 * float(np.log(np.diagonal(np.linalg.cholesky(blocks), axis1=1, axis2=2)).sum())
+    alone = np.linalg.inv(blocks)
+    through = (alone @ ties.reshape(*own.shape, -1)).reshape(len(flat), -1)
+    of_rest, log_det_rest = _inverse(matrix[rest[:, None], rest] - ties.T @ through, levels[1:], names[rest])
+    mixed = through @ of_rest
+    result = np.empty_like(matrix)
+    result[rest[:, None], rest] = of_rest
+    result[flat[:, None], rest] = -mixed
+    result[rest[:, None], flat] = -mixed.T
+    result[flat[:, None], flat] = mixed @ through.T
+    result[own[:, :, None], own[:, None]] += alone
+    return result, log_det + log_det_rest

@@ -1,0 +1,401 @@
+"""All measurements of a problem as rows of one linear model, with the directions in which each kind of noise acts.
+
+About an estimate the residual r = Log(B^-1 S(Y^-1 A X)) of a measurement is
+
+    r + J d = noise of B + E e + G w + sum_k f_k E u_k
+
+d moves the unknowns; e is a twist of A at this instant, on the side of what moves; w is the drift of the sensor's
+track; u_k are the arm's systematic errors, which vary smoothly with its configuration (f_k).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from gtsam_rwhec.fitting.fit_options import About
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.pair_data import PairData
+from gtsam_rwhec.fitting.pose_models import linearized
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
+from gtsam_rwhec.fitting.variance_components import jacobian_of
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.problem import Problem
+
+#: The lengths by which configurations are compared (an assumption about arms): rad, and m.
+SMOOTH_RAD, SMOOTH_M = 1.5, 0.75
+#: Directions of the configurations with less than this share of their spread are left out.
+SMALLEST_SPREAD = 1e-4
+#: A carrier stands still while no entry of its pose (1, m) changes by more than this.
+STILL = 5e-5
+#: Poses of an arm that comes back to a station are so near to their mean (1, and lengths by the motion's spread over
+#: ``SPREAD_M``): the first of these that fits. Those of other stations are ``APART`` times as far at least.
+REVISITED, APART, SPREAD_M = (1e-3, 6e-3), 10.0, 0.3
+#: More pairs of near poses than this, an instant, are not those of visits to stations.
+MOST_LINKS = 50
+#: A velocity is taken from neighbours that are no further apart than this, s.
+NEIGHBOURS_S = 0.5
+
+
+@dataclass(frozen=True)
+class Instants:
+    """Measurements grouped by instant: one carrier pose each, or one standstill, in order of time within a track.
+
+    Attributes
+    ----------
+    order : (N,) array
+        The measurements' places in the order of the pairs' data.
+    first : (T,) array
+        The first measurement of each instant, in that order.
+    index : (N,) array
+        The instant of each measurement, in that order.
+    chain : (N,) array
+        The place of each measurement's track in the state of its instant.
+    chains : int
+        The number of tracks in one state.
+    step : (T,) array
+        Time since the instant before, in typical steps; 0 where a track begins.
+    seconds : (T,) array or None
+        Time since the first instant.
+    """
+
+    order: np.ndarray
+    first: np.ndarray
+    index: np.ndarray
+    chain: np.ndarray
+    chains: int
+    step: Array
+    seconds: Array | None
+
+    @property
+    def count(self) -> int:
+        """The number of instants."""
+        return len(self.first)
+
+    @staticmethod
+    def of(data: list[PairData]) -> Instants:
+        """Measurements of one standstill (of one stamp and A at least) are one instant; without stamps, of one A."""
+        pair = np.concatenate([np.full(item.count, i) for i, item in enumerate(data)])
+        has_stamps = all(item.stamps_ns is not None for item in data)
+        within = np.concatenate([np.arange(item.count) for item in data])
+        stamps = np.concatenate([item.stamps_ns for item in data]) if has_stamps else within
+        A = np.concatenate([item.residuals.A for item in data])
+        rounded = np.round(A[:, :3].reshape(len(A), 12), 9)
+        keys = np.column_stack([(stamps - stamps.min()).astype(np.float64) * has_stamps, rounded])
+        first_of, same = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
+        same = same.ravel()
+        poses = A[first_of, :3].reshape(-1, 12)
+        if has_stamps or len(data) == 1:  # the rows of one pair are in order of time
+            still = standstills(poses, stamps[first_of])
+            poses, same = poses[np.unique(still, return_index=True)[1]], still[same]
+        same = stations(poses)[same]
+        if len(np.unique(same)) == len(same):  # no instant is shared: one track after the other
+            order = np.lexsort((stamps, pair))
+            begins = np.r_[True, np.diff(pair[order]) != 0]
+            index, chain, chains = np.arange(len(order)), np.zeros(len(order), dtype=np.int64), 1
+        else:
+            earliest = np.full(same.max() + 1, np.iinfo(np.int64).max)
+            np.minimum.at(earliest, same, stamps)
+            order = np.lexsort((pair, same, earliest[same]))
+            changes = np.r_[True, np.diff(same[order]) != 0]
+            index, chain, chains = np.cumsum(changes) - 1, pair[order], len(data)
+            begins = np.arange(index[-1] + 1) == 0
+        first = np.flatnonzero(np.r_[True, np.diff(index) != 0])
+        seconds = (stamps[order][first] - stamps.min()) * 1e-9 if has_stamps else None
+        step = np.ones(len(first))
+        if seconds is not None:
+            step[1:] = np.diff(seconds)
+            usual = step[1:][(step[1:] > 0.0) & ~begins[1:]]
+            step = step / np.median(usual) if len(usual) else np.ones(len(first))
+            step = np.clip(step, 1e-3, 1e3)
+        return Instants(order, first, index, chain, chains, np.where(begins, 0.0, step), seconds)
+
+
+def standstills(A: Array, stamps: np.ndarray) -> np.ndarray:
+    """The standstill (N,) of each instant: poses (N, 12) that stay within ``STILL`` of its first have one error."""
+    order = np.lexsort((A[:, 0], stamps))
+    place = np.empty(len(A), dtype=np.int64)
+    count, first, last = -1, np.full(12, np.inf), -1
+    for i in order.tolist():
+        if stamps[i] == last or not (np.abs(A[i] - first) < STILL).all():
+            count, first = count + 1, A[i]
+        place[i], last = count, stamps[i]
+    return place
+
+
+def stations(A: Array) -> np.ndarray:
+    """The station (N,) of each instant: where an arm comes back to few poses (N, 12), its error there is the same.
+
+    Poses near one another are one station, if all are far from those of other stations and if each is visited twice and
+    more on average. Elsewhere each instant is a station of its own. Lengths count in units of the motion's spread.
+    """
+    alone = np.arange(len(A))
+    spread = float(np.sqrt((A[:, 3::4].var(axis=0)).mean()))
+    poses = A.copy()
+    poses[:, 3::4] *= SPREAD_M / max(spread, SMALLEST_SPREAD)
+    tree = cKDTree(poses)
+    for near in REVISITED:
+        number = (tree.count_neighbors(tree, APART * near) - len(A)) // 2
+        if number > MOST_LINKS * len(A):
+            return alone
+        if number < len(A) // 2:
+            continue
+        links = tree.query_pairs(APART * near, output_type="ndarray")
+        graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(A), len(A)))
+        count, station = connected_components(graph, directed=False)
+        visits = np.bincount(station, minlength=count)
+        middle = np.stack([np.bincount(station, column, count) / visits for column in poses.T], axis=1)
+        if 2 * count <= len(A) and (np.linalg.norm(poses - middle[station], axis=1) < near).all():
+            return np.asarray(station)
+    return alone
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The linear model about one estimate, in the order of its instants.
+
+    Attributes
+    ----------
+    residual : (N, 6) array
+    by_unknowns : SparseColumns
+        Its derivative by the d unknowns, in the order of ``Variables.unknowns``.
+    given : (N, 6, 6) array
+        B's covariance as stated; without weights 0.5 rad^2 (kappa = 1) and 1 m^2.
+    axis : (N, 3) array
+        The sensor's z axis in the target's frame.
+    twist : dict of side to (N, 6, 6) array
+        E: by a twist of A on either side.
+    configuration : dict of side to (N, 12) array
+        Rotation and translation of the moving carrier, by ``SMOOTH_RAD`` and ``SMOOTH_M``.
+    rate : (N, 6) array
+        The residual's change for a stamp that is one second late; zero where the velocity is not known.
+    predicted : (N, 4, 4) array
+        T_sensor_target, lengths as measured.
+    length : (N, 3) array
+        The residual's change by the logarithm of the track's scale.
+    """
+
+    instants: Instants
+    residual: Array
+    by_unknowns: SparseColumns
+    given: Array
+    axis: Array
+    twist: dict[About, Array]
+    configuration: dict[About, Array]
+    rate: Array
+    predicted: Array
+    length: Array
+
+    @staticmethod
+    def of(
+        data: list[PairData], variables: Variables, state: State, layout: JointCovariance, instants: Instants
+    ) -> Rows:
+        """The rows at an estimate; ``layout`` has the places of the unknowns."""
+        at = linearized(data, variables, state)
+        frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
+        jacobians = []
+        blocks: list[list[Array]] = [[] for _ in range(9)]
+        for item in data:
+            linear = at[item.pair]
+            X, Y = frames[item.pair.target], frames[item.pair.sensor]
+            jacobians.append(jacobian_of(item.pair, linear, variables, layout))
+            A, B = item.residuals.A, item.residuals.B
+            inverse = se3.inverse(A)
+            predicted = np.linalg.inv(Y) @ A @ X
+            scale = variables.scale_of_pair.get(item.pair)
+            predicted[:, :3, 3] *= 1.0 if scale is None else state.scales[scale]
+            # A Expmap(e) on the target carrier's side; Expmap(e) A = A Expmap(Ad(A^-1) e) on the sensor carrier's.
+            right = linear.carrier
+            parts = [
+                linear.residual, item.covariance, B[:, 2, :3], right, right @ se3.adjoint(inverse),
+                _configuration(A), _configuration(inverse), predicted, se3.inverse(predicted)[:, :3, 3],
+            ]  # fmt: skip
+            for block, part in zip(blocks, parts, strict=True):
+                block.append(part)
+        stacked = [np.concatenate(block)[instants.order] for block in blocks]
+        residual, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
+        by_unknowns = SparseColumns.of(jacobians, len(layout.unit)).of_rows(instants.order)
+        A = np.concatenate([item.residuals.A for item in data])[instants.order]
+        rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
+        return Rows(
+            instants, residual, by_unknowns, given, axis, {"targetcarrier": right, "sensorcarrier": left},
+            {"targetcarrier": moving_target, "sensorcarrier": moving_sensor}, rate, predicted, length,
+        )  # fmt: skip
+
+    @property
+    def jacobian(self) -> Array:
+        """The derivative (N, 6, d) by all unknowns."""
+        return self.by_unknowns.whole
+
+    def thinned(self, every: int) -> Rows:
+        """The rows of every so-many-th instant of each track."""
+        instants = self.instants
+        track = np.cumsum(instants.step == 0.0) - 1
+        begins = np.flatnonzero(instants.step == 0.0)
+        place = np.arange(instants.count) - begins[track]
+        kept = place % every == 0
+        rows = kept[instants.index]
+        walked = np.cumsum(instants.step)[kept]
+        step = np.where(instants.step[kept] == 0.0, 0.0, np.diff(walked, prepend=0.0))
+        _, index = np.unique(instants.index[rows], return_inverse=True)
+        fewer = Instants(
+            instants.order[rows], np.flatnonzero(np.r_[True, np.diff(index) != 0]), index, instants.chain[rows],
+            instants.chains, step, None if instants.seconds is None else instants.seconds[kept],
+        )  # fmt: skip
+        return Rows(
+            fewer, self.residual[rows], self.by_unknowns.of_rows(rows), self.given[rows], self.axis[rows],
+            {side: twist[rows] for side, twist in self.twist.items()},
+            {side: moving[rows] for side, moving in self.configuration.items()},
+            self.rate[rows], self.predicted[rows], self.length[rows],
+        )  # fmt: skip
+
+    def features(self, side: About) -> Array:
+        """f (N, k): the centred principal components of the configurations."""
+        centred = self.configuration[side] - self.configuration[side].mean(axis=0)
+        # Of a motion that is wider than an arm's, the spread is the length.
+        spread = SMOOTH_M * float(np.sqrt((centred[:, 9:] ** 2).mean()))
+        centred[:, 9:] *= min(1.0, SPREAD_M / max(spread, SMALLEST_SPREAD))
+        _, s, directions = np.linalg.svd(centred, full_matrices=False)
+        kept = s**2 > SMALLEST_SPREAD * max(float((s**2).sum()), 1e-300)
+        found: Array = centred @ directions[kept].T
+        return found
+
+
+def _configuration(moving: Array) -> Array:
+    R, t = moving[:, :3, :3].reshape(len(moving), 9), moving[:, :3, 3]
+    return np.hstack([R / (np.sqrt(2.0) * SMOOTH_RAD), t / SMOOTH_M])
+
+
+def _velocity(A: Array, instants: Instants) -> Array:
+    """The carriers' velocity (N, 6) at each measurement, from the poses before and after; zero where these are far."""
+    velocity = np.zeros((instants.count, 6))
+    if instants.seconds is not None and instants.count >= 3:
+        poses, t = A[instants.first], instants.seconds
+        linked = (instants.step[1:-1] > 0.0) & (instants.step[2:] > 0.0)
+        apart = t[2:] - t[:-2]
+        near = linked & (apart > 0.0) & (apart <= 2.0 * NEIGHBOURS_S)
+        moved = se3.logmap(se3.inverse(poses[:-2]) @ poses[2:])
+        velocity[1:-1] = np.where(near[:, None], moved / np.where(near, apart, 1.0)[:, None], 0.0)
+    found: Array = velocity[instants.index]
+    return found
+
+
+#: Columns that are at most so many times as many as each row has are kept whole: one product is then faster.
+FEW = 2
+
+
+@dataclass(frozen=True)
+class SparseColumns:
+    """The numbers of some rows in columns that are zero elsewhere.
+
+    Attributes
+    ----------
+    values : (N, 6, w) array
+    places : (N, w) array
+        The column of each number; a row's columns may be named twice, and then add up.
+    count : int
+        The number of all columns.
+    """
+
+    values: Array
+    places: np.ndarray
+    count: int
+
+    @staticmethod
+    def of(blocks: list[tuple[Array, np.ndarray]], count: int) -> SparseColumns:
+        """Blocks of rows (n, 6, w_i), each with its columns (w_i,), one after the other."""
+        width = max((len(places) for _, places in blocks), default=0)
+        is_whole = count <= FEW * width
+        values = np.zeros((sum(len(J) for J, _ in blocks), 6, count if is_whole else width))
+        columns = np.zeros((len(values), values.shape[2]), dtype=np.int64)
+        if is_whole:
+            columns[:] = np.arange(count)
+        first = 0
+        for J, places in blocks:
+            rows = slice(first, first + len(J))
+            if is_whole:
+                values[rows, :, places] = J
+            else:
+                values[rows, :, : len(places)] = J
+                columns[rows, : len(places)] = places
+            first += len(J)
+        return SparseColumns(values, columns, count)
+
+    def of_rows(self, rows: np.ndarray) -> SparseColumns:
+        """Those of some rows."""
+        return SparseColumns(self.values[rows], self.places[rows], self.count)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every row has all columns, in their order."""
+        return self.values.shape[2] == self.count and bool((self.places == np.arange(self.count)).all())
+
+    @property
+    def whole(self) -> Array:
+        """All columns (N, 6, count)."""
+        if self.is_whole:
+            return self.values
+        found = np.zeros((len(self.values), 6, self.count))
+        rows = np.arange(len(self.values))
+        for k in range(self.values.shape[2]):
+            found[rows, :, self.places[:, k]] += self.values[:, :, k]
+        return found
+
+    def by(self, basis: Array) -> SparseColumns:
+        """The columns in another basis (count, p) of them; few of each row again where it only scales."""
+        unit = np.diagonal(basis)
+        if basis.shape[0] == basis.shape[1] and not (basis - np.diag(unit)).any():
+            return SparseColumns(self.values * unit[self.places][:, None], self.places, self.count)
+        values = self.whole @ basis
+        p = values.shape[2]
+        return SparseColumns(values, np.broadcast_to(np.arange(p), (len(values), p)), p)
+
+    def gram(self, weights: Array) -> Array:
+        """J' J (count, count) of the rows with their equations divided by ``weights`` (6,)."""
+        scaled = self.values / weights[:, None]
+        if self.is_whole:
+            flat = scaled.reshape(-1, self.count)
+            whole: Array = flat.T @ flat
+            return whole
+        at = self.places[:, :, None] * self.count + self.places[:, None]
+        return summed(scaled.transpose(0, 2, 1) @ scaled, at, (self.count, self.count))
+
+
+def summed(values: Array, places: np.ndarray, shape: tuple[int, ...]) -> Array:
+    """An array whose entries are the sums of the values at these places of its flat form."""
+    found = np.bincount(places.ravel(), values.ravel(), int(np.prod(shape)))
+    return found.reshape(shape).astype(np.float64, copy=False)  # counts of none are integers
+
+
+def prior_terms(
+    problem: Problem, variables: Variables, state: State, layout: JointCovariance, basis: Array
+) -> tuple[Array, Array]:
+    """Information (p, p) and gradient (p,) of 2 kappa_0 theta^2 + |t - t_0|^2 / sigma_0^2 over two, by the basis."""
+    size = len(layout.unit)
+    if not problem.priors:
+        return np.zeros((basis.shape[1], basis.shape[1])), np.zeros(basis.shape[1])
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    for name, priors in problem.priors.items():
+        unknown = Unknown(UnknownKind.FRAME, name)
+        if unknown not in layout.slots:
+            continue
+        place, pose = layout.slots[unknown], (state.X | state.Y)[name].matrix()
+        for prior in priors:
+            if prior.kappa is not None:
+                omega = se3.so3_logmap((prior.transform[:3, :3].T @ pose[:3, :3])[None])
+                # Log(R Expmap(d)) = omega + Jr^-1(omega) d, and Jr^-1(omega) = Jl^-1(-omega)
+                J = se3.so3_left_jacobian_inverse(-omega)[0]
+                rows = slice(place.start, place.start + 3)
+                information[rows, rows] += 2.0 * prior.kappa * J.T @ J
+                gradient[rows] += 2.0 * prior.kappa * J.T @ omega[0]
+            if prior.sigma is not None:
+                R, away = pose[:3, :3], pose[:3, 3] - prior.transform[:3, 3]
+                rows = slice(place.start + 3, place.stop)
+                information[rows, rows] += np.eye(3) / prior.sigma**2
+                gradient[rows] += R.T @ away / prior.sigma**2
+    return basis.T @ information @ basis, basis.T @ gradient

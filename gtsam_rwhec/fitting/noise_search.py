@@ -1,0 +1,315 @@
+"""A model of the noise settled: components and unknowns in turn, until both stay the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import get_args
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.component_posterior import ENOUGH, Fitted, fitted
+from gtsam_rwhec.fitting.drift import DriftPrior
+from gtsam_rwhec.fitting.fit_options import About, Component, Drift, DriftFrame, NoiseOptions, Walk
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.noise_components import CARRIER, DRIFT, SYSTEMATIC, WHITE, C, Sizes
+from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
+from gtsam_rwhec.fitting.noise_rows import Instants, Rows, prior_terms
+from gtsam_rwhec.fitting.pair_data import PairData
+from gtsam_rwhec.fitting.unknowns import State, UnknownKind, Variables
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.problem.problem import Problem
+
+#: Components and unknowns are estimated in turn at most this many times.
+ROUNDS = 4
+#: The unknowns are settled when they move by less than this part of their standard deviation.
+SETTLED = 0.05
+#: Components are estimated from at most about this many instants; the unknowns, from all.
+INSTANTS = 300
+#: The rows at so many estimates are kept.
+KEPT = 3
+#: In fewer rows the unknowns have this share of the information of all rows on top.
+HELD = 1e-3
+
+
+@dataclass(frozen=True)
+class Settled:
+    """The model at its optimum, and what simpler models say.
+
+    Attributes
+    ----------
+    state : State
+    model : NoiseModel
+    fit : Fitted
+    white : Settled or None
+        Without drift and systematic errors.
+    drift_evidence, systematic_evidence : float
+        How much -2 log of the density falls with drift, and with systematic errors.
+    """
+
+    state: State
+    model: NoiseModel
+    fit: Fitted
+    white: Settled | None = None
+    drift_evidence: float = 0.0
+    systematic_evidence: float = 0.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """What stays the same while components and unknowns are estimated."""
+
+    problem: Problem
+    data: list[PairData]
+    variables: Variables
+    layout: JointCovariance
+    instants: Instants
+    options: NoiseOptions
+    free_directions: tuple[FreeDirection, ...] = ()
+    #: Is told each round, so that a long model is seen to move.
+    tell: Progress = silent
+    _known: list[tuple[State, Rows]] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    @property
+    def basis(self) -> Array:
+        """(d, p): the determined directions of the unknowns."""
+        free, unit = self.layout.free, self.layout.unit
+        if not free.shape[1]:
+            return np.diag(unit)
+        rest: Array = unit[:, None] * np.linalg.svd(free, full_matrices=True)[0][:, free.shape[1] :]
+        return rest
+
+    def model(self, state: State, side: About, walk: Walk | None, *, systematic: bool) -> NoiseModel:
+        """The model about an estimate, from all measurements."""
+        rows = self._rows(state)
+        drift = None if walk is None else DriftPrior.of(rows, walk)
+        features = rows.features(side) if systematic else np.zeros((len(rows.residual), 0))
+        information, gradient = prior_terms(self.problem, self.variables, state, self.layout, self.basis)
+        return NoiseModel(rows, side, self.basis, information, gradient, drift, features)
+
+    def _rows(self, state: State) -> Rows:
+        """The rows at an estimate; those at the last ones are kept, since several models begin where one ended."""
+        for known, rows in self._known:
+            if known is state:
+                return rows
+        self._known.append((state, Rows.of(self.data, self.variables, state, self.layout, self.instants)))
+        del self._known[:-KEPT]
+        return self._known[-1][1]
+
+    def sizes(self, model: NoiseModel, *, systematic: bool) -> Sizes:
+        """The components' ranges, by the residuals at the start."""
+        typical = typical_sizes(
+            model.rows, model.drift, has_scale=bool(self.variables.scale_of_pair),
+            carrier=self.options.carrier, systematic=systematic and model.features.shape[1] > 0,
+        )  # fmt: skip
+        return Sizes.of(typical, {c: s for c, s in self.options.stated.items() if c in typical})
+
+    def settle(
+        self,
+        start: State,
+        side: About,
+        walk: Walk | None,
+        *,
+        systematic: bool,
+        near: Fitted | None = None,
+        rounds: int = ROUNDS,
+    ) -> Settled:
+        """Components and unknowns in turn; ``near`` has components of a similar model."""
+        state, sizes, logs = start, None, None
+        what = "errors of the configuration" if systematic else "noise of A and B"
+        what = what if walk is None else f"drift, {what}"
+        for number in range(1, rounds + 1):
+            self.tell(f"estimating {what}: round {number} of at most {rounds}")
+            model = self.model(state, side, walk, systematic=systematic)
+            sizes = self.sizes(model, systematic=systematic) if sizes is None else sizes
+            logs = start_at(sizes, near) if logs is None else logs
+            fit = fitted(thinned(model), sizes, logs)
+            logs = fit.logs
+            whole = model.evaluate(sizes.values(logs))
+            state = moved(state, self.variables, self.layout, model.basis @ whole.step)
+            if (np.abs(whole.step) < SETTLED * np.sqrt(np.diagonal(whole.covariance))).all():
+                break
+        return Settled(state, self.model(state, side, walk, systematic=systematic), fit)
+
+
+def start_at(sizes: Sizes, near: Fitted | None) -> Array:
+    """Logarithms (k,) from which components are fitted: those of a similar model, others as expected."""
+    known = {} if near is None else dict(zip(near.sizes.active, near.logs, strict=True))
+    return np.array([known.get(c, e) for c, e in zip(sizes.active, sizes.expected, strict=True)])
+
+
+def thinned(model: NoiseModel) -> NoiseModel:
+    """The model of fewer instants, where there are very many."""
+    every = -(-model.rows.instants.count // INSTANTS)
+    if every == 1:
+        return model
+    rows = model.rows.thinned(every)
+    kept = np.isin(model.rows.instants.order, rows.instants.order)
+    drift = None if model.drift is None else DriftPrior.of(rows, model.drift.walk)
+    # Frames that are not seen in these rows are held by a little of what all rows know of them.
+    size = np.sqrt((model.rows.residual**2).mean(axis=0)) + QUIETEST
+    held = model.prior_information + HELD * (model.basis.T @ model.rows.by_unknowns.gram(size) @ model.basis)
+    return replace(model, rows=rows, drift=drift, features=model.features[kept], prior_information=held)
+
+
+def moved(state: State, variables: Variables, layout: JointCovariance, d: Array) -> State:
+    """The estimate after a change (d,) of the unknowns: frames by right perturbations, scales by their logarithms."""
+    X, Y, scales, offsets = dict(state.X), dict(state.Y), dict(state.scales), dict(state.offsets_s)
+    for unknown, place in layout.slots.items():
+        change, owner = d[place], unknown.owner
+        if unknown.kind is UnknownKind.FRAME:
+            step = gtsam.Pose3.Expmap(change)
+            for poses in (X, Y):
+                if owner in poses:
+                    poses[owner] = poses[owner].compose(step)
+        elif unknown.kind is UnknownKind.SCALE:
+            scales[unknown] *= float(np.exp(np.clip(change[0] / scales[unknown], -1.0, 1.0)))
+        else:
+            offsets[owner] += float(change[0])
+    return State(X, Y, scales, offsets)
+
+
+#: A track has at least this many instants for a drift.
+SHORTEST_TRACK = 20
+#: Tracks that are seen at the same instants share a state of at most this many tracks.
+MOST_TRACKS = 9
+#: Kinds of drift that are tried.
+FIRST_WALKS: dict[Drift, tuple[Walk, ...]] = {
+    "auto": tuple(Walk(each, frame) for each in (1.0, 0.9) for frame in get_args(DriftFrame)),
+    "walk": tuple(Walk(1.0, frame) for frame in get_args(DriftFrame)),
+    "correlated": tuple(Walk(0.9, frame) for frame in get_args(DriftFrame)),
+    "none": (),
+}
+#: These correlations are tried where the walk is not a random one.
+MORE_CORRELATIONS = (0.6, 0.97, 0.99)
+#: A drift is in the model when it lowers -2 log of the density by more than this.
+PAYS = 6.0
+#: A kind's first fit ends where -2 log of the density would fall by less than this; kinds up to so far above the best
+#: are fitted to the end.
+ROUGH, NEAR = 1.0, 10.0
+#: Residuals are correlated in time when their lag-1 correlation is beyond this many standard deviations.
+CORRELATED = 2.5
+
+
+def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
+    """The best model with drift, where that pays; else the one without."""
+    options = task.options
+    if options.drift == "none" or why_no_drift(task) or (options.drift == "auto" and not is_correlated(steady)):
+        return steady
+    tell("estimating drift")
+    if isinstance(options.drift, Walk):
+        return task.settle(
+            steady.state, steady.model.side, options.drift, systematic=options.systematic, near=steady.fit
+        )
+    thin, systematic = thinned(steady.model), options.systematic
+
+    def best_of(kinds: Sequence[Walk], near: Fitted) -> tuple[Walk, Fitted]:
+        """A rough fit of each kind, and a whole one of those that are near the best."""
+
+        def fit(kind: Walk, near: Fitted, enough: float) -> Fitted:
+            name = "a random walk" if kind.correlation == 1.0 else f"correlation {kind.correlation:g}"
+            tell(f"estimating drift: {name}")
+            model, whole = (replace(each, drift=DriftPrior.of(each.rows, kind)) for each in (thin, steady.model))
+            sizes = task.sizes(whole, systematic=systematic)
+            return fitted(model, sizes, start_at(sizes, near), enough=enough)
+
+        rough = [(kind, fit(kind, near, ROUGH)) for kind in kinds]
+        most = min(map(_height, rough)) + NEAR
+        return min(((kind, fit(kind, one, ENOUGH)) for kind, one in rough if _height((kind, one)) <= most), key=_height)
+
+    kind, walk = best_of(FIRST_WALKS[options.drift], steady.fit)
+    if kind.correlation < 1.0:
+        more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
+        kind, walk = min((kind, walk), more, key=_height)
+    if options.drift == "auto" and walk.objective > steady.fit.objective - PAYS:
+        return steady
+    return task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
+
+
+def why_no_drift(task: Task) -> str:
+    """Why no drift can be looked for; empty where it can."""
+    instants = task.instants
+    if instants.chains > MOST_TRACKS:
+        return (
+            f"{instants.chains} pairs are measured at the same instants, and it can take {MOST_TRACKS} at most; "
+            "errors of neighbours in time are not clearly alike"
+        )
+    if instants.count < SHORTEST_TRACK * len(task.data) / instants.chains:
+        return f"it takes {SHORTEST_TRACK} instants of each pair, one after the other"
+    return ""
+
+
+def _height(tried: tuple[Walk, Fitted]) -> float:
+    """-2 log of the density; more for a random walk, which says that the first instant has no error."""
+    kind, fit = tried
+    return fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
+
+
+def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:
+    """Whether residuals of neighbours in time are alike, track by track."""
+    rows = found.model.rows
+    tracks = np.cumsum(rows.instants.step[rows.instants.index] == 0.0) if rows.instants.chains == 1 else None
+    groups = rows.instants.chain if tracks is None else tracks
+    return likeness_of_neighbours([rows.residual[groups == group] for group in np.unique(groups)]) > limit
+
+
+def likeness_of_neighbours(tracks: Sequence[Array]) -> float:
+    """The lag-1 correlation of residuals (N, 6), track by track, in the standard deviations of independent ones."""
+    products, squares, count = np.zeros(6), np.zeros(6), 0
+    for track in tracks:
+        if len(track) > 1:
+            r = track - track.mean(axis=0)
+            products += (r[1:] * r[:-1]).sum(axis=0)
+            squares += (r**2).sum(axis=0)
+            count += len(r) - 1
+    correlation = products / np.maximum(squares, 1e-300)
+    return float(correlation.mean() * np.sqrt(6 * max(count, 1)))
+
+
+#: No noise is smaller: rad and m.
+QUIETEST = 1e-7
+
+
+def typical_sizes(
+    rows: Rows, drift: DriftPrior | None, *, has_scale: bool, carrier: bool, systematic: bool
+) -> dict[Component, float]:
+    """The components that are in the model, with their typical sizes."""
+    r = rows.residual
+    size_r, size_t = (max(float(np.sqrt(np.median((part**2).mean(axis=1)))), QUIETEST) for part in (r[:, :3], r[:, 3:]))
+    given = np.sqrt(np.einsum("nii->i", rows.given) / len(r))
+    active: list[Component] = list(WHITE)
+    typical: dict[Component, float] = {
+        C.ROTATION: size_r / float(given[:3].mean()),
+        C.TRANSLATION: size_t / float(given[3:].mean()),
+        C.DEPTH: size_t,
+        C.CARRIER_ROTATION: size_r,
+        C.CARRIER_TRANSLATION: size_t,
+        C.SYSTEMATIC_ROTATION: size_r,
+        C.SYSTEMATIC_TRANSLATION: size_t,
+    }
+    if carrier:
+        active += CARRIER
+        speed = np.sqrt((rows.rate**2).mean(axis=0))
+        if speed.any():
+            active.append(C.JITTER)
+            turning, moving = max(float(speed[:3].max()), 1e-12), max(float(speed[3:].max()), 1e-12)
+            typical[C.JITTER] = min(size_r / turning, size_t / moving)
+    if drift is not None:
+        steps = np.sqrt(rows.instants.count / rows.instants.chains) if drift.correlation == 1.0 else 1.0
+        length = max(_root_mean_square(rows.length), QUIETEST)
+        typical |= {
+            C.DRIFT_ROTATION: size_r / steps,
+            C.DRIFT_TRANSLATION: size_t / steps,
+            C.DRIFT_SCALE: size_t / length / steps,
+        }
+        active += DRIFT if has_scale else DRIFT[:2]
+    if systematic:
+        active += SYSTEMATIC
+    return {component: typical[component] for component in active}
+
+
+def _root_mean_square(vectors: Array) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))

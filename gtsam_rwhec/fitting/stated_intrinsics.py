@@ -1,0 +1,190 @@
+"""What is known of a camera before the images are looked at: its stated parameters, and how far they may be off.
+
+Intrinsics are stated by a calibration, or they are nominal: from a data sheet, a simulator, another camera of the same
+kind. A calibration without a covariance is taken to be right to 0.3 % of the focal length and 3 pixels of the centre;
+nominal intrinsics to 3 %, and to 30 pixels or 2 % of the image's width, whichever is more. Coefficients of the
+lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length. Unknown ones
+are right to the focal length itself and half the width: the images must say them. Exact ones are held: their
+deviations are so small that no number of corners tells anything of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.distortion import coefficient_jacobian, distorted
+
+#: fx, fy, cx, cy come before the coefficients.
+PINHOLE = 4
+#: Deviation of the focal length (a share), of the centre (pixels), and of the coefficients (pixels at the corner of
+#: the image, or a share of the focal length).
+FOCAL = {"exact": 1e-8, "calibration": 0.003, "nominal": 0.03, "unknown": 1.0}
+CENTRE_PX = {"exact": 1e-5, "calibration": 3.0, "nominal": 30.0, "unknown": 30.0}
+CENTRE_OF_WIDTH = {"exact": 0.0, "calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
+LENS_PX = {"exact": 1e-5, "calibration": 3.0}
+LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
+#: xi of a nominal unified camera is right to this share of 1 + xi. It bends the image as k1 does, but along a curve:
+#: where xi is as free as the other coefficients, their linear deviations hold the truth in 78 to 88 % of simulations.
+XI_OF_NOMINAL = 0.05
+
+
+def free_model(camera: Camera, stated: Stated) -> Camera:
+    """The camera with the lens model that is estimated: a pinhole may have distortion that nobody stated."""
+    if camera.model == "pinhole" and stated != "exact":
+        return Camera(camera.width, camera.height, "radtan", camera.K, np.zeros(4))
+    return camera
+
+
+def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
+    """Mean (m,) and standard deviation (m,) of a camera's parameters."""
+    mean = parameters_of(camera)
+    f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
+    lens_px = LENS_PX[stated] if stated in LENS_PX else LENS_OF_FOCAL[stated] * float(f.mean())
+    corner = 0.5 * np.array([camera.width, camera.height]) / f
+    by_lens = pixels_and_derivatives(camera, mean, corner)[2][:, PINHOLE:]
+    deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / np.linalg.norm(by_lens, axis=0)])
+    if camera.model == "unified" and stated == "nominal":
+        deviation[PINHOLE] = min(deviation[PINHOLE], XI_OF_NOMINAL * (1.0 + camera.D[0]))
+    assert len(deviation) == PINHOLE + len(camera.D)
+    return mean, deviation
+
+
+#: Directions count in which the images say at least this share of what the prior and the images say together.
+TOLD = 0.05
+#: The parts of a camera's parameters, which are stated well or badly for reasons of their own. Each is tested alone:
+#: among all parameters together a centre that is off by three deviations drowns.
+PARTS = {"focal length": slice(0, 2), "centre": slice(2, PINHOLE), "distortion": slice(PINHOLE, None)}
+#: A stated part is contradicted where chance gives such an innovation with less than this probability; where it does
+#: so with less than the second, its deviations are widened all the same.
+CONTRADICTED, DOUBTED = 0.0025, 0.05
+#: By so many times: what is contradicted is off as nominal intrinsics are, and no calibration's.
+WIDER_CONTRADICTED, WIDER_DOUBTED = 10.0, 3.0
+#: A direction is held by the prior where its posterior deviation is above this share of the prior's.
+HELD = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What the images say against stated intrinsics.
+
+    Attributes
+    ----------
+    off : (m,) array
+        Estimated less stated parameters.
+    probabilities : dict of str to float
+        That chance gives as much, by part ("focal length", "centre", "distortion").
+    """
+
+    off: Array
+    probabilities: Mapping[str, float]
+
+    @property
+    def probability(self) -> float:
+        """That chance gives one part as much: Bonferroni's bound."""
+        return min(1.0, len(self.probabilities) * min(self.probabilities.values()))
+
+    @property
+    def deviations(self) -> float:
+        """How far off the worst part is, as deviations of one normal number with the same probability."""
+        return deviations_of(min(self.probabilities.values()))
+
+    @property
+    def contradicted(self) -> tuple[str, ...]:
+        """The parts that chance does not explain."""
+        return tuple(part for part, probability in self.probabilities.items() if probability < CONTRADICTED)
+
+    @property
+    def doubted(self) -> tuple[str, ...]:
+        """The parts that chance hardly explains, or not at all."""
+        return tuple(part for part, probability in self.probabilities.items() if probability < DOUBTED)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether chance does not explain a part."""
+        return bool(self.contradicted)
+
+
+def deviations_of(probability: float) -> float:
+    """The deviations that a normal number exceeds with a probability, either way."""
+    return float(np.sqrt(chdtri(1.0, max(probability, 1e-300))))
+
+
+def innovation_of(off: Array, prior: Array, posterior: Array) -> Innovation:
+    """The test of estimated less stated parameters (m,), with the prior's deviations (m,) and the posterior (m, m)."""
+    return Innovation(
+        off, {part: chance_of(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])}
+    )
+
+
+def chance_of(off: Array, prior: Array, posterior: Array) -> float:
+    """The probability that chance gives as much; `off` (m,), the prior's deviations (m,) and the posterior (m, m).
+
+    Before the images, `off` has the covariance prior^2 - posterior: z^2 of its principal parts is chi-square.
+    """
+    covariance = np.eye(len(off)) - posterior / np.outer(prior, prior)
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    told = values > TOLD
+    if not told.any():
+        return 1.0
+    z2 = float(((vectors.T @ (off / prior))[told] ** 2 / values[told]).sum())
+    return float(chdtrc(told.sum(), z2))
+
+
+def wider(deviation: Array, innovation: Innovation) -> Array:
+    """The prior's deviations (m,), wider for the parts that are doubted."""
+    result = deviation.copy()
+    for part in innovation.doubted:
+        result[PARTS[part]] *= WIDER_CONTRADICTED if part in innovation.contradicted else WIDER_DOUBTED
+    return result
+
+
+def held_by_prior(prior: Array, posterior: Array) -> np.ndarray:
+    """Which parameters (m,) only the prior holds: alone, or in a direction that the images do not tell.
+
+    A focal length that only the prior holds leaves fx and fy each a deviation that is smaller than the prior's, since
+    the images tell that they are equal. So principal directions are asked, in the prior's deviations; a direction
+    names the parameters that have half of its largest part and more.
+    """
+    scaled = posterior / np.outer(prior, prior)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    parts = np.abs(vectors[:, values > HELD**2])
+    of_directions = (parts >= 0.5 * parts.max(axis=0, initial=0.0)).any(axis=1)
+    return np.asarray(of_directions | (np.diagonal(scaled) > HELD**2))
+
+
+def parameters_of(camera: Camera) -> Array:
+    """The parameters (4 + n,) of a camera with n coefficients."""
+    return camera.parameters
+
+
+def camera_with(camera: Camera, parameters: Array) -> Camera:
+    """The camera with other parameters, and the same model and size of images."""
+    return camera.with_parameters(parameters)
+
+
+def pixels_of(camera: Camera, parameters: Array, x: Array) -> Array:
+    """Pixels (..., 2) of normalised coordinates (..., 2)."""
+    return camera_with(camera, parameters).pixels(x)
+
+
+def pixels_and_derivatives(camera: Camera, parameters: Array, x: Array) -> tuple[Array, Array, Array]:
+    """Pixels (..., 2) of normalised coordinates (..., 2), with derivatives (..., 2, 2) by x and by the parameters."""
+    camera = camera_with(camera, parameters)
+    f, c, D = np.diagonal(camera.K)[:2], camera.K[:2, 2], camera.D
+    bent, by_x = distorted(camera.model, D, x)
+    by_parameters = np.zeros((*x.shape[:-1], 2, len(parameters)))
+    by_parameters[..., 0, 0], by_parameters[..., 1, 1] = bent[..., 0], bent[..., 1]
+    by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
+    if len(D):
+        by_parameters[..., PINHOLE:] = f[:, None] * coefficient_jacobian(camera.model, D, x)
+    if camera.model == "unified":  # f is a parameter times 1 + xi
+        by_parameters[..., :2] *= 1.0 + D[0]
+        by_parameters[..., PINHOLE] += bent * parameters[:2]
+    return f * bent + c, f[:, None] * by_x, by_parameters

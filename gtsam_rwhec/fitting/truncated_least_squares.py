@@ -1,0 +1,523 @@
+"""The minimisation of truncated squares by re-weighted fits: graduation, trimming, settling and voting.
+
+``graduated`` has the equation and the reasons. Every stage has a bound on its number of fits, so that no measurements
+make it run for ever: trimming and settling may go round in circles, and graduation would need ever more steps the
+larger the residuals are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from scipy.special import chdtr, chdtri
+
+from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.admission import inlier_threshold, judged
+from gtsam_rwhec.fitting.weighted_fit import Measured, Squares, WeightedFit, by_vote, weighted_fit
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import reweighted, selected
+from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
+
+NoiseScale = Literal["given", "estimate"]
+
+#: Mu grows by this factor in an iteration (the paper's value).
+GRADUATION = 1.4
+#: This is the last mu. Here only residuals within about 10 % of c^2 have weights between 0 and 1.
+LAST_MU = 10.0
+#: A frame's measurements vote on its pose when less than this share of them agree.
+VOTED = 0.9
+#: Residuals count with at least this standard deviation, m and rad, so that exact data can be divided by it.
+QUIETEST = 1e-8
+#: A vote is accepted when it decreases the truncated cost by more than this part.
+PAYS = 1e-6
+#: A measurement has these degrees of freedom: three of rotation, three of translation.
+DOF = 6
+#: Graduation takes at most this many steps: where residuals are so large that it would need more, mu grows faster.
+MAX_GRADUATIONS = 40
+#: Trimming and settling take at most this many fits each; five to ten are usual.
+MAX_FITS = 20
+#: Frames vote at most this many times, each time all that have outliers.
+MAX_VOTES = 3
+#: The inliers are judged anew at most this many times; two or three are usual.
+MAX_ADMISSIONS = 5
+#: With estimated noise so many equations must be left when one measurement is left out.
+SPARE = 6
+#: An outlier cannot hide where the unknowns take up no more than this part of the equations.
+PULLED = 0.02
+#: An estimated variance factor is settled when a fit changes it by no more than this part.
+SETTLED = 1e-4
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One re-weighted fit."""
+
+    #: "trimming", "graduating", "settling" or "admitting".
+    stage: str
+    #: The graduation's parameter; nan where weights are 0 or 1.
+    mu: float
+    #: 1/2 sum min(d^2, c^2) of all measurements.
+    truncated_cost: float
+    #: Number of measurements with d^2 <= c^2.
+    inliers: int
+
+
+@dataclass
+class TruncatedLeastSquares:
+    """The stages of the minimisation and their common state: ``factors`` and ``history`` change on the way."""
+
+    problem: Problem
+    confidence: float
+    tell: Progress
+    factors: VarianceFactors = AS_STATED
+    history: list[Iteration] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        #: c^2; it grows when inliers are admitted at the end.
+        self.threshold = float(chdtri(DOF, 1.0 - self.confidence))
+        #: Whether there are measurements enough to tell an outlier.
+        self.searches = True
+        self.measured = Measured.of(self.problem)
+        self.smallest_factors = VarianceFactors(
+            2.0 * float(np.median(self.measured.kappa)) * QUIETEST**2,
+            QUIETEST**2 / float(np.median(self.measured.sigma)) ** 2,
+        )
+
+    def run(self, noise_scale: NoiseScale) -> tuple[WeightedFit, np.ndarray]:
+        """The best answer and its inliers (N,)."""
+        self.tell("rejecting outliers: the fit to all measurements")
+        everything = self.fit(np.ones(len(self.measured.A)), None)
+        self.searches = noise_scale == "given" or self.spare_equations >= SPARE
+        if not self.searches or self.is_clean(everything, noise_scale):
+            return everything, self.everyone
+        if not everything.has_positive_scales and self.problem.scale == "per_target":
+            everything = with_scales_of_targets_alone(self.problem, self.confidence, noise_scale, self.tell)
+        if noise_scale == "given":
+            fit, _ = self.best([lambda: self.graduate(everything)])
+            self.threshold = inlier_threshold(self.confidence, len(self.measured.A))
+            return self.settle(fit)
+        halves = self.trim(everything)
+        fit, _ = self.settle(halves, estimates=True)
+        fit, _ = self.best([lambda: self.graduate(everything), lambda: fit])
+        return self.admit(*self.settle(fit, estimates=True))
+
+    @property
+    def everyone(self) -> np.ndarray:
+        """The mask (N,) of all measurements."""
+        return np.ones(len(self.measured.A), dtype=bool)
+
+    @property
+    def spare_equations(self) -> int:
+        """Equations less unknowns when one measurement is left out."""
+        unknowns = sum(6 for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed)
+        if self.problem.scale == "shared":
+            unknowns += 1
+        elif self.problem.scale == "per_target":
+            owners = {pair.target for pair in self.problem.pairs}
+            unknowns += len(owners - self.problem.fixed_scales.keys())
+        return DOF * (len(self.measured.A) - 1) - unknowns
+
+    def is_clean(self, everything: WeightedFit, noise_scale: NoiseScale) -> bool:
+        """Whether the fit to all measurements shows no outlier, so that there is nothing to do.
+
+        If the noise is not known, an outlier may hide in the fit that it has pulled, unless there are many measurements
+        for each unknown: then it cannot pull.
+        """
+        count = len(self.measured.A)
+        if noise_scale == "given":
+            return bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
+        unknowns = DOF * (count - 1) - self.spare_equations
+        if unknowns > PULLED * DOF * count:
+            return False
+        found = judged(self.problem, self.measured, everything, self.everyone, self.confidence, robust=True)
+        if not found.agrees.all():
+            return False
+        self.factors = self._from_inliers(self.measured.squares(everything), self.everyone)
+        self.threshold = inlier_threshold(self.confidence, count)
+        return True
+
+    def admit(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
+        """Judge every measurement anew, under the noise by axis that the inliers show, until the inliers stay.
+
+        The noise is that of the inliers of graduation throughout. If it followed the admitted ones, heavy tails would
+        let one another in.
+        """
+        first = keep
+        self.threshold = inlier_threshold(self.confidence, len(keep))
+        for step in range(1, MAX_ADMISSIONS + 1):
+            found = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first).agrees
+            if (found == keep).all():
+                break
+            try:
+                fit = self.complete(self.fit(found.astype(np.float64), fit))
+            except (UnderdeterminedError, CountError):
+                break
+            keep = found
+            self.record("admitting", step, MAX_ADMISSIONS, np.nan, self.distances(fit))
+        self.factors = self._from_inliers(self.measured.squares(fit), keep)
+        return fit, keep
+
+    def best(self, starts: list[Callable[[], WeightedFit]]) -> tuple[WeightedFit, np.ndarray]:
+        """The best fit of all starts, each settled to weights of 0 and 1; a start with too few inliers is left out."""
+        ends: list[tuple[float, WeightedFit, np.ndarray]] = []
+        failure: UnderdeterminedError | CountError | None = None
+        for start in starts:
+            try:
+                fit, keep = self.settle(start())
+                ends.append((self.truncated(self.distances(fit)), fit, keep))
+            except (UnderdeterminedError, CountError) as error:
+                failure = error
+        if not ends:
+            assert failure is not None
+            raise failure
+        _, fit, keep = min(ends, key=lambda end: end[0])
+        return self.vote(fit, keep)
+
+    def vote(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
+        """Move frames with outliers to where more of their measurements agree, where this lowers the cost."""
+        for _ in range(MAX_VOTES):
+            least = self.truncated(self.distances(fit))
+            moved, saved = fit, 0.0
+            inliers = self.measured.by_pair(keep)
+            for name in self.problem.targets + self.problem.sensors:
+                good, total = inlier_count(name, inliers)
+                if good >= VOTED * total or name in self.problem.fixed:
+                    continue
+                self.tell(f"rejecting outliers: the measurements of {name} vote, {good} of {total} agree")
+                moved, less = by_vote(name, self.measured, moved, self.factors, self.threshold)
+                saved += less
+            if saved <= 0.0:
+                break
+            with contextlib.suppress(UnderdeterminedError, CountError):
+                candidate, kept = self.settle(moved)
+                if self.truncated(self.distances(candidate)) < least * (1.0 - PAYS):
+                    fit, keep = candidate, kept
+                    continue
+            break
+        return fit, keep
+
+    def complete(self, fit: WeightedFit) -> WeightedFit:
+        """The fit with poses by vote for frames that lost all their measurements, so that they may come back."""
+        for name in self.problem.targets + self.problem.sensors:
+            if name not in fit.poses and name not in self.problem.fixed:
+                fit, _ = by_vote(name, self.measured, fit, self.factors, self.threshold)
+        return fit
+
+    def fit(self, weights: Array, previous: WeightedFit | None) -> WeightedFit:
+        """The certified optimum of weighted measurements."""
+        return weighted_fit(reweighted(self.problem, self.measured.by_pair(weights), self.factors), previous)
+
+    def distances(self, fit: WeightedFit) -> Array:
+        """d^2 (N,)."""
+        return self.measured.together(self.measured.squares(fit), self.factors)
+
+    def truncated(self, distances: Array) -> float:
+        """sum min(d^2, c^2)."""
+        return float(np.minimum(distances, self.threshold).sum())
+
+    def record(self, stage: str, step: int, most: int, mu: float, distances: Array) -> None:
+        """Add an iteration to the history, and tell it."""
+        inliers = int((distances <= self.threshold).sum())
+        self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers))
+        self.tell(f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree")
+
+    def graduate(self, fit: WeightedFit) -> WeightedFit:
+        """From least squares to truncated least squares with growing mu (Remark 5 and eq. 14 of the paper)."""
+        d = self.distances(fit)
+        c2 = self.threshold
+        worst = float(d[np.isfinite(d)].max(initial=0.0))
+        if worst <= c2:
+            return fit
+        mu = c2 / (2.0 * worst - c2)
+        growth = max(GRADUATION, (LAST_MU / mu) ** (1.0 / (MAX_GRADUATIONS - 1)))
+        for step in range(1, MAX_GRADUATIONS + 1):
+            w = truncated_weights(d, mu, c2)
+            if not w.any():
+                break
+            fit = self.fit(w / w.max(), fit)  # all are small at first, and priors would dominate
+            d = self.distances(fit)
+            self.record("graduating", step, MAX_GRADUATIONS, mu, d)
+            mu *= growth
+            if mu > LAST_MU * growth or not ((w > 0.0) & (w < 1.0)).any():
+                break
+        return fit
+
+    def trim(self, fit: WeightedFit) -> WeightedFit:
+        """Least trimmed squares: the better half of each pair under the median's noise, until it stays the same."""
+        keep = np.zeros(len(self.measured.A), dtype=bool)
+        for step in range(1, MAX_FITS + 1):
+            squares = self.measured.squares(fit)
+            self.factors = self._from_median(squares)
+            d = self.measured.together(squares, self.factors)
+            half = np.zeros_like(keep)
+            for rows in self.measured.rows:
+                count = rows.stop - rows.start
+                number = min(count, count // 2 + 2)  # enough to determine one pair alone
+                half[rows.start + np.argsort(d[rows], kind="stable")[:number]] = True
+            if (half == keep).all():
+                break
+            keep = half
+            fit = self.fit(keep.astype(np.float64), fit)
+            self.record("trimming", step, MAX_FITS, np.nan, self.distances(fit))
+        return fit
+
+    def settle(self, fit: WeightedFit, *, estimates: bool = False) -> tuple[WeightedFit, np.ndarray]:
+        """Weights of 0 and 1 until they stay the same: a local minimum of the truncated cost."""
+        keep = np.zeros(len(self.measured.A), dtype=bool)
+        for step in range(1, MAX_FITS + 1):
+            squares = self.measured.squares(fit)
+            d = self.measured.together(squares, self.factors)
+            change = 0.0
+            if estimates:
+                before = self.factors
+                self.factors = self._from_inliers(squares, d <= self.threshold)
+                change = float(np.abs(np.log(np.array(self.factors) / np.array(before))).max())
+                d = self.measured.together(squares, self.factors)
+            inliers = d <= self.threshold
+            if (inliers == keep).all() and change < SETTLED:
+                break
+            keep = inliers
+            fit = self.complete(self.fit(keep.astype(np.float64), fit))
+            self.record("settling", step, MAX_FITS, np.nan, self.distances(fit))
+        return fit, keep
+
+    def _from_median(self, squares: Squares) -> VarianceFactors:
+        median = float(chdtri(DOF // 2, 0.5))
+        return self._factors(
+            float(np.median(squares.rotation)) / median, float(np.median(squares.translation)) / median
+        )
+
+    def _from_inliers(self, squares: Squares, inliers: np.ndarray) -> VarianceFactors:
+        """The inliers' mean squares over the share of its variance that a truncated chi-square keeps.
+
+        E[chi^2_k; chi^2_k <= c^2] = k F_(k+2)(c^2), with the distribution function F.
+        """
+        kept = float(chdtr(DOF + 2, self.threshold) / chdtr(DOF, self.threshold))
+        number = int(inliers.sum())
+        unknowns = sum(6.0 for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed)
+        degrees_of_freedom = kept * max(3.0 * number - 0.5 * unknowns, 1.0)
+        if number == 0:
+            return self.factors
+        return self._factors(
+            float(squares.rotation[inliers].sum()) / degrees_of_freedom,
+            float(squares.translation[inliers].sum()) / degrees_of_freedom,
+        )
+
+    def _factors(self, rotation: float, translation: float) -> VarianceFactors:
+        return VarianceFactors(
+            max(rotation, self.smallest_factors.rotation), max(translation, self.smallest_factors.translation)
+        )
+
+
+def with_scales_of_targets_alone(
+    problem: Problem, confidence: float, noise_scale: NoiseScale, tell: Progress
+) -> WeightedFit:
+    """A start where outliers make a scale negative: each target alone gives its scale, then all are known.
+
+    Outliers pull the scales of the inverse equation to zero and below (design fact 7), and there is no way back from
+    there. A target alone has one scale, which the direct equation holds.
+    """
+    known = selected(problem, {})
+    owners = [name for name in dict.fromkeys(pair.target for pair in problem.pairs) if name not in problem.fixed_scales]
+    for number, name in enumerate(owners, 1):
+        tell(f"rejecting outliers: the scale of {name} alone, {number} of {len(owners)}")
+        alone = Problem("shared")
+        for pair in problem.pairs:
+            if pair.target == name:
+                raw = problem.measurements(*pair)
+                add = alone.add_motion if pair.is_motion else partial(alone.add, pair.target)
+                add(pair.sensor, raw.A, raw.B, raw.sigma, raw.kappa)
+        fit, _ = TruncatedLeastSquares(alone, confidence, silent).run(noise_scale)
+        if not fit.has_positive_scales:
+            raise CountError(f"the measurements of {name} that agree with one another give it no positive scale")
+        known.fix_scale(name, fit.alpha[name])
+    fit, _ = TruncatedLeastSquares(known, confidence, tell).run(noise_scale)
+    return fit
+
+
+def truncated_weights(d2: Array, mu: float, c2: float) -> Array:
+    """Weights of the graduated truncated squares, eq. 14: 1 at first, then c / d sqrt(mu (mu + 1)) - mu, then 0."""
+    w = np.zeros_like(d2)
+    w[d2 <= mu / (mu + 1.0) * c2] = 1.0
+    between = (d2 > mu / (mu + 1.0) * c2) & (d2 < (mu + 1.0) / mu * c2)
+    w[between] = np.sqrt(c2 * mu * (mu + 1.0) / d2[between]) - mu
+    return np.clip(w, 0.0, 1.0)
+
+
+def inlier_count(name: str, inliers: dict[Pair, np.ndarray]) -> tuple[int, int]:
+    """The number of a frame's measurements that agree, and of all its measurements."""
+    masks = [mask for pair, mask in inliers.items() if name in pair]
+    return sum(int(mask.sum()) for mask in masks), sum(len(mask) for mask in masks)
+
+
+#: A warning names a frame or pair when the share of its measurements that agree is below this.
+SUSPECT = 0.5
+#: No sensor has a larger standard deviation about an axis, rad. A larger estimate comes from outliers.
+GROSS_RAD = 0.35
+#: A warning names at most this many frames and pairs.
+NAMED = 5
+
+
+@dataclass(frozen=True)
+class Graduated:
+    """A calibration from the measurements that agree with it."""
+
+    #: The certified solution of the inliers, under the variance factors.
+    solution: Solution
+    #: In the order of ``problem.measurements``.
+    inliers: dict[Pair, np.ndarray]
+    #: Factors of the noise as given; 1 unless estimated.
+    variance_factors: VarianceFactors
+    #: c^2 at the end, a quantile of chi-square: the largest squared residual of an inlier where noise is given.
+    threshold: float
+    #: 1/2 sum min(d^2, c^2).
+    truncated_cost: float
+    #: Frames of which no measurement agrees; the solution lacks them.
+    left_out: tuple[str, ...]
+    #: Frames of which less than half of the measurements agree: the number that agrees, and the number of all.
+    suspect: dict[str, tuple[int, int]]
+    #: The same for pairs of which neither frame is suspect as a whole.
+    suspect_pairs: dict[Pair, tuple[int, int]]
+    #: The re-weighted fits, of all starts together; empty where the first fit shows that there is no outlier.
+    history: tuple[Iteration, ...]
+    #: Whether outliers were looked for. With noise that is not known, a few measurements cannot tell them from noise:
+    #: then all count as inliers.
+    searched: bool = True
+
+
+@one_blas_thread()
+def graduated(
+    problem: Problem, *, confidence: float = 0.997, noise_scale: NoiseScale = "given", progress: Progress | None = None
+) -> Graduated:
+    """Reject outliers and calibrate from the inliers.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem that kept its raw measurements.
+    confidence : float
+        Probability that a good measurement is kept during graduation: c^2 is this quantile of chi-square with 6
+        degrees of freedom. At the end each of N is kept with this probability or 1 - 0.05 / N, whichever is larger.
+    noise_scale : "given" or "estimate"
+        Take sigma and kappa (or covariances) as given; or multiply them by variance factors, one for rotations and one
+        for translations, which are estimated from the inliers.
+    progress : callable, optional
+        Is called with each stage, its step, and the number of measurements that agree.
+
+    Raises
+    ------
+    MeasurementsNotKeptError
+        If the problem was made with ``keep_measurements=False``.
+    OutlierError
+        If too few measurements agree with each other for an answer, or give a scale that is not positive.
+
+    Warns
+    -----
+    OutliersWarning
+        If less than half of a frame's measurements agree, or less than half of all measurements (then sigma and kappa
+        may be too small). One bad tag among many does not stop the calibration: its own pose rests on the measurements
+        that agree, and the other poses do not use the rejected ones.
+    """
+    tell = progress or silent
+    work = TruncatedLeastSquares(problem, confidence, tell)
+    try:
+        fit, keep = work.run(noise_scale)
+        tell("certifying the inliers' solution")
+        weights = work.measured.by_pair(keep.astype(np.float64))
+        solution = solve(reweighted(problem, weights, work.factors), progress=tell)
+    except ScaleError as error:
+        raise OutlierError(
+            f"the {problem.number_of_measurements} measurements have no answer with a positive scale in which most of "
+            f"them agree ({error}). Check that A and B are not exchanged or inverted, and the names of targets"
+        ) from error
+    except (UnderdeterminedError, CountError) as error:
+        raise OutlierError(
+            f"too few of the {problem.number_of_measurements} measurements agree for an answer ({error}). With "
+            f"confidence={confidence} a measurement agrees if it is within {np.sqrt(work.threshold):.3g} standard "
+            "deviations. If sigma and kappa may be too small, take noise='estimate'; else check that B = "
+            "T_sensor_target, that A and B are of the same instant, and the names of targets"
+        ) from error
+    inliers = work.measured.by_pair(keep)
+    counts = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
+    left_out = tuple(name for name, (good, _) in counts.items() if good == 0)
+    suspect = {name: (good, total) for name, (good, total) in counts.items() if good < SUSPECT * total}
+    suspect_pairs = {
+        pair: (int(mask.sum()), len(mask))
+        for pair, mask in inliers.items()
+        if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
+    }
+    if not work.searches:
+        warnings.warn(
+            f"{problem.number_of_measurements} measurements are too few to tell outliers from noise that is not known: "
+            "all of them count. Measure more, or give sigma and kappa (noise='given')",
+            OutliersWarning,
+            stacklevel=2,
+        )
+    _warn(keep, suspect, suspect_pairs, left_out, work.threshold, noise_scale)
+    rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
+    if noise_scale == "estimate" and work.searches and rotation_rad > GROSS_RAD:
+        warnings.warn(
+            f"the estimated noise, {np.degrees(rotation_rad):.0f} degrees an axis, is too large for a sensor: more "
+            "than half of the measurements may be outliers. Give sigma and kappa and take noise='given', which "
+            "withstands more outliers",
+            OutliersWarning,
+            stacklevel=3,
+        )
+    return Graduated(
+        solution=solution,
+        inliers=inliers,
+        variance_factors=work.factors,
+        threshold=work.threshold,
+        truncated_cost=0.5 * work.truncated(work.distances(fit)),
+        left_out=left_out,
+        suspect=suspect,
+        suspect_pairs=suspect_pairs,
+        history=tuple(work.history),
+        searched=work.searches,
+    )
+
+
+def _warn(
+    keep: np.ndarray,
+    suspect: dict[str, tuple[int, int]],
+    suspect_pairs: dict[Pair, tuple[int, int]],
+    left_out: tuple[str, ...],
+    threshold: float,
+    noise_scale: NoiseScale,
+) -> None:
+    """Warn if less than half of the measurements agree: of all, or of some frames and pairs."""
+    named = [
+        f"{name} ({good} of {total}{': left out' if name in left_out else ''})"
+        for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
+    ]
+    named += [f"{pair} ({good} of {total})" for pair, (good, total) in suspect_pairs.items()]
+    if keep.sum() < SUSPECT * len(keep):
+        message = (
+            f"only {int(keep.sum())} of {len(keep)} measurements agree to within {np.sqrt(threshold):.3g} standard "
+            "deviations; "
+        )
+        if noise_scale == "given":
+            message += "if sigma and kappa may be too small, take noise='estimate'; else check the names of frames"
+        else:
+            message += "check the frame convention, the stamps, and the names of targets"
+    elif named:
+        more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
+        message = (
+            f"less than half of the measurements agree with the answer for {', '.join(named[:NAMED])}{more}. Check "
+            "whether the frame has moved, or has another frame's name. The poses rest on the measurements that agree"
+        )
+    else:
+        return
+    warnings.warn(message, OutliersWarning, stacklevel=4)
