@@ -6,14 +6,17 @@ the residuals of the targets alone.
 """
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
+
 from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.fitting.refined import PairNoise
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import SynchronisedPairs
-from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
+
 
 def with_comparable_noise(rounds: SolvingRounds, given: SynchronisedPairs) -> SynchronisedPairs:
     """The pairs with covariances of the targets' poses as their own residuals have them.

@@ -1,12 +1,13 @@
 """What the poses of targets in images say first: outliers, time offsets and sizes."""
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import field
-from gtsam_rwhec.results.log_history import SizeFields
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import SynchronisedPairs
+
+from dataclasses import dataclass, field
+
 from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.results.log_history import SizeFields
+from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
+
 
 @dataclass(frozen=True, eq=False)
 class SettledPoses:
