@@ -1,4 +1,4 @@
-"""How often ``rw.changes.difference`` and ``verify`` say that something changed: where nothing did, and where it did.
+"""How often ``rw.results.difference`` and ``verify`` say that something changed: where nothing did, and where it did.
 
     python benchmarks/changes.py [--runs 1000] [--seed 0] [--workers 1] [--keep FILE]
 
@@ -23,19 +23,20 @@ with 1 if a bar is missed.
 """
 
 from __future__ import annotations
-
 import json
 import multiprocessing
 import sys
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any
-
 import gtsam
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row
+from bars import benchmark_parser
+from bars import print_rows
 from binomial import Share
 from numpy.typing import NDArray
 from rich.console import Console
@@ -43,16 +44,21 @@ from rich.progress import track
 from scipy.optimize import brentq
 from scipy.special import chdtri
 from scipy.stats import ncx2
-from simulated_arms import ARM, BENT_RAD, Arm, moved_by, white
-
+from simulated_arms import ARM
+from simulated_arms import BENT_RAD
+from simulated_arms import Arm
+from simulated_arms import moved_by
+from simulated_arms import white
 import gtsam_rwhec as rw
-from gtsam_rwhec.changes.change_test import change_test
-from gtsam_rwhec.changes.comparing import as_result
-from gtsam_rwhec.changes.constant_errors import without_constant_errors
-from gtsam_rwhec.changes.quantities import Quantities, quantities
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.simulate.motion import Motion, carrier_poses
+from gtsam_rwhec.simulate.motion import Motion
+from gtsam_rwhec.simulate.motion import carrier_poses
 from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.results.change_test import change_test
+from gtsam_rwhec.results.common_quantities import Quantities
+from gtsam_rwhec.results.common_quantities import quantities
+from gtsam_rwhec.results.difference import as_result
+from gtsam_rwhec.results.difference import without_constant_errors
 
 FloatArray = NDArray[np.float64]
 KINDS = ("white", "carriers", "drift", "arm")
@@ -125,8 +131,8 @@ def run(kind: str, number: int, seed: int) -> dict[str, Any]:
         old, new = (rw.calibrate(problem, options) for problem in problems)
         if old.refined is None or new.refined is None:
             return {"kind": kind, "number": number, "answered": False}
-        found = rw.changes.difference(old, new)
-        verified = rw.changes.verify(old, problems[1], systematic=kind == "arm").test
+        found = rw.results.difference(old, new)
+        verified = rw.results.verify(old, problems[1], systematic=kind == "arm").test
     assert found.test is not None
     common = quantities(*(without_constant_errors(as_result(each)) for each in (old, new)))
     freedom = old.refined.degrees_of_freedom, new.refined.degrees_of_freedom
@@ -162,7 +168,7 @@ def run(kind: str, number: int, seed: int) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rw.errors.RwhecWarning)
             turned = gtsam.Pose3.Expmap(one[rows] * unit_of(old, frame)).matrix()
-            again = rw.changes.verify(old, with_moved(problems[1], frame, turned), systematic=kind == "arm")
+            again = rw.results.verify(old, with_moved(problems[1], frame, turned), systematic=kind == "arm")
         result["verified_one"], result["verified_named"] = not again.holds, again.test.changed == (frame,)
     return result | {
         "one": moved.has_changed,

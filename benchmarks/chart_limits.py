@@ -1,7 +1,7 @@
-"""The limits of the control chart, by Monte Carlo: writes ``gtsam_rwhec/changes/chart_limits.json``.
+"""The limits of the control chart, by Monte Carlo: writes ``gtsam_rwhec/results_changes/chart_limits.json``.
 
 Every path is a robot that nothing happens to: nights of independent standard normal numbers, some groups of equal
-size. Its statistic of each night is the smallest chance over moments and groups (`gtsam_rwhec.changes.control_chart`).
+size. Its statistic of each night is the smallest chance over moments and groups (`gtsam_rwhec.results.control_chart`).
 The limit of a night is such that, of the paths without an alarm so far, the given share has one (Hawkins and Zamba
 2005). It is kept as limit / rate, which is one over the number of moments that the search is worth, and smoothed over
 nights.
@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtrc
 
-from gtsam_rwhec.changes.control_chart import OF_ALL
+from gtsam_rwhec.results.control_chart import OF_ALL
 
-TABLE = Path(__file__).parents[1] / "gtsam_rwhec/changes/chart_limits.json"
+TABLE = Path(__file__).parents[1] / "gtsam_rwhec/results_changes/chart_limits.json"
 NIGHTS = 61
 #: Kept nights: the limits change slowly after the first ones.
 KEPT = (2, 3, 4, 5, 6, 8, 10, 13, 17, 22, 28, 36, 46, 61)

@@ -7,7 +7,6 @@ of its own. Every number of both pages is compared with the JSON beside them. ``
 """
 
 from __future__ import annotations
-
 import cProfile
 import json
 import pstats
@@ -18,14 +17,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-from bars import Row, benchmark_parser, print_rows
+from bars import Row
+from bars import benchmark_parser
+from bars import print_rows
 from dataset import utias_folder
 from places import CELL
-from shown_numbers import numbers_of, wrong_numbers
-
+from shown_numbers import numbers_of
+from shown_numbers import wrong_numbers
 import gtsam_rwhec as rw
-from gtsam_rwhec.runs import all_stages, log_report
+from gtsam_rwhec.runs import all_stages
+from gtsam_rwhec.runs import log_report
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -65,11 +66,11 @@ def real(folder: Path, timed: Timed) -> None:
     rw.write_calibration(calibration, result)
 
     def write() -> None:
-        inputs = rw.evidence.Inputs(
-            files=rw.evidence.input_files(sorted(utias_folder().glob("*.csv"))), versions=rw.evidence.versions()
+        inputs = rw.results.Inputs(
+            files=rw.results.input_files(sorted(utias_folder().glob("*.csv"))), versions=rw.results.versions()
         )
-        evidence = rw.evidence.evidence_of(problem, calibration, inputs)
-        rw.evidence.write_evidence(evidence, folder / "evidence.json", result)
+        evidence = rw.results.evidence_of(problem, calibration, inputs)
+        rw.results.write_evidence(evidence, folder / "evidence.json", result)
         rw.report.write_html(result, folder / "report.html")
 
     timed.function = write

@@ -56,8 +56,7 @@ from .fitting import Observations as Observations
 from .fitting import calibrate_corners as calibrate_corners
 from .fitting import refine_corners as refine_corners
 
-# Keep it in files, print it, draw it.
-from . import evidence as evidence
+# Keep it in files, print it, draw it; what changed since, and whether it still holds.
 from . import report as report
 from . import results as results
 from .results import judge as judge
@@ -66,9 +65,6 @@ from .results import read_solution as read_solution
 from .results import write_calibration as write_calibration
 from .results import write_refined as write_refined
 from .results import write_solution as write_solution
-
-# What changed since, and does it still hold.
-from . import changes as changes
 
 # From a log of images to a calibration, at once or step by step.
 from . import export as export

@@ -14,7 +14,7 @@ from gtsam_rwhec.cli.report import read_of
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
-#: As ``rw.changes.LEVEL``, which help must not bring in.
+#: As ``rw.results.LEVEL``, which help must not bring in.
 LEVEL = 0.01
 RESULT_HELP = "result.json, or the folder that calibrate wrote."
 LevelOption = Annotated[
@@ -28,7 +28,7 @@ PageOption = Annotated[
 
 
 def write_page_to(
-    found: rw.changes.Difference | rw.changes.Verification, output: Path | None, compared: tuple[Path, Path]
+    found: rw.results.Difference | rw.results.Verification, output: Path | None, compared: tuple[Path, Path]
 ) -> None:
     """Write the page, if one is asked for, and say so."""
     if output is not None:
@@ -54,9 +54,9 @@ def diff(
 ) -> ExitStatus:
     """What moved from an old calibration to a new one, and whether by more than chance; exit status 1 if so."""
     check_output(output, *(file for each in (old, new) for file in read_of(each)))
-    found = rw.changes.difference(
-        rw.changes.read_calibration(old),
-        rw.changes.read_calibration(new),
+    found = rw.results.difference(
+        rw.results.read_calibration(old),
+        rw.results.read_calibration(new),
         level=level,
         frames=frame or (),
         clocks_may_change=clocks_may_change,
@@ -78,11 +78,11 @@ def have_same_inputs(old: Path, new: Path) -> bool:
 
 def old_checksums(result: Path) -> set[str]:
     """Of the input files of a calibration; empty where nothing readable beside its result says them."""
-    evidence = rw.evidence.evidence_path(rw.changes.result_path(result))
+    evidence = rw.results.evidence_path(rw.results.result_path(result))
     if not evidence.exists():
         return set()
     try:
-        inputs = rw.evidence.read_evidence(evidence).inputs
+        inputs = rw.results.read_evidence(evidence).inputs
     except FileFormatError:  # of another version: the numbers themselves are compared all the same
         return set()
     return set() if inputs is None else {file.sha256 for file in inputs.files}

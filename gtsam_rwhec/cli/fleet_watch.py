@@ -13,7 +13,7 @@ from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
-#: Nights of one robot between two false alarms: 1 / ``rw.changes.RATE``, which help must not bring in.
+#: Nights of one robot between two false alarms: 1 / ``rw.results.RATE``, which help must not bring in.
 NIGHTS = 1000.0
 #: The name of the standard output in the place of a file.
 STANDARD_OUTPUT = "-"
@@ -48,7 +48,7 @@ def watch(
     ] = None,
 ) -> ExitStatus:
     """What moved on each robot over time, when, and which frame; exit status 1 if something did."""
-    rate = rw.changes.checked_rate(nights_between_false_alarms)
+    rate = rw.results.checked_rate(nights_between_false_alarms)
     since_ns = rw.fleet.day_ns_of(since)
     to_file = None if stream in (None, STANDARD_OUTPUT) else Path(str(stream))
     local = [Path(each) for each in runs if "://" not in each]

@@ -1,18 +1,15 @@
 """``gtsam-rwhec report``: the report of a result as one HTML file."""
 
 from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
-
 import typer
-
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.files.terminal_text import say, shown_path
-
+from gtsam_rwhec.files.terminal_text import say
+from gtsam_rwhec.files.terminal_text import shown_path
 
 def report(
     result: Annotated[Path, typer.Argument(help="Output folder of a calibration, or its result file (JSON).")],
@@ -47,7 +44,7 @@ def report(
 def read_of(result: Path) -> tuple[Path, ...]:
     """The files that are read of a result, or of the folder that has it."""
     file = result / rw.runs.RESULT_FILE if result.is_dir() else result
-    return file, rw.evidence.evidence_path(file)
+    return file, rw.results.evidence_path(file)
 
 
 def report_path(result: Path) -> Path:

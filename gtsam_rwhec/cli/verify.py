@@ -1,19 +1,26 @@
 """``gtsam-rwhec verify``: whether an old calibration still holds on a new log."""
 
 from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
-
 import typer
-
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.calibrate import is_log, other_than_csv
-from gtsam_rwhec.cli.diff import LEVEL, RESULT_HELP, LevelOption, PageOption, old_checksums, write_page_to
+from gtsam_rwhec.cli.calibrate import is_log
+from gtsam_rwhec.cli.calibrate import other_than_csv
+from gtsam_rwhec.cli.diff import LEVEL
+from gtsam_rwhec.cli.diff import RESULT_HELP
+from gtsam_rwhec.cli.diff import LevelOption
+from gtsam_rwhec.cli.diff import PageOption
+from gtsam_rwhec.cli.diff import old_checksums
+from gtsam_rwhec.cli.diff import write_page_to
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
-from gtsam_rwhec.cli.options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
+from gtsam_rwhec.cli.options import FOLDER_OF_CSV
+from gtsam_rwhec.cli.options import RigOption
+from gtsam_rwhec.cli.options import SensorsOption
+from gtsam_rwhec.cli.options import TargetsOption
+from gtsam_rwhec.cli.options import WorkersOption
 from gtsam_rwhec.cli.report import read_of
 from gtsam_rwhec.cli.stage_display import StageDisplay
 
@@ -48,12 +55,12 @@ def verify(
     Exit status 0: it holds. 1: it no longer does. 3: nothing contradicts it, but a sensor of it was not seen.
     """
     check_output(output, source, *read_of(result), *([] if rig is None else [rig]))
-    old = rw.changes.read_calibration(result) if result.suffix.lower() != ".mcap" else None
+    old = rw.results.read_calibration(result) if result.suffix.lower() != ".mcap" else None
     with StageDisplay() as stage:
         if old is not None and old.log is None:
             problem = _problem(source, old.solution.scale_mode, targets, sensors)
             stage("testing the old poses")
-            found = rw.changes.verify(old, problem, level=level, targets_may_move=targets_may_move, progress=stage)
+            found = rw.results.verify(old, problem, level=level, targets_may_move=targets_may_move, progress=stage)
         else:
             found = rw.runs.verify_log(
                 result,
@@ -78,7 +85,7 @@ def is_of_old_log(result: Path, source: Path) -> bool:
     if not (old := old_checksums(result)):
         return False
     files = [path for path in source.glob("*") if path.suffix in LOG_SUFFIXES] if source.is_dir() else [source]
-    return bool(files) and {file.sha256 for file in rw.evidence.input_files(files)} <= old
+    return bool(files) and {file.sha256 for file in rw.results.input_files(files)} <= old
 
 
 def _problem(source: Path, scale: rw.ScaleMode, targets: str, sensors: str) -> rw.Problem:

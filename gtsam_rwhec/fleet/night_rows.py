@@ -10,9 +10,9 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
-from gtsam_rwhec.changes.quantities import Movement
 from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.common_quantities import Movement
 
 #: Verdicts "do not use" for these grounds alone still say what is determined.
 DETERMINES_SOMETHING = {Ground.NOT_UNIQUE, Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS}

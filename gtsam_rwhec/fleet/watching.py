@@ -8,11 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.changes.chart_limits import RATE
-from gtsam_rwhec.changes.charting import Alarm, Chart
-from gtsam_rwhec.changes.control_chart import NightTest
-from gtsam_rwhec.changes.night_spread import FoundSpread, SpreadPool
-from gtsam_rwhec.changes.nights import Nights
 from gtsam_rwhec.fleet.night_rows import Night, RobotFrames, names_of, why_not
 from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.fleet.watch_events import (
@@ -26,6 +21,8 @@ from gtsam_rwhec.fleet.watch_events import (
 )
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.control_chart import RATE, Alarm, Chart, NightTest
+from gtsam_rwhec.results.nights import FoundSpread, Nights, SpreadPool
 from gtsam_rwhec.solver.certificate import Basis
 
 #: Nanoseconds of a day.
@@ -105,7 +102,7 @@ def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
     rows : RobotRow
         Of one or several runs, in any order. Of two rows of one robot that overlap in time, the one given last counts.
     rate : float
-        False alarms a night of one robot (`rw.changes.checked_rate`).
+        False alarms a night of one robot (`rw.results.checked_rate`).
     """
     given = _one_for_each_time(list(rows))
     usable = [row for row in given if not why_not(row)]

@@ -11,8 +11,7 @@ from typing import Any
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.methods.chained import Chained
 from gtsam_rwhec.methods.comparison import Compared, Comparison
-from gtsam_rwhec.results.conventions import CONVENTIONS
-from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER, pose_rows
+from gtsam_rwhec.results.schema import CONVENTIONS, SENSOR_CARRIER, TARGET_CARRIER, pose_rows
 
 FORMAT = "gtsam-rwhec comparison"
 FORMAT_VERSION = 1

@@ -15,8 +15,8 @@ from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print
 from gtsam_rwhec.report.short_poses import refined_poses, scales_and_clocks
 from gtsam_rwhec.report.short_report import LINES, ShortReport
 from gtsam_rwhec.report.solution_report import print_solution_body, solved_poses
-from gtsam_rwhec.results.judging import contradicted_names
 from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.result_judgement import contradicted_names
 
 POINTS = (
     "This is the error of the calibration alone, where the sensor typically saw its targets; in Python, "

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.changes.change_test import ChangeTest
-from gtsam_rwhec.changes.comparing import Difference, share_words
-from gtsam_rwhec.changes.quantities import Movement
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
+from gtsam_rwhec.results.change_test import ChangeTest
+from gtsam_rwhec.results.common_quantities import Movement
+from gtsam_rwhec.results.difference import Difference, share_words
 
 MOVED_HEADINGS = ("mm", "°", "deviations", "chance", "changed")
 NUMBER_HEADINGS = ("old", "new", "deviations", "chance", "changed")

@@ -29,7 +29,7 @@ from gtsam_rwhec.report.sentences import (
     weights_sentence,
 )
 from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport
-from gtsam_rwhec.results.judging import judge
+from gtsam_rwhec.results.result_judgement import judge
 from gtsam_rwhec.solving.solution import Solution
 
 #: How to see everything, in Python.

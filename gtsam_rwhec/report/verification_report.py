@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from gtsam_rwhec.calibration.prediction_errors import PredictionError
-from gtsam_rwhec.changes.verification import Verification
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.report.change_report import CHANGE_LEGEND, MOVED_HEADINGS, STYLES, moved_cells
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
+from gtsam_rwhec.results.verification import Verification
 
 ERROR_HEADINGS = ("n", "old mm", "old°", "old px", "best mm", "best°")
 PIXELS = "old px"

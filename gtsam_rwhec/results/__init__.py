@@ -1,4 +1,4 @@
-"""Calibrations in files: one schema, written and read."""
+"""Results in files with their evidence; what changed between two of them, and whether an old one still holds."""
 
 from gtsam_rwhec.files.optional_packages import lazy_names
 

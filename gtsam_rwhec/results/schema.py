@@ -6,27 +6,42 @@ bases describe the fields. Lengths are in metres, angles in radians, times in se
 """
 
 from __future__ import annotations
-
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
-
+from typing import Annotated
+from typing import Any
+from typing import Final
+from typing import Literal
 import gtsam
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetPydanticSchema, model_validator
-
-from gtsam_rwhec.calibration.verdict import Ground, Verdict
+from pydantic import AfterValidator
+from pydantic import BaseModel
+from pydantic import BeforeValidator
+from pydantic import ConfigDict
+from pydantic import Field
+from pydantic import GetPydanticSchema
+from pydantic import model_validator
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
+from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
+from gtsam_rwhec.identifiability.verdicts import Identifiability
+from gtsam_rwhec.identifiability.verdicts import PairIdentifiability
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
+import math
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.task_units import PointUncertainty
+from gtsam_rwhec.calibration.task_units import point_sentence
+from gtsam_rwhec.calibration.verdict import Finding
 
 FORMAT: Final = "gtsam-rwhec result"
 #: It grows whenever a reader of the version before would misread or refuse the file.
@@ -263,3 +278,125 @@ class ResultFile(BaseModel):
         if self.certified.residuals.keys() != self.certified.identifiability.pairs.keys():
             raise ValueError("residuals and identifiability.pairs have different pairs")
         return self
+
+
+CONVENTIONS = {
+    "poses": (
+        "sensors and targets at the top are the poses to use: the refined poses if the answer was refined, otherwise "
+        "the certified poses; certified has the certified poses in either case"
+    ),
+    "pose": (
+        "T_parent_child is the pose of frame child in frame parent: p_parent = T_parent_child p_child. "
+        "quaternion_wxyz is scalar first, of unit norm, and the same rotation as rotation_matrix (rows)."
+    ),
+    "model": (
+        "T_sensorcarrier_targetcarrier T_targetcarrier_target = T_sensorcarrier_sensor T_sensor_target (A X = Y B); "
+        "X are the targets' poses and Y the sensors'."
+    ),
+    "scale": "length of the measured translation of T_sensor_target = scale * true length",
+    "units": "m, rad, s; sigma in m, kappa in 1/rad^2 (1/(2 s^2) for a standard deviation of s about each axis)",
+    "covariance": (
+        "of xi in T_parent_child Expmap(xi), xi = [omega (rad), v (m)], rotation first, in the axes and about the "
+        "origin of child (GTSAM's right perturbation)"
+    ),
+    "intrinsics": (
+        "of refined.intrinsics: fx, fy, cx, cy in pixels, with the middle of the upper left pixel at (0, 0), and the "
+        "coefficients of the model, as OpenCV has them: radtan k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 (4, 5, 8 "
+        "or 12 of them), equidistant k1, k2, k3, k4 of the fisheye model, pinhole none, unified xi, k1, "
+        "k2, p1, p2 of the omnidir model, whose fx and fy are divided by 1 + xi here. Their covariance is that of "
+        "intrinsics:SENSOR in refined.joint, in the order of names"
+    ),
+    "shape": (
+        "of refined.reprojection.boards: size is the true size less the stated one, a share of 1 (its covariance is "
+        "that of the target's scale, 1 / (1 + size)); warp_x and warp_y are heights of its edge over its middle, "
+        "metres; corners_off_m is how far each corner is from its place on that board, x, y, z in the target's frame, "
+        "where corners were free"
+    ),
+    "infinity": (
+        "null means an infinite number: minus infinity in lower_bound, float_bound and min_eigenvalue (no bound was "
+        "found), infinity of either sign in a covariance, and plus infinity elsewhere"
+    ),
+    "sentence": "the meaning of a record in words; not read back",
+}
+
+
+@dataclass(frozen=True)
+class PointFields:
+    """How far off a point is that a sensor sees; ``str()`` is a sentence.
+
+    Attributes
+    ----------
+    frame, seen_from : str
+        The sensor's frame, and the frame in which the point is expressed.
+    point_m : 3 float
+        The point in ``frame``, metres.
+    level : float
+        The true point is within ``radius_mm`` of the given one with this probability.
+    radius_mm : float
+        Millimetres; infinite (null) where a free direction moves the point.
+    measurement_mm : float or None
+        The same for the noise of one new measurement alone; None where it is not known.
+    """
+
+    frame: str
+    seen_from: str
+    point_m: tuple[float, float, float]
+    level: float
+    radius_mm: float
+    measurement_mm: float | None
+
+    def __str__(self) -> str:
+        distance_m = math.hypot(*self.point_m)
+        return point_sentence(self.frame, self.seen_from, distance_m, self.level, self.radius_mm, self.measurement_mm)
+
+    @staticmethod
+    def of(point: PointUncertainty) -> PointFields:
+        """The record of a point."""
+        x, y, z = point.point_m.tolist()
+        return PointFields(point.frame, point.seen_from, (x, y, z), point.level, point.radius_mm, point.measurement_mm)
+
+
+@dataclass(frozen=True)
+class CalibrationFields:
+    """What ``calibrate`` found and chose.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        What it found against the poses, besides what certificate, free directions and log say; the verdict counts it.
+    choices : tuple of Choice
+        Every choice, with its evidence.
+    points : tuple of PointFields
+        How far off a point is, where each sensor typically saw its targets.
+    noise : str
+        The noise that the answer counts with, in words.
+    outliers : str
+        How many measurements were left out, in words.
+    notes : tuple of str
+        Warnings on the way that changed no choice.
+    constant_errors : two tuples of 6 float, or empty
+        Deviations of a constant error of the carriers' poses, which the covariance holds although no residual shows
+        it: [omega (rad), v (m)] of the targets' carrier in its own axes, and of the sensors'. Another calibration with
+        the same carriers has the same error.
+    """
+
+    findings: tuple[Finding, ...]
+    choices: tuple[Choice, ...]
+    points: tuple[PointFields, ...]
+    noise: str
+    outliers: str
+    notes: tuple[str, ...]
+    constant_errors: tuple[tuple[float, ...], ...] = ()
+
+    @staticmethod
+    def of(calibration: Calibration) -> CalibrationFields:
+        """What a file keeps of a calibration, besides its solution and its refined poses."""
+        return CalibrationFields(
+            findings=calibration.findings,
+            choices=calibration.choices,
+            points=tuple(map(PointFields.of, calibration.points.values())),
+            noise=str(calibration.noise),
+            outliers=str(calibration.outliers),
+            notes=calibration.notes,
+            constant_errors=() if calibration.noise.model is None else calibration.noise.model.constant_deviations,
+        )

@@ -74,7 +74,7 @@ def test_a_calibration_of_csv_files_is_verified_on_others(folder: Path, tmp_path
 
 
 def test_the_level_is_that_of_the_library() -> None:
-    assert diff.LEVEL == rw.changes.LEVEL
+    assert diff.LEVEL == rw.results.LEVEL
 
 
 def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path, tmp_path: Path) -> None:
@@ -87,13 +87,13 @@ def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path,
 
 
 def test_files_with_the_same_checksums_are_not_tested(folder: Path, tmp_path: Path) -> None:
-    file = rw.evidence.InputFile(name="run.mcap", bytes=1, sha256="0" * 64)
+    file = rw.results.InputFile(name="run.mcap", bytes=1, sha256="0" * 64)
     for name in ("old", "same"):
         (tmp_path / name).mkdir()
         result = tmp_path / name / "result.json"
         result.write_bytes((folder / name / "result.json").read_bytes())
-        inputs = rw.evidence.Inputs(files=(file,), versions={})
-        rw.evidence.write_evidence(rw.evidence.Evidence(inputs=inputs), rw.evidence.evidence_path(result), result)
+        inputs = rw.results.Inputs(files=(file,), versions={})
+        rw.results.write_evidence(rw.results.Evidence(inputs=inputs), rw.results.evidence_path(result), result)
     done = CliRunner().invoke(app, ["diff", str(tmp_path / "old"), str(tmp_path / "same")])
     assert done.exit_code == ExitStatus.BAD_INPUT
     assert done.stdout.startswith("Not tested: both rest on the same measurements")
@@ -106,8 +106,8 @@ def test_a_log_that_the_calibration_was_made_from_is_known_again(tmp_path: Path)
     log.write_bytes(b"a log")
     other.write_bytes(b"another log")
     assert not verify.is_of_old_log(result, log)  # nothing says what it was made from
-    inputs = rw.evidence.Inputs(files=rw.evidence.input_files([log]), versions={})
-    rw.evidence.write_evidence(rw.evidence.Evidence(inputs=inputs), rw.evidence.evidence_path(result), result)
+    inputs = rw.results.Inputs(files=rw.results.input_files([log]), versions={})
+    rw.results.write_evidence(rw.results.Evidence(inputs=inputs), rw.results.evidence_path(result), result)
     (tmp_path / "bag").mkdir()
     assert not verify.is_of_old_log(result, tmp_path / "bag")
     (tmp_path / "bag" / "again.mcap").write_bytes(b"a log")

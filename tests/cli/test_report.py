@@ -50,13 +50,13 @@ def test_a_page_is_not_written_onto_the_result_or_its_evidence(result: Path) -> 
     content = result.read_bytes()
     status, said = command("report", result.parent, "-o", result)
     assert (status, "the command reads it" in said) == (2, True)
-    evidence = rw.evidence.evidence_path(result)
-    rw.evidence.write_evidence(rw.evidence.Evidence(), evidence, result)
+    evidence = rw.results.evidence_path(result)
+    rw.results.write_evidence(rw.results.Evidence(), evidence, result)
     assert command("report", result, "-o", evidence)[0] == 2
     assert command("diff", result, result, "-o", result)[0] == 2
     assert command("verify", result, result, "-o", result)[0] == 2
     assert result.read_bytes() == content
-    assert rw.evidence.read_evidence(evidence).derived is None
+    assert rw.results.read_evidence(evidence).derived is None
     evidence.unlink()
 
 

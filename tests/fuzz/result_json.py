@@ -1,18 +1,18 @@
 """Result files, of this version and of the earlier ones."""
 
 from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-
-from harness import Harness, scratch
+from harness import Harness
+from harness import scratch
 from mutations import json_tree
-
 from gtsam_rwhec.calibration.calibrating import calibrate
-from gtsam_rwhec.fitting import refined, refinement
-from gtsam_rwhec.results import result_file, written_result
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.fitting import refined
+from gtsam_rwhec.fitting import refinement
+from gtsam_rwhec.results import result_file
+from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.simulate import general
 from gtsam_rwhec.solving import certified_solution
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
@@ -48,14 +48,14 @@ def seeds() -> Iterable[bytes]:
         warnings.simplefilter("ignore")
         for problem in problems:
             solution = certified_solution.solve(problem)
-            written_result.write_solution(solution, folder / "a.json")
+            result_file.write_solution(solution, folder / "a.json")
             yield (folder / "a.json").read_bytes()
         better: refined.Refined = refinement.refine(problems[0], certified_solution.solve(problems[0]))
         calibrations = [calibrate(problem) for problem in problems[:2]]
-    written_result.write_refined(better, folder / "b.json")
+    result_file.write_refined(better, folder / "b.json")
     yield (folder / "b.json").read_bytes()
     for calibration in calibrations:
-        yield written_result.calibration_json(calibration)
+        yield result_file.calibration_json(calibration)
     for version in (1, 2, 3, 4, 5, 6, 7):  # 7 is of a refinement from corners
         yield (GOLDEN / f"result_version_{version}.json").read_bytes()
 

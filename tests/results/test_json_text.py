@@ -17,7 +17,7 @@ from places import DEMO
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.results.json_text import DEEPEST, MOST_ROWS, parse_json
+from gtsam_rwhec.results.json_tree import DEEPEST, MOST_ROWS, parse_json
 
 #: Bytes of the large files.
 LARGE = 20_000_000

@@ -22,9 +22,8 @@ from strategies import changed_trees, damaged
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
-from gtsam_rwhec.results.result_file import parse_result, read_solution
+from gtsam_rwhec.results.result_file import parse_result, read_solution, write_solution
 from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
-from gtsam_rwhec.results.written_result import write_solution
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.cause import Cause
 

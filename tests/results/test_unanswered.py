@@ -6,7 +6,7 @@ import pytest
 
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport, LogFields, OutlierCount, TrackCount
-from gtsam_rwhec.results.unanswered import short_of_measurements, shortage
+from gtsam_rwhec.results.result_judgement import short_of_measurements, shortage
 
 
 def track(target: str, sensor: str, used: int, **removed: int) -> TrackCount:

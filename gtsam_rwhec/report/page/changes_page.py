@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gtsam_rwhec.changes.comparing import Difference
-from gtsam_rwhec.changes.verification import Verification
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.report.change_report import CHANGE_LEGEND, change_tables, remark_sentences
@@ -13,6 +11,8 @@ from gtsam_rwhec.report.page.blocks import Block, Listing, Page, Paragraph, Sect
 from gtsam_rwhec.report.page.html import write_page
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.verification_report import ERROR_LEGEND, verification_remarks, verification_tables
+from gtsam_rwhec.results.difference import Difference
+from gtsam_rwhec.results.verification import Verification
 
 MADE_BY = "Written by gtsam-rwhec."
 

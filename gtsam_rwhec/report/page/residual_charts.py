@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import ndtri
 
-from gtsam_rwhec.evidence.residuals import Dependence, ResidualsEvidence
-from gtsam_rwhec.evidence.seen import SeenCamera
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.page.figures import INK, SvgFigure, svg_figure
 from gtsam_rwhec.report.plots.coverage import image_axes
 from gtsam_rwhec.report.plots.drawing import GREEN, GREY, ORANGE, PURPLE, VERMILLION, shortened
+from gtsam_rwhec.results.image_errors import SeenCamera
+from gtsam_rwhec.results.residual_evidence import Dependence, ResidualsEvidence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

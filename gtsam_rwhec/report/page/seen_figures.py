@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gtsam_rwhec.evidence.seen import SeenCamera, SeenEvidence, SeenTrack
 from gtsam_rwhec.report.page.figures import INK, SvgFigure, svg_figure
 from gtsam_rwhec.report.plots.coverage import image_axes
 from gtsam_rwhec.report.plots.drawing import GREY, ORANGE, PURPLE, VERMILLION, shortened
+from gtsam_rwhec.results.detection_evidence import SeenEvidence, SeenTrack
+from gtsam_rwhec.results.image_errors import SeenCamera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

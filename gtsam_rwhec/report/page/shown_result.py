@@ -9,11 +9,11 @@ from functools import cached_property
 from typing import Any
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.evidence import Evidence
-from gtsam_rwhec.evidence.evidence import evidence_json
 from gtsam_rwhec.report.page.blocks import Number
+from gtsam_rwhec.results import Evidence
 from gtsam_rwhec.results.earlier_versions import FIRST_WITH_CALIBRATION, as_version_4
-from gtsam_rwhec.results.json_text import parse_json
+from gtsam_rwhec.results.evidence import evidence_json
+from gtsam_rwhec.results.json_tree import parse_json
 from gtsam_rwhec.results.result_file import Result, parse_result
 from gtsam_rwhec.results.schema import FORMAT, FORMAT_VERSION
 

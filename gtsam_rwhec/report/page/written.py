@@ -13,8 +13,6 @@ import numpy as np
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import EvidenceWarning, FileFormatError, OptionError
-from gtsam_rwhec.evidence import Evidence, evidence_path, read_evidence
-from gtsam_rwhec.evidence.evidence import checksum
 from gtsam_rwhec.files.paths import checked_path, is_one_of
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import read_whole
@@ -23,9 +21,11 @@ from gtsam_rwhec.report.page.figure_files import write_figures
 from gtsam_rwhec.report.page.html import write_page
 from gtsam_rwhec.report.page.sections import sections_of
 from gtsam_rwhec.report.page.shown_result import ShownResult
-from gtsam_rwhec.results.json_text import MOST_BYTES
+from gtsam_rwhec.results import Evidence, evidence_path, read_evidence
+from gtsam_rwhec.results.evidence import checksum
+from gtsam_rwhec.results.json_tree import MOST_BYTES
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.written_result import calibration_json
+from gtsam_rwhec.results.result_file import calibration_json
 
 #: The name of a result in an output folder.
 RESULT_FILE = "result.json"
@@ -36,7 +36,7 @@ TONES = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
 #: What a page says once that lacks the parts that need the measurements.
 WITHOUT_EVIDENCE = (
     "There is no evidence beside this result, so some parts are left out. gtsam-rwhec calibrate writes it "
-    "(evidence.json); in Python give write_html(calibration, path, rw.evidence.evidence_of(problem, calibration))."
+    "(evidence.json); in Python give write_html(calibration, path, rw.results.evidence_of(problem, calibration))."
 )
 
 
@@ -59,7 +59,7 @@ def write_html(
     path : str or Path
         The HTML file; an existing file is replaced.
     evidence : Evidence, optional
-        What ``rw.evidence.evidence_of(problem, calibration)`` gathered. Sections whose data are missing say so.
+        What ``rw.results.evidence_of(problem, calibration)`` gathered. Sections whose data are missing say so.
     log : LogFields, optional
         What became of the measurements, if a calibration comes from a log.
     images : bool
@@ -95,7 +95,7 @@ def write_html(
 def _check_evidence(evidence: object) -> None:
     if not isinstance(evidence, Evidence | None):
         raise OptionError(
-            f"evidence is {brief(evidence)}; give what rw.evidence.evidence_of(problem, calibration) returned, or "
+            f"evidence is {brief(evidence)}; give what rw.results.evidence_of(problem, calibration) returned, or "
             "nothing: the evidence beside a result file is read with it"
         )
 

@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     problem = rig(targets=2, sensors=2).problem
     calibration = rw.calibrate(problem, rw.CalibrateOptions(sizes="known"))
     rw.write_calibration(calibration, folder / "result.json")
-    rw.evidence.write_evidence(rw.evidence.evidence_of(problem, calibration), folder / "evidence.json")
+    rw.results.write_evidence(rw.results.evidence_of(problem, calibration), folder / "evidence.json")
     rw.report.write_html(folder, folder / "report.html")
     return folder
 
@@ -188,7 +188,7 @@ def test_a_free_direction_is_said_with_the_motion_that_settles_it(tmp_path: Path
     still.add(*pair, A, A, 0.01, 1e4)
     calibration = rw.calibrate(still)
     rw.write_calibration(calibration, tmp_path / "result.json")
-    rw.evidence.write_evidence(rw.evidence.evidence_of(still, calibration), tmp_path / "evidence.json")
+    rw.results.write_evidence(rw.results.evidence_of(still, calibration), tmp_path / "evidence.json")
     shown = read_shown(tmp_path / "result.json")
     said = str(section(shown, "determines"))
     assert "the motion did not turn. Turn the carriers" in said

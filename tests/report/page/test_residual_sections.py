@@ -11,19 +11,19 @@ from refinement_problems import rig
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.evidence.evidence import evidence_json
 from gtsam_rwhec.report.page import Chart, Page, ShownResult, page_html
 from gtsam_rwhec.report.page.residual_charts import image_figure
 from gtsam_rwhec.report.page.sections.contribution import contribution_section
 from gtsam_rwhec.report.page.sections.residuals import residuals_section
-from gtsam_rwhec.results.written_result import calibration_json
+from gtsam_rwhec.results.evidence import evidence_json
+from gtsam_rwhec.results.result_file import calibration_json
 
 
 @pytest.fixture(scope="module")
 def shown() -> ShownResult:
     problem = rig().problem
     calibration = rw.calibrate(problem)
-    return ShownResult.of(calibration_json(calibration), rw.evidence.evidence_of(problem, calibration))
+    return ShownResult.of(calibration_json(calibration), rw.results.evidence_of(problem, calibration))
 
 
 def test_every_number_is_that_of_the_evidence(shown: ShownResult) -> None:
@@ -57,7 +57,7 @@ def test_without_evidence_the_sections_say_why(shown: ShownResult) -> None:
 
 
 def test_arrows_over_the_image_point_where_corners_are_off() -> None:
-    from gtsam_rwhec.evidence.seen import SeenCamera
+    from gtsam_rwhec.results.image_errors import SeenCamera
 
     rng = np.random.default_rng(5)
     x, y = rng.uniform(0.0, 640.0, 400), rng.uniform(0.0, 480.0, 400)
@@ -78,7 +78,7 @@ def test_evidence_of_numbers_without_bounds_is_refused(shown: ShownResult, tmp_p
         path.write_text(json.dumps(tree), encoding="utf-8")
         if is_refused:
             with pytest.raises(rw.errors.FileFormatError, match="normalised"):
-                rw.evidence.read_evidence(path)
+                rw.results.read_evidence(path)
         else:
-            of = ShownResult.of(json.dumps(shown.tree).encode(), rw.evidence.read_evidence(path))
+            of = ShownResult.of(json.dumps(shown.tree).encode(), rw.results.read_evidence(path))
             assert residuals_section(of).blocks

@@ -12,19 +12,12 @@ from refinement_problems import rig
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.evidence.evidence import evidence_json
-from gtsam_rwhec.evidence.seen import (
-    PIECES,
-    RemovedCount,
-    RemovedMeasurement,
-    SeenCamera,
-    SeenEvidence,
-    SeenTrack,
-    WorstImage,
-)
 from gtsam_rwhec.report.page import Page, Section, ShownResult, page_html
 from gtsam_rwhec.report.page.empty_regions import empty_in_words
 from gtsam_rwhec.report.page.sections.seen import seen_section
+from gtsam_rwhec.results.detection_evidence import PIECES, RemovedCount, RemovedMeasurement, SeenEvidence, SeenTrack
+from gtsam_rwhec.results.evidence import evidence_json
+from gtsam_rwhec.results.image_errors import SeenCamera, WorstImage
 
 NAME = "<b>cam</b>"
 PICTURE = b"\xff\xd8 a picture"
@@ -78,14 +71,14 @@ def made_up() -> SeenEvidence:
 
 
 def page_of(result: bytes, seen: SeenEvidence | None, *, images: bool = True) -> tuple[str, Section]:
-    evidence = None if seen is None else rw.evidence.Evidence(seen=seen)
+    evidence = None if seen is None else rw.results.Evidence(seen=seen)
     section = seen_section(ShownResult.of(result, evidence, images=images))
     return page_html(Page("A page", "good", (section,), "a test")), section
 
 
 def test_numbers_are_those_of_the_evidence_and_names_are_text(result: bytes) -> None:
     page, _ = page_of(result, made_up())
-    files = {"evidence.json": json.loads(evidence_json(rw.evidence.Evidence(seen=made_up())))}
+    files = {"evidence.json": json.loads(evidence_json(rw.results.Evidence(seen=made_up())))}
     assert len(numbers_of(page)) >= 10
     assert list(wrong_numbers(page, files)) == []
     assert NAME not in page
@@ -104,8 +97,8 @@ def test_without_images_there_is_none_and_it_is_said(result: bytes) -> None:
 
 
 def test_pictures_come_through_the_file(tmp_path: Path) -> None:
-    rw.evidence.write_evidence(rw.evidence.Evidence(seen=made_up()), tmp_path / "evidence.json")
-    read = rw.evidence.read_evidence(tmp_path / "evidence.json").seen
+    rw.results.write_evidence(rw.results.Evidence(seen=made_up()), tmp_path / "evidence.json")
+    read = rw.results.read_evidence(tmp_path / "evidence.json").seen
     assert read == made_up()
 
 
@@ -125,7 +118,7 @@ def test_without_evidence_or_corners_it_is_said(result: bytes) -> None:
 def test_a_problem_without_images_has_its_measurements_in_the_figure(result: bytes) -> None:
     problem = rig(1, 1).problem
     calibration = rw.calibrate(problem)
-    seen = rw.evidence.evidence_of(problem, calibration).seen
+    seen = rw.results.evidence_of(problem, calibration).seen
     assert seen is not None
     page, _ = page_of(result, seen)
     assert "20" in page

@@ -35,8 +35,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     problem = rig().problem
     calibration = rw.calibrate(problem)
     rw.write_calibration(calibration, folder / "result.json")
-    evidence = rw.evidence.evidence_of(problem, calibration)
-    rw.evidence.write_evidence(evidence, folder / "evidence.json")
+    evidence = rw.results.evidence_of(problem, calibration)
+    rw.results.write_evidence(evidence, folder / "evidence.json")
     rw.report.write_html(folder, folder / "report.html")
     return folder
 
@@ -57,15 +57,15 @@ def test_a_number_that_is_not_that_of_the_json_is_found() -> None:
 
 
 def test_the_evidence_is_read_back(folder: Path) -> None:
-    evidence = rw.evidence.read_evidence(folder / "evidence.json")
-    rw.evidence.write_evidence(evidence, folder / "again.json")
+    evidence = rw.results.read_evidence(folder / "evidence.json")
+    rw.results.write_evidence(evidence, folder / "again.json")
     assert (folder / "again.json").read_bytes() == (folder / "evidence.json").read_bytes()
 
 
 def test_evidence_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "evidence.json").write_text('{"format": "something else", "format_version": 1}')
     with pytest.raises(rw.errors.FileFormatError, match="is not the evidence of a calibration"):
-        rw.evidence.read_evidence(tmp_path / "evidence.json")
+        rw.results.read_evidence(tmp_path / "evidence.json")
 
 
 def test_a_page_without_evidence_says_once_how_to_get_it(folder: Path, tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_every_block_is_shown_and_names_are_text() -> None:
 def test_evidence_of_another_result_is_left_out_and_said(folder: Path, tmp_path: Path) -> None:
     result, beside = tmp_path / "result.json", tmp_path / "evidence.json"
     result.write_bytes((folder / "result.json").read_bytes())
-    rw.evidence.write_evidence(rw.evidence.read_evidence(folder / "evidence.json"), beside, result)
+    rw.results.write_evidence(rw.results.read_evidence(folder / "evidence.json"), beside, result)
     rw.report.write_html(tmp_path, tmp_path / "same.html")
     result.write_bytes(result.read_bytes() + b"\n")
     with pytest.warns(rw.errors.EvidenceWarning, match="is the evidence of another result"):
@@ -126,7 +126,7 @@ def test_evidence_of_another_result_is_left_out_and_said(folder: Path, tmp_path:
 def test_a_page_is_of_a_result_its_own_evidence_and_a_file_of_its_own(folder: Path, tmp_path: Path) -> None:
     problem = rig(1, 1).problem
     other = rw.calibrate(problem)
-    page, own = tmp_path / "page.html", rw.evidence.evidence_of(problem, other)
+    page, own = tmp_path / "page.html", rw.results.evidence_of(problem, other)
     with pytest.raises(rw.errors.OptionError, match="evidence is of another calibration"):
         rw.report.write_html(folder / "result.json", page, own)
     for wrong in (5, "evidence.json"):
@@ -145,6 +145,6 @@ def test_a_page_is_of_a_result_its_own_evidence_and_a_file_of_its_own(folder: Pa
 def test_a_result_that_is_larger_than_evidence_may_be_has_evidence(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gtsam_rwhec.evidence.evidence.MOST_BYTES", 10)  # a result of 300 frames has 112 MB
-    rw.evidence.write_evidence(rw.evidence.Evidence(), tmp_path / "evidence.json", folder / "result.json")
+    monkeypatch.setattr("gtsam_rwhec.results.evidence.MOST_BYTES", 10)  # a result of 300 frames has 112 MB
+    rw.results.write_evidence(rw.results.Evidence(), tmp_path / "evidence.json", folder / "result.json")
     assert (tmp_path / "evidence.json").exists()

@@ -9,10 +9,10 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.evidence.scene import SceneEvidence
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.report.plots.drawing import round_down
+from gtsam_rwhec.results.scene_evidence import SceneEvidence
 
 Kind = Literal["carrier", "sensor", "target"]
 #: Axes of frames have at most and at least this share of the scene, and this share of the distance between neighbours.

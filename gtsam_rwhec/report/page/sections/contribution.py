@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gtsam_rwhec.evidence.contribution import ContributionEvidence, ImageContribution
 from gtsam_rwhec.report.page.blocks import Block, Chart, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.figures import SvgFigure, svg_figure
 from gtsam_rwhec.report.page.residual_charts import BLUE
 from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.results.contribution import ContributionEvidence, ImageContribution
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from gtsam_rwhec.evidence.residuals import BEYOND_3_BY_CHANCE, FEWEST, ResidualsEvidence
-from gtsam_rwhec.evidence.seen import SeenCamera
 from gtsam_rwhec.report.page.blocks import Block, Chart, Folded, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.residual_charts import (
     boxes_figure,
@@ -15,6 +13,8 @@ from gtsam_rwhec.report.page.residual_charts import (
     time_figure,
 )
 from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.results.image_errors import SeenCamera
+from gtsam_rwhec.results.residual_evidence import BEYOND_3_BY_CHANCE, FEWEST, ResidualsEvidence
 
 TITLE = "Residuals"
 #: Residuals are called as large as the noise within these.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from gtsam_rwhec.evidence.seen import MOST_LISTED, PIECES, RemovedMeasurement, SeenEvidence
 from gtsam_rwhec.report.page.blocks import (
     Block,
     Chart,
@@ -20,6 +19,7 @@ from gtsam_rwhec.report.page.blocks import (
 from gtsam_rwhec.report.page.empty_regions import empty_in_words
 from gtsam_rwhec.report.page.seen_figures import MOST_CAMERAS, coverage_figure, detections_figure
 from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.results.detection_evidence import MOST_LISTED, PIECES, RemovedMeasurement, SeenEvidence
 
 #: A table of removed measurements with more rows is folded.
 MOST_ROWS = 20

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gtsam_rwhec.evidence.weak import MORE, TURN_RAD, WEAK, WeakDirection
 from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Paragraph, Table, Words, significant
 from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
 
 NO_TURN = "No such turn would help clearly more than measuring on."
 #: A direction is called after a coordinate axis within 8 degrees of it.

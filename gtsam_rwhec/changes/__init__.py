@@ -1,5 +1,0 @@
-"""What changed between two calibrations, and whether an old one still holds."""
-
-from gtsam_rwhec.files.optional_packages import lazy_names
-
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -1,0 +1,210 @@
+"""How much each image tells: its information, what would change without it, and how many images tell nearly all.
+
+At the level of poses, with independent noise: an image is all that one sensor measured at one stamp; without stamps
+each measurement counts by itself.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import Field
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
+from gtsam_rwhec.results.linear_model import OWN, LinearModel, inverse_of
+
+#: More images are chosen in bundles of neighbours.
+MOST_CHOSEN_FROM = 125
+#: The choice begins with this share of all information, so that every direction has a finite deviation.
+BEGIN = 1e-6
+#: How much larger the worst standard deviation may be.
+GROWTHS = (0.05, 0.1, 0.25, 0.5)
+#: So many measurements are looked at together.
+AT_ONCE = 512
+#: So many images are listed.
+LISTED = 10
+
+
+class ImageContribution(EvidenceRecord):
+    """What one image tells."""
+
+    sensor: str = Field(description="the sensor's name")
+    targets: tuple[str, ...] = Field(description="what it saw")
+    time: float = Field(description="seconds since the first measurement, or the place of the measurement in its pair")
+    stamp_ns: int | None = Field(description="its stamp")
+    share: float = Field(description="of all that was learnt: the trace of its part of the hat matrix over unknowns")
+    moved: float = Field(description="without it the pose that moves most moves so many of its standard deviations")
+    moved_frame: str = Field(description="which pose that is")
+    moved_mm: float = Field(description="how far that pose's origin moves, millimetres")
+    growth: float = Field(description="without it the standard deviation that grows most grows by this share")
+
+
+class Fewer(EvidenceRecord):
+    """How many images tell nearly as much as all."""
+
+    growth: float = Field(description="no standard deviation is larger by more than this share")
+    bundles: int = Field(description="so many bundles of images are enough, if they are chosen well", ge=0)
+
+
+class ContributionEvidence(EvidenceRecord):
+    """How much each image contributed."""
+
+    has_stamps: bool = Field(description="whether an image is known by its stamp; else each measurement is one")
+    images: int = Field(description="in the answer", ge=0)
+    bundle: int = Field(description="images are chosen in bundles of so many neighbours", ge=1)
+    bundles: int = Field(description="bundles among which the choice was", ge=0)
+    important: tuple[ImageContribution, ...] = Field(description="those that tell most, the first most of all")
+    influential: tuple[ImageContribution, ...] = Field(description="those without which the answer moves most")
+    shares: Row = Field(description="of all images, the largest first")
+    fewer: tuple[Fewer, ...] = Field(description="how many images are enough")
+    curve: Row = Field(description="the largest growth of a standard deviation with the first 1, 2, ... chosen bundles")
+
+
+def contribution_of(model: LinearModel) -> ContributionEvidence | None:
+    """What each image of a model contributed; None where nothing is in the answer, or no frame is unknown."""
+    r, J = model.whitened()
+    which = np.flatnonzero(model.used)
+    if not len(which):
+        return None
+    covariance = inverse_of(model.information(J, model.used))
+    padded = np.pad(covariance, ((0, 1), (0, 1)))
+    images = _images(model, which)
+    own = [np.linalg.pinv(covariance[where, where], hermitian=True) for where in model.frames.values()]
+    if not own:
+        return None
+    blocks = np.array(own)
+    found = _left_out(model, r, J, padded, blocks, images)
+    by_share = sorted(found, key=lambda one: -one.share)
+    by_move = sorted(found, key=lambda one: -one.moved)
+    each = -(-len(images) // MOST_CHOSEN_FROM)
+    bundles = [np.concatenate(images[i : i + each]) for i in range(0, len(images), each)]
+    curve = _chosen(model, J, covariance, bundles)
+    return ContributionEvidence(
+        has_stamps=model.stamps_ns is not None,
+        images=len(images),
+        bundle=each,
+        bundles=len(bundles),
+        important=tuple(by_share[:LISTED]),
+        influential=tuple(by_move[:LISTED]),
+        shares=tuple(float(f"{one.share:.6g}") for one in by_share[:1000]),
+        fewer=tuple(_fewer(curve, growth) for growth in GROWTHS),
+        curve=tuple(float(f"{value:.6g}") for value in curve),
+    )
+
+
+def _images(model: LinearModel, which: np.ndarray) -> list[np.ndarray]:
+    """The measurements of each image."""
+    if model.stamps_ns is None:
+        return [np.array([i]) for i in which]
+    keys = np.column_stack([model.sensor[which], model.stamps_ns[which] - model.stamps_ns.min()])
+    _, image = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(image.ravel(), kind="stable")
+    return np.split(which[order], np.flatnonzero(np.diff(image.ravel()[order])) + 1)
+
+
+def _left_out(
+    model: LinearModel, r: Array, J: Array, covariance: Array, blocks: Array, images: list[np.ndarray]
+) -> list[ImageContribution]:
+    """Leave-one-out of images, all of one size together: d = -S J' (1 - J S J')^-1 r, and S + S J' (1 - J S J')^-1 J S.
+
+    ``covariance`` S has a last row and column of zeros; ``blocks`` (F, 6, 6) are the inverses of the frames' own
+    covariances, zero along free directions.
+    """
+    found: dict[int, ImageContribution] = {}
+    sizes = np.array([len(rows) for rows in images])
+    for size in np.unique(sizes).tolist():
+        alike = np.flatnonzero(sizes == size)
+        for part in np.array_split(alike, -(-len(alike) * size // AT_ONCE)):
+            rows = np.array([images[i] for i in part])
+            found |= dict(zip(part.tolist(), _alike(model, r, J, covariance, blocks, rows), strict=True))
+    return [found[i] for i in range(len(images))]
+
+
+def _alike(
+    model: LinearModel, r: Array, J: Array, covariance: Array, blocks: Array, rows: np.ndarray
+) -> Iterator[ImageContribution]:
+    """The same for images with as many measurements each: their places (n, k)."""
+    n, k = rows.shape
+    places, derivative = model.places[rows], J[rows]
+    spread = np.einsum("dnkp,nkip->ndki", covariance[:, places], derivative, optimize=True)  # S J'
+    spread = spread.reshape(n, len(covariance), 6 * k)
+    there = np.take_along_axis(spread, places.reshape(n, -1, 1), axis=1).reshape(n, k, OWN, 6 * k)
+    hat = np.einsum("nkip,nkpj->nkij", derivative, there).reshape(n, 6 * k, 6 * k)
+    # Where only this image tells something, a direction is lost without it: its eigenvalue is zero up to rounding.
+    values, vectors = np.linalg.eigh(np.eye(6 * k) - hat)
+    values = np.maximum(values, 1e-9)
+    half = spread @ (vectors / np.sqrt(values)[:, None, :])
+    turned = np.einsum("nij,ni->nj", vectors, r[rows].reshape(n, 6 * k)) / np.sqrt(values)
+    step = -np.einsum("ndj,nj->nd", half, turned)
+    variance = np.diagonal(covariance)
+    known = variance > 0.0
+    ratio = (half**2).sum(axis=2)[:, known] / variance[known]
+    growth = np.sqrt(1.0 + ratio.max(axis=1, initial=0.0)) - 1.0
+    by_frame = step[:, : 6 * len(blocks)].reshape(n, -1, 6)
+    squares = np.maximum(np.einsum("nfi,fij,nfj->nf", by_frame, blocks, by_frame, optimize=True), 0.0)
+    most = squares.argmax(axis=1)
+    share = np.einsum("nii->n", hat) / max(int(known.sum()), 1)
+    names, seconds = list(model.frames), model.seconds
+    for i, first in enumerate(rows[:, 0].tolist()):
+        frame = int(most[i])
+        yield ImageContribution(
+            sensor=model.pairs[model.pair[first]].sensor,
+            targets=tuple(model.pairs[pair].target for pair in model.pair[rows[i]].tolist()),
+            time=float(seconds[first]),
+            stamp_ns=None if model.stamps_ns is None else int(model.stamps_ns[first]),
+            share=float(share[i]),
+            moved=float(np.sqrt(squares[i, frame])),
+            moved_frame=names[frame],
+            moved_mm=1e3 * float(np.linalg.norm(by_frame[i, frame, 3:])),
+            growth=float(growth[i]),
+        )
+
+
+def _stacked(model: LinearModel, J: Array, rows: np.ndarray) -> tuple[np.ndarray, Array]:
+    """The unknowns of some measurements, and their whitened derivatives by these (6 n, m)."""
+    places = model.places[rows]
+    own, at = np.unique(places, return_inverse=True)
+    derivative = np.zeros((len(rows), 6, len(own)))
+    at = at.reshape(len(rows), OWN)
+    for i in range(len(rows)):
+        np.add.at(derivative[i].T, at[i], J[rows[i]].T)
+    return own, derivative.reshape(-1, len(own))
+
+
+def _chosen(model: LinearModel, J: Array, covariance: Array, images: list[np.ndarray]) -> list[float]:
+    """The largest growth of a standard deviation after each image, if each next one is that which tells most.
+
+    The gain log det(1 + J S J') falls as images are added, so an image whose old gain is below another's new one need
+    not be looked at again.
+    """
+    stacked = [_stacked(model, J, rows) for rows in images]
+    whole = np.zeros((len(covariance) + 1,) * 2)
+    for own, derivative in stacked:
+        whole[np.ix_(own, own)] += derivative.T @ derivative
+    final = inverse_of(whole[:-1, :-1])
+    known = np.diagonal(final) > 0.0
+    S = np.pad(final / BEGIN, ((0, 1), (0, 1)))
+    gains = [(-np.inf, i) for i in range(len(stacked))]
+    heapq.heapify(gains)
+    curve = []
+    while gains:
+        while True:
+            _, i = heapq.heappop(gains)
+            own, derivative = stacked[i]
+            gain = np.linalg.slogdet(np.eye(len(derivative)) + derivative @ S[np.ix_(own, own)] @ derivative.T)[1]
+            if not gains or -gain <= gains[0][0]:
+                break
+            heapq.heappush(gains, (-gain, i))
+        spread = S[:, own] @ derivative.T
+        S = S - spread @ np.linalg.solve(np.eye(len(derivative)) + derivative @ spread[own], spread.T)
+        ratio = np.diagonal(S)[:-1][known] / np.diagonal(final)[known]
+        curve.append(float(np.sqrt(ratio.max(initial=1.0)) - 1.0))
+    return curve
+
+
+def _fewer(curve: list[float], growth: float) -> Fewer:
+    enough = next((i + 1 for i, value in enumerate(curve) if value <= growth), len(curve))
+    return Fewer(growth=growth, bundles=enough)

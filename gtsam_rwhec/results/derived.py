@@ -1,0 +1,178 @@
+"""What follows from a calibration's poses and covariances alone, as people read it: angles, relative poses, points."""
+
+from __future__ import annotations
+import math
+from collections.abc import Iterator
+from collections.abc import Mapping
+from typing import Literal
+import gtsam
+import numpy as np
+from pydantic import Field
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.geometry.pose_covariances import standard_deviations
+from gtsam_rwhec.results.evidence_record import EvidenceRecord
+
+Triple = tuple[float, float, float]
+Deviations = tuple[float | None, float | None, float | None]
+#: Metres from a sensor at which points are tested, beside the distance at which it saw its targets.
+DISTANCES_M = (0.5, 1.0, 2.0)
+
+
+class FrameAngles(EvidenceRecord):
+    """The rotation of a frame on its carrier as angles."""
+
+    frame: str = Field(description="sensor or target")
+    rpy_deg: Triple = Field(description="roll, pitch, yaw, degrees: R = Rz(yaw) Ry(pitch) Rx(roll)")
+
+
+class Scalar(EvidenceRecord):
+    """A scale or a clock offset that was estimated."""
+
+    kind: Literal["scale", "time_offset"]
+    owner: str = Field(description="target or sensor; empty for a scale that all share")
+    value: float = Field(description="measured / true length; or seconds: a stamp + this = the carriers' time")
+    deviation: float | None = Field(description="one standard deviation; null: infinite")
+
+
+class PointAt(EvidenceRecord):
+    """How far off a point is that a sensor sees at a distance, in the direction in which it saw its targets."""
+
+    sensor: str
+    seen_from: str = Field(description="the frame in which the point is expressed")
+    distance_m: float = Field(description="from the sensor", gt=0.0)
+    is_seen: bool = Field(description="whether this is the typical distance of its targets")
+    radius_mm: float | None = Field(description="the true point is within it; null: a free direction moves the point")
+
+
+class RelativePose(EvidenceRecord):
+    """The pose of a sensor in another sensor's frame, which is often known far better than each on its carrier."""
+
+    first: str
+    second: str
+    translation_m: Triple = Field(description="of T_first_second")
+    rpy_deg: Triple = Field(description="roll, pitch, yaw, degrees")
+    deviations_mm: Deviations = Field(description="along the second's axes; null: infinite")
+    deviations_deg: Deviations = Field(description="about the second's axes; null: infinite")
+
+
+class ClockEffect(EvidenceRecord):
+    """What an error of a clock offset that was estimated would do to a frame: E[pose | offset] - E[pose]."""
+
+    sensor: str = Field(description="whose clock")
+    frame: str = Field(description="whose pose moves")
+    rotation_deg: float = Field(description="of one millisecond", ge=0.0)
+    translation_mm: float = Field(description="of one millisecond", ge=0.0)
+
+
+class Derived(EvidenceRecord):
+    """What follows from poses and covariances."""
+
+    angles: tuple[FrameAngles, ...] = Field(description="of every sensor and target")
+    scalars: tuple[Scalar, ...] = Field(default=(), description="scales and clock offsets that were estimated")
+    level: float = Field(default=0.95, description="probability of the points' radii")
+    points: tuple[PointAt, ...] = Field(default=(), description="at several distances, by sensor")
+    relative: tuple[RelativePose, ...] = Field(default=(), description="of sensors in the first sensor's frame")
+    clocks: tuple[ClockEffect, ...] = Field(default=(), description="of every estimated offset on every frame")
+
+
+def derived_of(calibration: Calibration) -> Derived:
+    """What follows from a calibration's poses and covariances."""
+    angles, refined = tuple(_angles(calibration.Y | calibration.X)), calibration.refined
+    if refined is None:
+        return Derived(angles=angles)
+    return Derived(
+        angles=angles,
+        scalars=tuple(_scalars(refined)),
+        level=calibration.options.level,
+        points=tuple(_points(calibration)),
+        relative=tuple(_relative(refined)),
+        clocks=tuple(clock_effects(refined)),
+    )
+
+
+def _scalars(refined: RefinedPoses) -> Iterator[Scalar]:
+    """Scales and clock offsets with their deviations."""
+    for unknown in refined.unknowns:
+        deviation = _finite(math.sqrt(refined.covariance(unknown)[0, 0]))
+        if unknown.kind is UnknownKind.SCALE:
+            value = refined.scale[unknown.owner] if isinstance(refined.scale, Mapping) else refined.scale
+            yield Scalar(kind="scale", owner=unknown.owner, value=value, deviation=deviation)
+        elif unknown.kind is UnknownKind.TIME_OFFSET:
+            value = refined.time_offsets_s[unknown.owner]
+            yield Scalar(kind="time_offset", owner=unknown.owner, value=value, deviation=deviation)
+
+
+def _points(calibration: Calibration) -> Iterator[PointAt]:
+    """Points at `DISTANCES_M` and where the targets were seen."""
+    for sensor in sorted(calibration.views, key=natural_key):
+        if sensor not in calibration.Y:
+            continue
+        seen = np.array(calibration.views[sensor].point_m)
+        typical = float(np.linalg.norm(seen))
+        if not typical > 0.0:
+            continue
+        for distance in sorted({*DISTANCES_M, typical}):
+            point = calibration.uncertainty_at(seen * (distance / typical), sensor, level=calibration.options.level)
+            yield PointAt(
+                sensor=sensor,
+                seen_from=point.seen_from,
+                distance_m=distance,
+                is_seen=distance == typical,
+                radius_mm=_finite(point.radius_mm),
+            )
+
+
+def _relative(refined: RefinedPoses) -> Iterator[RelativePose]:
+    first, *others = sorted(refined.Y, key=natural_key)
+    for second in others:
+        pose, covariance = refined.relative(first, second)
+        degrees, millimetres = standard_deviations(covariance)
+        yield RelativePose(
+            first=first,
+            second=second,
+            translation_m=_triple(pose.translation()),
+            rpy_deg=_triple(np.degrees(pose.rotation().rpy())),
+            deviations_mm=_deviations(millimetres),
+            deviations_deg=_deviations(degrees),
+        )
+
+
+def clock_effects(refined: RefinedPoses) -> Iterator[ClockEffect]:
+    """The regression of each pose on each estimated offset: cov(pose, offset) / var(offset), times 1 ms."""
+    frames = [name for name in (*refined.Y, *refined.X) if name in refined.names]
+    for unknown in refined.unknowns:
+        if unknown.kind is not UnknownKind.TIME_OFFSET:
+            continue
+        for frame in frames:
+            joint = refined.covariance(frame, unknown)
+            if not (np.isfinite(joint).all() and joint[6, 6] > 0.0):
+                continue
+            moved = 1e-3 * joint[:6, 6] / joint[6, 6]
+            yield ClockEffect(
+                sensor=unknown.owner,
+                frame=frame,
+                rotation_deg=math.degrees(float(np.linalg.norm(moved[:3]))),
+                translation_mm=1e3 * float(np.linalg.norm(moved[3:])),
+            )
+
+
+def _angles(poses: Mapping[str, gtsam.Pose3]) -> Iterator[FrameAngles]:
+    for name in sorted(poses, key=natural_key):
+        yield FrameAngles(frame=name, rpy_deg=_triple(np.degrees(poses[name].rotation().rpy())))
+
+
+def _triple(values: np.ndarray) -> Triple:
+    x, y, z = (float(value) + 0.0 for value in values)
+    return x, y, z
+
+
+def _deviations(values: np.ndarray) -> Deviations:
+    x, y, z = (_finite(float(value)) for value in values)
+    return x, y, z
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

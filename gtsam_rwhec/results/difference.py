@@ -1,0 +1,364 @@
+"""``difference``: what changed from one calibration to the next, and whether by more than chance."""
+
+from __future__ import annotations
+from collections.abc import Collection
+from dataclasses import dataclass
+from dataclasses import field
+import numpy as np
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown
+from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.results.result_file import Result
+from dataclasses import replace
+from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.results.change_test import LEVEL
+from gtsam_rwhec.results.change_test import ChangeTest
+from gtsam_rwhec.results.change_test import change_test
+from gtsam_rwhec.results.change_test import checked_level
+from gtsam_rwhec.results.common_quantities import Movement
+from gtsam_rwhec.results.common_quantities import Quantities
+from gtsam_rwhec.results.common_quantities import quantities
+from gtsam_rwhec.results.schema import CalibrationFields
+
+@dataclass(frozen=True)
+class NumberChange:
+    """How a number changed that both calibrations estimated: a scale, a time offset, a camera's parameter.
+
+    Attributes
+    ----------
+    name : str
+        "scale:board", "time_offset:cam", "fx of cam".
+    old, new : float
+    """
+
+    name: str
+    old: float
+    new: float
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What changed from an old calibration to a new one; ``str()`` is the verdict.
+
+    Attributes
+    ----------
+    movements : dict of str to Movement
+        Of every frame that both have; sensors first.
+    numbers : dict of str to tuple of NumberChange
+        By group ("scale:board", "time_offset:cam", "intrinsics:cam"), of what both estimated.
+    test : ChangeTest or None
+        None where it does not apply; ``why_no_test`` says why.
+    why_no_test : str
+    not_compared : dict of str to str
+        What the test leaves out, with the reason.
+    remarks : tuple of str
+        Frames that only one has, other ways to count sizes, what was assumed.
+    """
+
+    movements: dict[str, Movement]
+    numbers: dict[str, tuple[NumberChange, ...]]
+    test: ChangeTest | None
+    why_no_test: str
+    not_compared: dict[str, str]
+    remarks: tuple[str, ...]
+    is_same: bool = field(default=False)
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether something changed by more than chance."""
+        return self.test is not None and self.test.has_changed
+
+    def __str__(self) -> str:
+        if self.is_same:
+            return "Nothing changed: both are the same answer, number by number."
+        if self.test is None:
+            return f"Not tested: {self.why_no_test}."
+        level = f"{100.0 * self.test.level:g} %"
+        if not self.test.has_changed:
+            return (
+                f"Nothing changed by more than chance at {level}: the two differ by {self.test.deviations:.1f} joint "
+                f"deviations in {self.test.dimension} directions, as much as without a change in "
+                f"{share_words(self.test.chance)}."
+            )
+        named = self.test.changed
+        if not named:
+            return (
+                f"Changed, by more than chance at {level}: by {self.test.deviations:.1f} joint deviations in "
+                f"{self.test.dimension} directions together. No frame stands out by itself."
+            )
+        return f"Changed: {'; '.join(self.sentence(name) for name in named)}, more than chance at {level}."
+
+    def sentence(self, name: str) -> str:
+        """How one frame or number changed, in words, without a full stop."""
+        deviations = "" if self.test is None or name not in self.test.groups else _deviations(self.test, name)
+        if name in self.movements:
+            moved = self.movements[name]
+            verb = "moved" if self.test is None or name in self.test.changed else "differs by"
+            return f"{shown(name)} {verb} {moved}{deviations}"
+        said = ", ".join(f"{shown(one.name)} from {one.old:.6g} to {one.new:.6g}" for one in self.numbers[name])
+        return f"{said}{deviations}"
+
+
+def _deviations(test: ChangeTest, name: str) -> str:
+    return f": {test.groups[name].deviations:.1f} joint deviations"
+
+
+def share_words(chance: float) -> str:
+    """A chance in words: "23 of 100 comparisons"."""
+    if chance >= 0.01:
+        return f"{100.0 * chance:.0f} of 100 comparisons"
+    return "less than one of 100 comparisons"
+
+
+@one_blas_thread()
+def difference(
+    old: Result | Calibration,
+    new: Result | Calibration,
+    *,
+    level: float = LEVEL,
+    frames: Collection[str] = (),
+    clocks_may_change: bool = False,
+    same_arm: bool = True,
+    same_measurements: bool = False,
+) -> Difference:
+    """What changed from an old calibration to a new one, and whether by more than chance.
+
+    The difference of both answers is compared with the sum of both joint covariances: of all frames, scales, time
+    offsets and intrinsics that both have, together and one by one (`change_test`). The errors of the two are taken as
+    independent. Where they share some (a prior of intrinsics, the systematic error of one arm), false alarms are fewer
+    than the level says, and small changes are harder to see.
+
+    Parameters
+    ----------
+    old, new : Result (``rw.results.read_result``) or Calibration
+    level : float
+        How often it may say that something changed where nothing did.
+    frames : names, optional
+        Only these frames are tested. One frame alone is tested most sharply.
+    clocks_may_change : bool
+        Whether time offsets are left out of the test.
+    same_arm : bool
+        Whether the carriers' poses come from the same arm or tracker. A constant error of these, which no residual
+        shows, is then the same in both, and does not count in the difference.
+    same_measurements : bool
+        Whether the measurements of both are known to be the same, such as by their files' checksums: then nothing is
+        tested. What the numbers themselves show of it is seen without.
+
+    Raises
+    ------
+    FrameError
+        They have no frame in common, their carriers or roles differ, or ``frames`` has a name that is in neither.
+    OptionError
+        ``level`` is not between 0 and 1, or an argument is of another type.
+    """
+    checked_level(level)
+    first, second = (as_result(each) for each in (old, new))
+    check_same_rig(first, second)
+    answers = [each.refined or each.solution for each in (first, second)]
+    sides = [(answer.X, answer.Y) for answer in answers]
+    movements = {
+        name: Movement.of(pose, sides[1][side][name])
+        for side in (1, 0)
+        for name, pose in sides[0][side].items()
+        if name in sides[1][side]
+    }
+    unknown = [name for name in frames if name not in movements]
+    if unknown:
+        raise FrameError(
+            f"both must have {', '.join(map(brief, unknown))}; both have {', '.join(map(shown, movements))}"
+        )
+    remarks = list(remarks_of(first, second))
+    if first.refined is None or second.refined is None:
+        which = " and ".join(name for name, each in (("OLD", first), ("NEW", second)) if each.refined is None)
+        why = f"{which} has no covariances, because it was not refined; calibrate with rw.calibrate or gtsam-rwhec"
+        return Difference(movements, {}, None, why, {}, tuple(remarks))
+    without = {UnknownKind.TIME_OFFSET} if clocks_may_change else set()
+    counted = first.refined, second.refined
+    if same_arm:
+        counted = without_constant_errors(first), without_constant_errors(second)
+    common = quantities(*counted, without)
+    numbers = _numbers(first.refined, second.refined, common)
+    not_compared = {str(unknown): why for unknown, why in common.not_compared.items()}
+    if all(abs(common.difference) <= SAME) and all(abs(moved.xi).max() <= SAME for moved in movements.values()):
+        return Difference(movements, numbers, None, "", not_compared, tuple(remarks), is_same=True)
+    if same_measurements or is_of_the_same_measurements(first, second):
+        why = "both rest on the same measurements, whose errors cancel in the difference; compare with another log"
+        return Difference(movements, numbers, None, why, not_compared, tuple(remarks))
+    if frames:
+        common = _only(common, frames)
+    if not common.slots:
+        why = "nothing is left to compare: " + "; ".join(f"{shown(name)}: {why}" for name, why in not_compared.items())
+        return Difference(movements, numbers, None, why, not_compared, tuple(remarks))
+    freedom = first.refined.degrees_of_freedom, second.refined.degrees_of_freedom
+    test = change_test(common.difference, common.covariances, common.free, common.groups, freedom, level)
+    if same_arm and has_constant_errors(first) and has_constant_errors(second):
+        remarks.append(
+            "a constant error of the carriers' poses, which no residual shows, counts as the same in both and not as a "
+            "change (unless NEW is said to have another arm)"
+        )
+    remarks.append(
+        "the errors of both are taken as independent; errors that both share, such as those of one arm or of one "
+        "stated lens, make alarms rarer than the level says"
+    )
+    return Difference(movements, numbers, test, "", not_compared, tuple(remarks))
+
+
+def as_result(given: object) -> Result:
+    """A result, or a calibration that was just computed as one; OptionError for anything else."""
+    if isinstance(given, Calibration):
+        if given.solution is None:
+            raise OptionError(f"a calibration to compare has no answer: {given.judgement}")
+        return Result(given.solution, given.refined, None, CalibrationFields.of(given))
+    if not isinstance(given, Result):
+        raise OptionError(
+            f"a calibration to compare is a {type(given).__name__}; give what rw.results.read_result or rw.calibrate "
+            "returned"
+        )
+    return given
+
+
+def _numbers(old: RefinedPoses, new: RefinedPoses, common: Quantities) -> dict[str, tuple[NumberChange, ...]]:
+    found: dict[str, tuple[NumberChange, ...]] = {}
+    for unknown in common.slots:
+        owner = unknown.owner
+        if unknown.kind is UnknownKind.TIME_OFFSET:
+            values = [old.time_offsets_s[owner], new.time_offsets_s[owner]]
+            found[str(unknown)] = (NumberChange(f"time offset of {owner} (s)", *values),)
+        elif unknown.kind is UnknownKind.SCALE:
+            scales = [each.scale[owner] if isinstance(each.scale, dict) else each.scale for each in (old, new)]
+            found[str(unknown)] = (NumberChange(f"scale of {owner}" if owner else "scale", *scales),)
+        elif unknown.kind is UnknownKind.INTRINSICS:
+            first, second = old.intrinsics[owner], new.intrinsics[owner]
+            found[str(unknown)] = tuple(
+                NumberChange(f"{name} of {owner}", *pair)
+                for name, *pair in zip(first.names, first.values, second.values, strict=True)
+            )
+    return found
+
+
+def _only(common: Quantities, frames: Collection[str]) -> Quantities:
+    """The quantities of some frames; all others are unknown again."""
+    slots: dict[Unknown, slice] = {}
+    rows: list[int] = []
+    for unknown, place in common.slots.items():
+        if unknown.kind is UnknownKind.FRAME and unknown.owner in frames:
+            slots[unknown] = slice(len(rows), len(rows) + 6)
+            rows += range(place.start, place.stop)
+    first, second = common.covariances
+    at = np.ix_(rows, rows)
+    return Quantities(
+        common.difference[rows], (first[at], second[at]), common.free[rows], slots,
+        {unknown: why for unknown, why in common.not_compared.items() if unknown.owner in frames},
+    )  # fmt: skip
+
+
+#: Two numbers that differ by less than this share are the same number, computed twice.
+SAME = 1e-12
+
+
+def check_same_rig(old: Result, new: Result) -> None:
+    """A FrameError for calibrations that do not say poses of the same frames in the same carriers."""
+    first, second = old.refined or old.solution, new.refined or new.solution
+    if old.log is not None and new.log is not None:
+        for what in ("sensor_carrier", "target_carrier"):
+            names = [getattr(each.log, what) for each in (old, new)]
+            if names[0] != names[1]:
+                raise FrameError(
+                    f"OLD has poses in the frame {shown(names[0])}, NEW in {shown(names[1])} "
+                    f"({what.replace('_', ' ')}): these are of different rigs. "
+                    "Compare results of one rig file, or name the carrier as before"
+                )
+    exchanged = [
+        name
+        for name in (*first.X, *first.Y)
+        if (name in first.X) != (name in second.X) and name in (second.X | second.Y)
+    ]
+    if exchanged:
+        raise FrameError(
+            f"{', '.join(map(shown, exchanged))}: a target in one of the two and a sensor in the other; exchange one"
+        )
+    if not (first.X.keys() & second.X.keys() or first.Y.keys() & second.Y.keys()):
+        theirs = [", ".join(map(shown, (*each.Y, *each.X))) for each in (first, second)]
+        raise FrameError(f"no frame is in both: OLD has {theirs[0]}, NEW has {theirs[1]}. They are of different rigs")
+
+
+def is_of_the_same_measurements(old: Result, new: Result) -> bool:
+    """Whether two results rest on the same measurements, by the noise of their corners or by their residuals.
+
+    Numbers that come from images or poses with noise are equal to the last digits only if these are the same.
+    """
+    if old.log is not None and new.log is not None:
+        noise = [each.log.detection.corner_px for each in (old, new) if each.log is not None]
+        if noise[0] and noise[0] == noise[1] and len(set(noise[0].values())) > 1:
+            return True
+    residuals = [each.solution.residuals for each in (old, new)]
+    pairs = [pair for pair in residuals[0] if pair in residuals[1]]
+    return any(
+        residuals[0][pair].translation_rms_m > 0.0
+        and abs(residuals[0][pair].translation_rms_m / residuals[1][pair].translation_rms_m - 1.0) <= SAME
+        for pair in pairs
+        if residuals[1][pair].translation_rms_m > 0.0
+    )
+
+
+def remarks_of(old: Result, new: Result) -> list[str]:
+    """What differs between the two besides their numbers, in words."""
+    remarks = []
+    first, second = old.refined or old.solution, new.refined or new.solution
+    for which, own, other in (("OLD", first, second), ("NEW", second, first)):
+        alone = [name for name in (*own.Y, *own.X) if name not in other.X and name not in other.Y]
+        if alone:
+            remarks.append(f"only {which} has {', '.join(map(shown, alone))}")
+    if first.scale_mode != second.scale_mode:
+        words = {"known": "sizes as known", "shared": "one scale for all sizes", "per_target": "a scale for each size"}
+        remarks.append(f"OLD has {words[first.scale_mode]}, NEW {words[second.scale_mode]}: sizes are not compared")
+    for which, each in (("OLD", old), ("NEW", new)):
+        judgement = each.judgement
+        if judgement.verdict is Verdict.DO_NOT_USE:
+            remarks.append(f"{which} itself says: {judgement}")
+        if each.refined is not None:
+            remarks += [f"{which} leaves free: {direction}" for direction in each.refined.free_directions]
+    return remarks
+
+
+#: An eigenvalue of correlations that is below zero by more than this is none of rounding.
+ROUNDING = 1e-9
+
+
+def has_constant_errors(result: Result) -> bool:
+    """Whether the covariance holds a constant error of the carriers' poses, as the result says."""
+    return result.calibration is not None and bool(np.any(result.calibration.constant_errors))
+
+
+def without_constant_errors(result: Result) -> RefinedPoses:
+    """The refined calibration with the covariance that it has beside a constant error of the carriers' poses.
+
+    As it is where the result does not say what it holds, or where the covariance does not hold that much of it.
+    """
+    refined, fields = result.refined, result.calibration
+    assert refined is not None
+    if fields is None or not has_constant_errors(result):
+        return refined
+    joint = refined.joint
+    finite = joint.finite.copy()
+    for poses, deviations in zip((refined.X, refined.Y), fields.constant_errors, strict=True):
+        shift = np.zeros((len(finite), 6))
+        for name, pose in poses.items():
+            unknown = Unknown(UnknownKind.FRAME, name)
+            if unknown in joint.slots:
+                shift[joint.slots[unknown]] = pose.inverse().AdjointMap() * np.array(deviations)
+        finite -= shift @ shift.T
+    size = np.sqrt(np.maximum(np.diagonal(finite), 0.0))
+    has = np.diagonal(joint.finite) > 0.0
+    if not (size[has] > 0.0).all():
+        return refined
+    correlations = finite[np.ix_(has, has)] / size[has, None] / size[has]
+    if np.linalg.eigvalsh(correlations).min(initial=0.0) < -ROUNDING:
+        return refined
+    return replace(refined, joint=replace(joint, finite=finite))

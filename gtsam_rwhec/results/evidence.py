@@ -1,0 +1,221 @@
+"""The evidence of a calibration: the record, and its file beside the result."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Iterable
+from dataclasses import fields
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final, Literal
+
+from pydantic import Field, ValidationError
+
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.results.contribution import ContributionEvidence, contribution_of
+from gtsam_rwhec.results.derived import Derived, derived_of
+from gtsam_rwhec.results.detection_evidence import SeenEvidence, seen_in_problem
+from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.json_tree import MOST_BYTES as MOST_BYTES_OF_RESULT
+from gtsam_rwhec.results.json_tree import in_words
+from gtsam_rwhec.results.linear_model import LinearModel, measured_rows
+from gtsam_rwhec.results.proof_spectrum import Proof, proof_of
+from gtsam_rwhec.results.residual_evidence import ResidualsEvidence, residuals_of
+from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of_problem
+from gtsam_rwhec.results.weak_poses import WeakDirection, weak_directions
+
+FORMAT: Final = "gtsam-rwhec evidence"
+#: It grows whenever a reader of the version before would misread or refuse the file.
+FORMAT_VERSION: Final = 1
+#: Bytes of the largest file that is read.
+MOST_BYTES = 100_000_000
+
+
+class Evidence(EvidenceRecord):
+    """What a report shows beside the result. A part is None where its data are missing."""
+
+    format: Literal["gtsam-rwhec evidence"] = FORMAT
+    format_version: Literal[1] = FORMAT_VERSION
+    result_sha256: str = Field(default="", description="checksum of the result's file; empty where it was not known")
+    derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
+    proof: Proof | None = Field(default=None, description="gap and spectrum of the certificate")
+    weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
+    scene: SceneEvidence | None = Field(default=None, description="what is needed to draw the rig in space")
+    seen: SeenEvidence | None = Field(default=None, description="detections, removed measurements, corners, images")
+    residuals: ResidualsEvidence | None = Field(default=None, description="what is left, and what it says of the noise")
+    contribution: ContributionEvidence | None = Field(default=None, description="how much each image told")
+    inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
+
+
+def evidence_path(result_path: str | Path) -> Path:
+    """Where the evidence of a result file is: evidence.json beside result.json, NAME.evidence.json beside NAME.json."""
+    path = Path(result_path)
+    return path.with_name("evidence.json" if path.name == "result.json" else f"{path.stem}.evidence.json")
+
+
+def write_evidence(evidence: Evidence, path: str | Path, result_path: str | Path | None = None) -> None:
+    """Write the evidence as JSON.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    path
+        Its file.
+    result_path : optional
+        The result's file. Its checksum is kept, so that the evidence is never shown beside another result.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written, or that of the result cannot be read.
+    """
+    if result_path is not None:
+        content = read_whole(Path(result_path), MOST_BYTES_OF_RESULT, "A result was")
+        evidence = evidence.model_copy(update={"result_sha256": checksum(content)})
+    write_atomically(path, evidence_json(evidence))
+
+
+def checksum(content: bytes) -> str:
+    """SHA-256 of a result's content, as the evidence keeps it."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def evidence_json(evidence: Evidence) -> bytes:
+    """What `write_evidence` writes."""
+    return evidence.model_dump_json(indent=1).encode("utf-8") + b"\n"
+
+
+def read_evidence(path: str | Path) -> Evidence:
+    """Read a file that `write_evidence` wrote.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be read, or is not the evidence of this version; the message has the field.
+    """
+    content = read_whole(path, MOST_BYTES, "The evidence was")
+    try:
+        return Evidence.model_validate_json(content)
+    except ValidationError as error:
+        raise FileFormatError(f"{path} is not the evidence of a calibration: {in_words(error)}") from error
+
+
+#: The packages whose versions decide the last digits of an answer.
+PACKAGES = ("gtsam-rwhec", "gtsam", "numpy", "scipy", "clarabel", "opencv-python-headless", "mcap")
+#: Bytes that are read at once for a checksum.
+PIECE = 1 << 20
+
+
+class InputFile(EvidenceRecord):
+    """A file that was read."""
+
+    name: str = Field(description="its name, without its folder")
+    bytes: int = Field(description="its size", ge=0)
+    sha256: str = Field(description="checksum of its content", pattern="[0-9a-f]{64}")
+
+
+class Inputs(EvidenceRecord):
+    """All that is needed to make a calibration again."""
+
+    files: tuple[InputFile, ...] = Field(description="the files with the measurements")
+    command: str = Field(default="", description="the command, or the call, that made it")
+    versions: dict[str, str] = Field(description="of the packages that decide the answer, and of Python")
+    options: dict[str, str] = Field(default={}, description="options of the calibration that are not the default")
+    seeds: dict[str, int] = Field(default={}, description="seeds of random numbers, by what draws them")
+    rig_file: str | None = Field(default=None, description="the text of the rig file")
+    copies: dict[str, str] = Field(
+        default={}, description="the poses as texts of other programs, under the rig file's names, by the file's name"
+    )
+
+    def with_options(self, options: CalibrateOptions) -> Inputs:
+        """The record with the options of a calibration, and its seeds."""
+        update = {"options": chosen_options(options), "seeds": {"random starts of the search": options.solve.seed}}
+        return self.model_copy(update=update)
+
+
+def chosen_options(options: CalibrateOptions) -> dict[str, str]:
+    """Options that are not the default, by name, as Python writes them; of a path of poses only its kind."""
+    chosen = {}
+    for field in fields(options):
+        value, default = getattr(options, field.name), getattr(CalibrateOptions(), field.name)
+        if field.name == "carrier_path":
+            if value is not None:
+                chosen[field.name] = f"the poses of the carrier over time ({type(value).__name__})"
+        elif value != default:
+            chosen[field.name] = brief(value) if isinstance(value, str) else repr(value)
+    return chosen
+
+
+def versions() -> dict[str, str]:
+    """Versions of `PACKAGES` that are installed, and of Python."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # other builds of OpenCV have other names
+            continue
+    return found
+
+
+def input_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
+    """The files, each with its size and checksum, as they are now."""
+    return tuple(_input_file(Path(path)) for path in paths)
+
+
+def _input_file(path: Path) -> InputFile:
+    digest, size = hashlib.sha256(), 0
+    with path.open("rb") as stream:
+        while piece := stream.read(PIECE):
+            digest.update(piece)
+            size += len(piece)
+    return InputFile(name=path.name, bytes=size, sha256=digest.hexdigest())
+
+
+@one_blas_thread()
+def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | None = None) -> Evidence:
+    """What a report shows beside a calibration.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was calibrated, with its measurements.
+    calibration : Calibration
+        What ``calibrate`` returned for it.
+    inputs : Inputs, optional
+        The files that the problem was read from; without them only versions are known.
+
+    Raises
+    ------
+    MeasurementsNotKeptError
+        The problem was made with ``keep_measurements=False``.
+    """
+    inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
+    rows = measured_rows(problem, calibration)
+    model = LinearModel.of(rows, calibration)
+    return Evidence(
+        derived=derived_of(calibration),
+        proof=_proof(problem, calibration),
+        weak=weak_directions(calibration, rows),
+        scene=scene_of_problem(problem, calibration, rows),
+        seen=seen_in_problem(problem, calibration.refined, rows, calibration.options.carrier_path),
+        residuals=None if model is None else residuals_of(model, calibration),
+        contribution=None if model is None else contribution_of(model),
+        inputs=inputs.with_options(calibration.options),
+    )
+
+
+def _proof(problem: Problem, calibration: Calibration) -> Proof | None:
+    """The proof of the certified solution, with the measurements that it is of."""
+    if calibration.solution is None:
+        return None
+    inliers = calibration.outliers.inliers
+    return proof_of(calibration.solution, selected(problem, inliers) if inliers else problem)

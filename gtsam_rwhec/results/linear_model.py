@@ -1,0 +1,255 @@
+"""The measurements about the answer as one linear model, at the level of poses: residuals, noise and derivatives.
+
+The residual of a measurement is r = Log(P^-1 B), with the prediction P = S(Y^-1 A X): it is the error of B in the
+target's axes. To first order, with right perturbations x of X and y of Y and the scale s,
+
+    r(d) = r - D (x - Ad(P^-1) y) - [0; R' t] ds,    D = diag(1, 1, 1, s, s, s)
+
+Its noise is B's, as it was found, and A's, moved into the same axes. Clocks, intrinsics, boards and errors that
+measurements share are not in it: what is computed from it says so.
+"""
+
+from __future__ import annotations
+from collections.abc import Mapping
+from dataclasses import dataclass
+import numpy as np
+from rwhec_factors import se3
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.fitting.unknowns import Unknown
+from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+
+#: Directions with less than this share of the largest information, in units of their own, count as free.
+FREE = 1e-12
+#: A measurement's unknowns: six of its target, six of its sensor, and the scale.
+OWN = 13
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """All measurements of frames that the answer has, pair after pair.
+
+    Attributes
+    ----------
+    pairs : tuple of Pair
+    pair : (N,) int
+        Each measurement's place in ``pairs``.
+    within : (N,) int
+        Its place among the measurements of its pair.
+    stamps_ns : (N,) int or None
+        None where a pair has none.
+    used : (N,) bool
+    residual : (N, 6)
+        [rad, m], in the target's axes, lengths as measured.
+    noise : (N, 6, 6)
+        Its covariance before the fit.
+    J : (N, 6, 13)
+        The change of the prediction by the measurement's own unknowns.
+    places : (N, 13) int
+        Where these are among all unknowns; ``dimension`` stands for one that is known.
+    A : (N, 4, 4)
+        The carriers' poses.
+    frames : dict of str to slice
+        Where the frames' six unknowns are.
+    dimension : int
+    """
+
+    pairs: tuple[Pair, ...]
+    pair: np.ndarray
+    within: np.ndarray
+    stamps_ns: np.ndarray | None
+    used: np.ndarray
+    residual: Array
+    noise: Array
+    J: Array
+    places: np.ndarray
+    A: Array
+    frames: dict[str, slice]
+    dimension: int
+
+    @staticmethod
+    def of(rows: Mapping[Pair, MeasuredRows], calibration: Calibration) -> LinearModel | None:
+        """The model of a calibration's measurements; None where it has no covariances, and so no noise."""
+        refined = calibration.refined
+        known = [pair for pair in rows if pair.target in calibration.X and pair.sensor in calibration.Y]
+        known = [pair for pair in known if refined is not None and pair in refined.noise and len(rows[pair].A)]
+        if refined is None or not known:
+            return None
+        free = [name for name in (*calibration.X, *calibration.Y) if Unknown.of(name) in refined.joint.slots]
+        frames = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(free)}
+        scales = [one for one in refined.joint.slots if one.kind is UnknownKind.SCALE]
+        dimension = 6 * len(free) + len(scales)
+        parts = []
+        for number, pair in enumerate(known):
+            of, count = rows[pair], len(rows[pair].A)
+            scale = refined.scale if isinstance(refined.scale, float) else refined.scale[pair.target]
+            X, Y = calibration.X[pair.target].matrix(), calibration.Y[pair.sensor].matrix()
+            P = np.linalg.inv(Y) @ of.A @ X
+            as_measured = np.repeat([1.0, scale], 3)
+            J = np.zeros((count, 6, OWN))
+            J[:, :, :6] = np.diag(as_measured)
+            J[:, :, 6:12] = -as_measured[:, None] * se3.adjoint(se3.inverse(P))
+            J[:, 3:, 12] = np.einsum("nji,nj->ni", P[:, :3, :3], P[:, :3, 3])
+            noise = _noise_of_B(of, refined.noise[pair]) + _noise_of_A(calibration.noise_of_A, of.A, X, as_measured)
+            P[:, :3, 3] *= scale
+            own = next((i for i, one in enumerate(scales) if one.owner in ("", pair.target)), None)
+            at = np.r_[
+                _places(frames.get(pair.target), dimension),
+                _places(frames.get(pair.sensor), dimension),
+                dimension if own is None else 6 * len(free) + own,
+            ]
+            residual = se3.logmap(se3.inverse(P) @ of.B)
+            places = np.tile(at, (count, 1))
+            parts.append((np.full(count, number), np.arange(count), of.used, residual, noise, J, places))
+        pair_of, within, used, residual, noise, J, places = (np.concatenate(part) for part in zip(*parts, strict=True))
+        stamps = [rows[pair].stamps_ns for pair in known]
+        together = [one for one in stamps if one is not None]
+        return LinearModel(
+            pairs=tuple(known),
+            pair=pair_of,
+            within=within,
+            stamps_ns=np.concatenate(together) if len(together) == len(stamps) else None,
+            used=used,
+            residual=residual,
+            noise=noise,
+            J=J,
+            places=places,
+            A=np.concatenate([rows[pair].A for pair in known]),
+            frames=frames,
+            dimension=dimension,
+        )
+
+    @property
+    def seconds(self) -> Array:
+        """Time (N,) since the first measurement; without stamps, the place in its pair."""
+        if self.stamps_ns is None:
+            return self.within.astype(float)
+        seconds: Array = (self.stamps_ns - self.stamps_ns.min()) * 1e-9
+        return seconds
+
+    @property
+    def sensor(self) -> np.ndarray:
+        """The sensor's place (N,) among all sensors, in the order of the pairs."""
+        names = list(dict.fromkeys(pair.sensor for pair in self.pairs))
+        of_pair = np.array([names.index(pair.sensor) for pair in self.pairs])
+        return np.asarray(of_pair[self.pair])
+
+    def whitened(self) -> tuple[Array, Array]:
+        """Residuals (N, 6) and derivatives (N, 6, 13) in units of the noise."""
+        L = np.linalg.cholesky(self.noise)
+        both = np.linalg.solve(L, np.concatenate([self.residual[:, :, None], self.J], axis=2))
+        return both[:, :, 0], both[:, :, 1:]
+
+    def information(self, J: Array, which: np.ndarray) -> Array:
+        """J'J (d, d) of some measurements (N,) bool, with whitened derivatives ``J``."""
+        total = np.zeros((self.dimension + 1, self.dimension + 1))
+        for number in range(len(self.pairs)):
+            mine = which & (self.pair == number)
+            if mine.any():
+                rows = J[mine].reshape(-1, OWN)
+                at = self.places[mine][0]
+                np.add.at(total, (at[:, None], at[None, :]), rows.T @ rows)
+        return total[:-1, :-1]
+
+    def gradient(self, J: Array, r: Array, which: np.ndarray) -> Array:
+        """J'r (d,) of some measurements, whitened."""
+        total = np.zeros(self.dimension + 1)
+        np.add.at(total, self.places[which], np.einsum("nij,ni->nj", J[which], r[which]))
+        return total[:-1]
+
+
+def inverse_of(information: Array) -> Array:
+    """The covariance: the inverse of an information; along free directions it is zero, for nothing is moved there."""
+    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    known = values > FREE * values.max(initial=0.0)
+    scaled = vectors[:, known] * unit[:, None]
+    result: Array = (scaled / values[known]) @ scaled.T
+    return result
+
+
+def _places(where: slice | None, dimension: int) -> np.ndarray:
+    """Six places of a frame; a frame that is fixed has none."""
+    return np.full(6, dimension) if where is None else np.arange(where.start, where.stop)
+
+
+def _noise_of_B(of: MeasuredRows, typical: PairNoise) -> Array:
+    """B's covariances (N, 6, 6): as stated, so that the median measurement of the pair has the noise that was found."""
+    if of.covariance is None:
+        return np.tile(np.diag(np.repeat([typical.rotation_rad**2, typical.translation_m**2], 3)), (len(of.A), 1, 1))
+    mean = np.einsum("nii->ni", of.covariance).reshape(-1, 2, 3).mean(axis=2)
+    usual = np.median(mean[of.used] if of.used.any() else mean, axis=0)
+    factor = np.repeat(np.array([typical.rotation_rad, typical.translation_m]) / np.sqrt(usual), 3)
+    scaled: Array = of.covariance * factor[:, None] * factor
+    return scaled
+
+
+def _noise_of_A(noise: CarrierNoise | None, A: Array, X: Array, as_measured: Array) -> Array:
+    """A's covariance in the prediction's axes (N, 6, 6); zero where A counts as exact."""
+    if noise is None:
+        return np.zeros((len(A), 6, 6))
+    frame = X if noise.about == "targetcarrier" else A @ X
+    E = as_measured[:, None] * se3.adjoint(se3.inverse(np.broadcast_to(frame, A.shape)))
+    E = E * np.repeat([noise.rotation_rad, noise.translation_m], 3)
+    moved: Array = E @ E.transpose(0, 2, 1)
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRows:
+    """The measurements of a pair, used or not.
+
+    Attributes
+    ----------
+    A, B : (N, 4, 4)
+        T_sensorcarrier_targetcarrier at the final time offsets, and T_sensor_target, metres.
+    stamps_ns : (N,) int or None
+    covariance : (N, 6, 6) or None
+        Of B's right perturbation [omega (rad), v (m)], as it was stated; None where a log has none.
+    reasons : tuple of str
+        Why a measurement is not used; empty where it is.
+    """
+
+    A: Array
+    B: Array
+    stamps_ns: np.ndarray | None
+    covariance: Array | None
+    reasons: tuple[str, ...]
+
+    @property
+    def used(self) -> np.ndarray:
+        """Which measurements are in the answer, (N,) bool."""
+        return np.array([not reason for reason in self.reasons], dtype=bool)
+
+
+#: A measurement of a problem that robust estimation left out.
+LEFT_OUT = "farther off than the noise of the others explains"
+
+
+def measured_rows(problem: Problem, calibration: Calibration) -> Mapping[Pair, MeasuredRows]:
+    """The measurements of a problem, in the order of their pairs; motions are left out, for they see no target.
+
+    Raises
+    ------
+    MeasurementsNotKeptError
+        The problem was made with ``keep_measurements=False``.
+    """
+    rows = {}
+    for pair in problem.pairs:
+        if pair.is_motion:
+            continue
+        measured = problem.measurements(pair.target, pair.sensor)
+        inlier = calibration.outliers.inliers.get(pair)
+        used = np.ones(len(measured.A), dtype=bool) if inlier is None else np.asarray(inlier, dtype=bool)
+        rows[pair] = MeasuredRows(
+            A=measured.A,
+            B=measured.B,
+            stamps_ns=measured.stamps_ns,
+            covariance=measured.covariance_of_B(),
+            reasons=tuple("" if one else LEFT_OUT for one in used),
+        )
+    return rows

@@ -1,0 +1,241 @@
+"""What is left after the fit, measurement by measurement, against the noise that was found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import Field
+from rwhec_factors import se3
+
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row, Rows
+from gtsam_rwhec.results.linear_model import LinearModel, inverse_of
+
+#: So many measurements are kept one by one; of more, every so-many-th.
+MOST_KEPT = 5_000
+#: The measurements are cut into so many blocks in time, each of which the others predict.
+BLOCKS = 5
+#: Of fewer measurements nothing is said about neighbours in time, or about the configuration.
+FEWEST = 8
+#: A normal error is beyond three deviations so often.
+BEYOND_3_BY_CHANCE = 0.0026997960632601866
+#: A dependence counts beyond so many of its standard deviations: that is 1 % for the 72 that are looked at.
+CHANCE_OF_MANY = 3.8
+AXES = ("x", "y", "z")
+COMPONENTS = tuple(f"{what} {axis}" for what in ("rotation about", "translation along") for axis in AXES)
+
+
+class PairResiduals(EvidenceRecord):
+    """The residuals of a pair: B against the prediction Y^-1 A X, in the target's axes."""
+
+    target: str = Field(description="the target's name")
+    sensor: str = Field(description="the sensor's name")
+    used: int = Field(description="measurements in the answer", ge=0)
+    rms_deg: float = Field(description="root mean square angle of those in the answer, degrees")
+    rms_mm: float = Field(description="root mean square length of those in the answer, millimetres")
+    spread: float = Field(description="root mean square in units of the noise: 1 where they are as large as the noise")
+    neighbours: float | None = Field(description="correlation with the one before; null: too few")
+    band: float | None = Field(description="by chance it is within this of zero in 95 %")
+    times: Row = Field(description="of those kept one by one: seconds since the first, or places without stamps")
+    in_answer: tuple[bool, ...] = Field(description="whether it is in the answer")
+    deg: Row = Field(description="angle, degrees")
+    mm: Row = Field(description="length, millimetres")
+    normalised: Rows = Field(description="in units of the noise, rotation first; of those in the answer")
+
+
+class HoldOut(EvidenceRecord):
+    """Measurements of a sensor, predicted by all that are not of their block in time, in one linear step."""
+
+    sensor: str = Field(description="the sensor's name")
+    measurements: int = Field(description="that could be predicted", ge=0)
+    held_out_mm: float = Field(description="root mean square length, millimetres")
+    held_out_deg: float = Field(description="root mean square angle, degrees")
+    fitted_mm: float = Field(description="the same with all measurements in the fit")
+    fitted_deg: float = Field(description="the same with all measurements in the fit")
+
+
+class Dependence(EvidenceRecord):
+    """How a residual depends on the pose of the carriers: the strongest dependence of all."""
+
+    sensor: str = Field(description="the sensor's name")
+    component: str = Field(description="which of the six residuals")
+    by: str = Field(description="what of A it depends on")
+    correlation: float = Field(description="between the two")
+    by_chance: float = Field(description="the largest of all is below this in 99 % if there is none")
+    x: Row = Field(description="what of A: radians, or metres")
+    y: Row = Field(description="the residual in units of its noise")
+
+
+class ResidualsEvidence(EvidenceRecord):
+    """Residuals of all pairs, and what they say of the noise model."""
+
+    has_stamps: bool = Field(description="whether times are seconds")
+    measurements: int = Field(description="in the answer", ge=0)
+    kept_every: int = Field(description="every so-many-th is kept one by one", ge=1)
+    pairs: tuple[PairResiduals, ...] = Field(description="by pair")
+    spread: float = Field(description="root mean square of all residuals in units of the noise")
+    beyond_3: float = Field(description="share of them beyond three deviations")
+    excess_kurtosis: float = Field(description="of them; 0 for normal noise, positive for heavy tails")
+    instants: int | None = Field(description="carrier poses with measurements; null: no model of the noise")
+    worth: float | None = Field(description="so many instants with independent noise would tell as much")
+    hold_out: tuple[HoldOut, ...] = Field(description="by sensor")
+    dependence: Dependence | None = Field(description="of the residuals on the carriers' pose; null: too few")
+
+
+def residuals_of(model: LinearModel, calibration: Calibration) -> ResidualsEvidence:
+    """The residuals of a calibration's model."""
+    r, J = model.whitened()
+    every = -(-len(r) // MOST_KEPT)
+    used = r[model.used]
+    noise = calibration.noise.model
+    return ResidualsEvidence(
+        has_stamps=model.stamps_ns is not None,
+        measurements=int(model.used.sum()),
+        kept_every=every,
+        pairs=tuple(_of_pair(model, r, number, every) for number in range(len(model.pairs))),
+        spread=_rms(used),
+        beyond_3=float((np.abs(used) > 3.0).mean()) if used.size else 0.0,
+        excess_kurtosis=_excess_kurtosis(used),
+        instants=None if noise is None else noise.instants,
+        worth=None if noise is None else noise.worth,
+        hold_out=tuple(_hold_out(model, r, J)),
+        dependence=_dependence(model, r),
+    )
+
+
+def _of_pair(model: LinearModel, r: Array, number: int, every: int) -> PairResiduals:
+    mine = model.pair == number
+    used = mine & model.used
+    mine = mine & (np.arange(len(r)) % every == 0)
+    degrees, millimetres = sizes(model.residual)
+    correlation, band = _neighbours(r[used], model.seconds[used])
+    pair = model.pairs[number]
+    return PairResiduals(
+        target=pair.target,
+        sensor=pair.sensor,
+        used=int(used.sum()),
+        rms_deg=_rms(degrees[used]),
+        rms_mm=_rms(millimetres[used]),
+        spread=_rms(r[used]),
+        neighbours=correlation,
+        band=band,
+        times=_rounded(model.seconds[mine]),
+        in_answer=tuple(model.used[mine].tolist()),
+        deg=_rounded(degrees[mine]),
+        mm=_rounded(millimetres[mine]),
+        normalised=tuple(map(_rounded, r[mine & model.used])),
+    )
+
+
+def sizes(residual: Array) -> tuple[Array, Array]:
+    """Angles (N,) in degrees and lengths (N,) in millimetres of residuals (N, 6)."""
+    angle: Array = np.degrees(np.linalg.norm(residual[:, :3], axis=1))
+    return angle, 1e3 * np.linalg.norm(residual[:, 3:], axis=1)
+
+
+def _neighbours(r: Array, seconds: Array) -> tuple[float | None, float | None]:
+    """The correlation of residuals with those before them in time, and how large it is by chance, 95 %."""
+    if len(r) < FEWEST:
+        return None, None
+    ordered = r[np.argsort(seconds, kind="stable")]
+    ordered = ordered - ordered.mean(axis=0)
+    variance = (ordered**2).mean()
+    if variance == 0.0:
+        return None, None
+    return float((ordered[1:] * ordered[:-1]).mean() / variance), 1.96 / np.sqrt(6.0 * (len(r) - 1))
+
+
+def _hold_out(model: LinearModel, r: Array, J: Array) -> Iterator[HoldOut]:
+    """Predictions of each block from the others: one step of the linear model from the answer, with what they know."""
+    used = model.used
+    whole, pull = model.information(J, used), model.gradient(J, r, used)
+    block = np.zeros(len(r), dtype=int)
+    block[np.argsort(model.seconds, kind="stable")] = np.arange(len(r)) * BLOCKS // max(len(r), 1)
+    predicted = np.full(model.residual.shape, np.nan)
+    for number in range(BLOCKS):
+        mine = used & (block == number)
+        if not mine.any():
+            continue
+        left = whole - model.information(J, mine)
+        if np.linalg.matrix_rank(_scaled(left), tol=1e-9, hermitian=True) < len(left):
+            continue
+        step = np.append(inverse_of(left) @ (pull - model.gradient(J, r, mine)), 0.0)
+        predicted[mine] = model.residual[mine] - np.einsum("nij,nj->ni", model.J[mine], step[model.places[mine]])
+    sensors = list(dict.fromkeys(pair.sensor for pair in model.pairs))
+    for number, sensor in enumerate(sensors):
+        known = (model.sensor == number) & np.isfinite(predicted[:, 0])
+        if known.any():
+            held, fitted = sizes(predicted[known]), sizes(model.residual[known])
+            yield HoldOut(
+                sensor=sensor,
+                measurements=int(known.sum()),
+                held_out_mm=_rms(held[1]),
+                held_out_deg=_rms(held[0]),
+                fitted_mm=_rms(fitted[1]),
+                fitted_deg=_rms(fitted[0]),
+            )
+
+
+def _scaled(information: Array) -> Array:
+    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    scaled: Array = information * unit[:, None] * unit
+    return scaled
+
+
+def _dependence(model: LinearModel, r: Array) -> Dependence | None:
+    """The strongest correlation of a residual with a coordinate of A, over sensors, residuals and coordinates."""
+    best: tuple[float, Dependence] | None = None
+    sensors = list(dict.fromkeys(pair.sensor for pair in model.pairs))
+    for number, sensor in enumerate(sensors):
+        mine = model.used & (model.sensor == number)
+        if mine.sum() < FEWEST:
+            continue
+        coordinates, names = _coordinates(model.A[mine])
+        values = r[mine] - r[mine].mean(axis=0)
+        spread = np.outer(values.std(axis=0), coordinates.std(axis=0)) * len(values)
+        correlation = np.divide(values.T @ coordinates, spread, out=np.zeros(spread.shape), where=spread > 0.0)
+        row, column = np.unravel_index(int(np.abs(correlation).argmax()), correlation.shape)
+        by_chance = min(CHANCE_OF_MANY / np.sqrt(len(values)), 1.0)
+        found = float(correlation[row, column])
+        if best is None or abs(found) / by_chance > best[0]:
+            every = slice(None, None, -(-len(values) // 1000))
+            best = (
+                abs(found) / by_chance,
+                Dependence(
+                    sensor=sensor,
+                    component=COMPONENTS[row],
+                    by=names[column],
+                    correlation=found,
+                    by_chance=by_chance,
+                    x=_rounded(coordinates[every, column]),
+                    y=_rounded(r[mine][every, row]),
+                ),
+            )
+    return None if best is None else best[1]
+
+
+def _coordinates(A: Array) -> tuple[Array, tuple[str, ...]]:
+    """The carriers' pose as six centred numbers, about the pose in the middle, and their names."""
+    middle = A[int(np.argmin(np.linalg.norm(A[:, :3, 3] - np.median(A[:, :3, 3], axis=0), axis=1)))]
+    turned = se3.so3_logmap(np.swapaxes(np.broadcast_to(middle[:3, :3], A[:, :3, :3].shape), 1, 2) @ A[:, :3, :3])
+    values = np.concatenate([turned, A[:, :3, 3]], axis=1)
+    names = (*(f"rotation of A about {axis}, rad" for axis in AXES), *(f"{axis} of A, m" for axis in AXES))
+    return values - values.mean(axis=0), names
+
+
+def _excess_kurtosis(values: Array) -> float:
+    if values.size < FEWEST or not values.any():
+        return 0.0
+    centred = values - values.mean()
+    return float((centred**4).mean() / (centred**2).mean() ** 2 - 3.0)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean())) if values.size else 0.0
+
+
+def _rounded(values: Array) -> Row:
+    """Six significant digits: more are noise, and a file has many."""
+    return tuple(float(f"{value:.6g}") for value in values.tolist())
