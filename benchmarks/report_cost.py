@@ -7,6 +7,7 @@ of its own. Every number of both pages is compared with the JSON beside them. ``
 """
 
 from __future__ import annotations
+
 import cProfile
 import json
 import pstats
@@ -17,16 +18,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from places import CELL
-from shown_numbers import numbers_of
-from shown_numbers import wrong_numbers
+from shown_numbers import numbers_of, wrong_numbers
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.runs import all_stages
-from gtsam_rwhec.runs import log_report
+from gtsam_rwhec.runs import all_stages, log_report
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 

@@ -1,26 +1,19 @@
 """``gtsam-rwhec verify``: whether an old calibration still holds on a new log."""
 
 from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
+
 import typer
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.calibrate import is_log
-from gtsam_rwhec.cli.calibrate import other_than_csv
-from gtsam_rwhec.cli.diff import LEVEL
-from gtsam_rwhec.cli.diff import RESULT_HELP
-from gtsam_rwhec.cli.diff import LevelOption
-from gtsam_rwhec.cli.diff import PageOption
-from gtsam_rwhec.cli.diff import old_checksums
-from gtsam_rwhec.cli.diff import write_page_to
+from gtsam_rwhec.cli.calibrate import is_log, other_than_csv
+from gtsam_rwhec.cli.diff import LEVEL, RESULT_HELP, LevelOption, PageOption, old_checksums, write_page_to
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
-from gtsam_rwhec.cli.options import FOLDER_OF_CSV
-from gtsam_rwhec.cli.options import RigOption
-from gtsam_rwhec.cli.options import SensorsOption
-from gtsam_rwhec.cli.options import TargetsOption
-from gtsam_rwhec.cli.options import WorkersOption
+from gtsam_rwhec.cli.options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
 from gtsam_rwhec.cli.report import read_of
 from gtsam_rwhec.cli.stage_display import StageDisplay
 

@@ -1,13 +1,15 @@
 """What follows from a calibration's poses and covariances alone, as people read it: angles, relative poses, points."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Literal
+
 import gtsam
 import numpy as np
 from pydantic import Field
+
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses

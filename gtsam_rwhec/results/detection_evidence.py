@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.fitting.pair_data import local_paths
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.pair_data import local_paths
-from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.results.evidence_record import EvidenceRecord
 from gtsam_rwhec.results.image_errors import (
     SeenCamera,

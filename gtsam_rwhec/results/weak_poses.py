@@ -13,14 +13,16 @@ measurements like those that there are is beside it, for comparison.
 """
 
 from __future__ import annotations
+
 import math
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
+
 import numpy as np
 from pydantic import Field
 from rwhec_factors import se3
+
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined

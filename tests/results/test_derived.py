@@ -1,20 +1,20 @@
 """What follows from poses and covariances is what the calibration itself says of each."""
 
 from __future__ import annotations
+
 import math
 from dataclasses import replace
+
 import numpy as np
 import pytest
 from places import REPOSITORY
 from refinement_problems import rig
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.results.derived import DISTANCES_M
-from gtsam_rwhec.results.derived import Derived
-from gtsam_rwhec.results.derived import clock_effects
-from gtsam_rwhec.results.derived import derived_of
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.results.derived import DISTANCES_M, Derived, clock_effects, derived_of
+
 
 @pytest.fixture(scope="module")
 def calibration() -> rw.Calibration:

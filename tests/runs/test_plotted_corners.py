@@ -1,15 +1,18 @@
 """Corners of a solved log for pictures: errors that stay in the refinement are those of its optimum."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 from refined_corners import two_cameras
+
 from gtsam_rwhec.fitting.corner_residuals import pixel_errors
 from gtsam_rwhec.fitting.reprojection_record import BoardShape
 from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
+from gtsam_rwhec.results.image_errors import SeenView, board_of
 from gtsam_rwhec.runs.plotted_corners import residuals_of
-from gtsam_rwhec.results.image_errors import SeenView
-from gtsam_rwhec.results.image_errors import board_of
+
 
 def views_of(sensor: str) -> list[SeenView]:
     given, _, refined = two_cameras()

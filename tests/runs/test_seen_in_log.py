@@ -1,26 +1,29 @@
 """What was seen in a log: its counts are the result's, its pictures come from the log, and only if they may."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import synthetic_logs as made
+
 from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.runs.seen_in_log import CLEANING
-from gtsam_rwhec.runs.seen_in_log import DETECTION
-from gtsam_rwhec.runs.seen_in_log import ROBUST
-from gtsam_rwhec.runs.seen_in_log import SHEET_BYTES
-from gtsam_rwhec.runs.seen_in_log import SHEET_WIDTH
-from gtsam_rwhec.runs.seen_in_log import Pictures
-from gtsam_rwhec.runs.seen_in_log import images_of
-from gtsam_rwhec.runs.seen_in_log import seen_in_log
-from gtsam_rwhec.runs.seen_in_log import small_sheet
-from gtsam_rwhec.runs.seen_in_log import stage_of
+from gtsam_rwhec.results.image_errors import CornerErrors, RatedView, SeenView
+from gtsam_rwhec.runs.seen_in_log import (
+    CLEANING,
+    DETECTION,
+    ROBUST,
+    SHEET_BYTES,
+    SHEET_WIDTH,
+    Pictures,
+    images_of,
+    seen_in_log,
+    small_sheet,
+    stage_of,
+)
 from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.results.image_errors import CornerErrors
-from gtsam_rwhec.results.image_errors import RatedView
-from gtsam_rwhec.results.image_errors import SeenView
 
 STAMP_NS = made.BEGIN_NS + 5
 
