@@ -24,18 +24,19 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import simulated_cells
 from bars import Row, benchmark_parser, print_rows
 from corner_peers import Found, evangelista, rp1
 from rwhec_factors import se3
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
-import simulated_cells
-
 import gtsam_rwhec as rw
+from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.methods import evangelista2023
 from gtsam_rwhec.methods.corner_costs import Corners
 from gtsam_rwhec.methods.reprojection import certified_start
-from gtsam_rwhec.vision.targets import Checkerboard
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
+
 
 NOISY = (1e-3, 5e-4)
 #: How far the starts are off, degrees and metres.

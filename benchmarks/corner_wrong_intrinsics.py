@@ -14,27 +14,32 @@ with the prior P and the posterior C would, without noise, show as m = (P - C) P
 """
 
 from __future__ import annotations
-
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row
+from bars import benchmark_parser
+from bars import print_rows
 from binomial import Share
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
 import placements
 import simulated_cells
-
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
 from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import PARTS, TOLD, free_model, parameters_of, prior_of
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.targets import Checkerboard
+from gtsam_rwhec.fitting.stated_intrinsics import PARTS
+from gtsam_rwhec.fitting.stated_intrinsics import TOLD
+from gtsam_rwhec.fitting.stated_intrinsics import free_model
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
+from gtsam_rwhec.fitting.stated_intrinsics import prior_of
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Checkerboard
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
+
 
 LEVEL, LEAST = 0.95, 0.93
 #: Beyond so many innovation deviations a contradiction must be flagged in this share of runs; falsely in so many.

@@ -13,7 +13,7 @@ from gallery_scene import Recording
 from rendered_prints import Array
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.cameras.camera import Camera
 
 
 def stations(rng: np.random.Generator) -> Recording:

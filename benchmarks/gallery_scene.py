@@ -19,8 +19,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from simulated_arms import ARM, BENT_RAD, moved_by, white
 
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.targets import Charuco
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Charuco
 
 IMAGES = 30
 #: The controller's poses: rad and m about and along each axis.

@@ -26,7 +26,7 @@ from typing import Any
 
 from bars import Row, print_rows
 
-from gtsam_rwhec.vision.many_images import FEW
+from gtsam_rwhec.detect.many_images import FEW
 
 DATA = Path(os.environ.get("GTSAM_RWHEC_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 RIG = """\
@@ -39,7 +39,7 @@ targets:
 #: The command with two files beside it: one gets a byte for each image that is decoded, the other what is told.
 COUNTING = """\
 import os, sys
-from gtsam_rwhec.vision import many_images
+from gtsam_rwhec.detect import many_images
 from gtsam_rwhec.cli import stage_display
 from gtsam_rwhec.cli.app import main
 

@@ -28,6 +28,7 @@ import numpy as np
 import zstandard
 from bars import Row, print_rows
 from interleaved import interleaved
+from log_files import POSE, TRANSFORM, header, ros2_log, xyz
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -35,15 +36,12 @@ from PIL import Image
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from vision_rate import CELL, the_log
 
+from gtsam_rwhec.detect.images import decode_gray, stated_size
+from gtsam_rwhec.detect.tags import dictionary, identified, quadrangles, tag_detector
 from gtsam_rwhec.logs import LogWriter, open_log, ros2_schemas
 from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.vision.codes import identified, quadrangles
-from gtsam_rwhec.vision.dictionaries import dictionary, tag_detector
-from gtsam_rwhec.vision.image_sizes import stated_size
-from gtsam_rwhec.vision.images import decode_gray
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "logs"))
-from log_files import POSE, TRANSFORM, header, ros2_log, xyz
 
 T0 = 1_700_000_000_000_000_000
 #: Damaged files of each format.
@@ -157,7 +155,7 @@ def decoding(folder: Path, count: int) -> list[Row]:
 
 
 def tags(most: int = 40) -> list[Row]:
-    """``vision/codes.py`` against OpenCV: all tags of the targets' families in images of the shipped log."""
+    """``detect/tags.py`` against OpenCV: all tags of the targets' families in images of the shipped log."""
     images, _ = the_log()
     grays = [decode_gray(image) for image in images[:most]]
     families = sorted({target.family for target in read_rig(CELL / "rig.yaml").target_list if target.ids})
@@ -214,7 +212,7 @@ def _identify(gray: np.ndarray, quad: np.ndarray, family: str) -> int:
 
 
 def sizes() -> list[Row]:
-    """``vision/image_sizes.py`` against Pillow and imagesize: damaged files, and TIFFs that state two widths."""
+    """``detect/images.py`` against Pillow and imagesize: damaged files, and TIFFs that state two widths."""
     Image.MAX_IMAGE_PIXELS = None
     gray = (60 + 6 * np.arange(24)[None] + 2 * np.arange(18)[:, None]).astype(np.uint8)
 

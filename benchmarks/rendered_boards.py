@@ -29,7 +29,7 @@ from rendered_kinds import KINDS, Kind, outline_of
 from rendered_prints import Array
 from rendered_scenes import BACKGROUNDS, Gray
 
-from gtsam_rwhec.vision.detection import Detection, Detector
+from gtsam_rwhec.detect.detector import Detection, Detector
 
 #: Shares of images: with something over the target, with shade over a part of it.
 COVERED, SHADED = 0.2, 0.5

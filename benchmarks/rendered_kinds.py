@@ -12,8 +12,17 @@ import rendered_prints as prints
 from rendered_prints import Array, Print
 from rendered_scenes import Gray
 
-from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
+from gtsam_rwhec.cameras.targets import (
+    AprilGrid,
+    Bundle,
+    BundleTag,
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    Tag,
+    TagGrid,
+    Target,
+)
 
 
 @dataclass(frozen=True)

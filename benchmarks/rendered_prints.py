@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gtsam_rwhec.vision.dictionaries import dictionary
-from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag
+from gtsam_rwhec.cameras.targets import AprilGrid, Bundle, Charuco, Checkerboard, CircleGrid, Tag, TagGrid
+from gtsam_rwhec.detect.tags import dictionary
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.float32]

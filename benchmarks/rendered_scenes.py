@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from rendered_prints import Array, Picture, Print
 
-from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.cameras.camera import Camera
 
 Gray = npt.NDArray[np.uint8]
 

@@ -22,12 +22,12 @@ from bars import Row, benchmark_parser, print_rows
 from interleaved import interleaved
 from loky import cpu_count
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.detect.many_images import detect_in_images
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.logs.records import ImageRecord, IntrinsicsRecord
 from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.many_images import detect_in_images
 
 CELL = Path(__file__).resolve().parents[1] / "data" / "cell"
 LEAST = 0.8

@@ -21,12 +21,12 @@ from bars import Row, benchmark_parser, print_rows
 from interleaved import in_words, interleaved
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.detect.many_images import detect_in_images
 from gtsam_rwhec.files.yaml_lines import read_yaml
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.many_images import detect_in_images
-from gtsam_rwhec.vision.targets import Checkerboard
 
 DATA = Path(os.environ.get("GTSAM_RWHEC_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 FOLDER = DATA / "workcell_camera2"

@@ -10,7 +10,7 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 
 rng = np.random.default_rng(3)
-board = rw.vision.Checkerboard("board", 9, 6, 0.025).corners()  # (54, 3), metres
+board = rw.cameras.Checkerboard("board", 9, 6, 0.025).corners()  # (54, 3), metres
 true = rw.Camera.of(1280, 960, "radtan", [[1012, 0, 652], [0, 1012, 473], [0, 0, 1]], [-0.1, 0.05, 0, 0], "true")
 stated = rw.Camera.of(1280, 960, "radtan", [[1000, 0, 640], [0, 1000, 480], [0, 0, 1]], [-0.1, 0.05, 0, 0], "stated")
 # T_base_board and T_hand_camera

@@ -19,11 +19,11 @@ from figures import BLUE, GREEN, GREY, ORANGE, VERMILLION, arguments_of, save
 from matplotlib.figure import Figure
 from mcap.reader import make_reader
 
+from gtsam_rwhec.detect.images import decode_gray
 from gtsam_rwhec.logs import ImageRecord, TfBuffer, open_log
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.runs.all_stages import calibrate_log
 from gtsam_rwhec.runs.log_metadata import read_cameras
-from gtsam_rwhec.vision.images import decode_gray
 
 CELL = Path(__file__).resolve().parents[1] / "data" / "cell"
 CAMERAS = ("cam_front", "cam_side")

@@ -7,7 +7,8 @@ from .problem import Prior as Prior
 from .problem import Problem as Problem
 from .problem import ScaleMode as ScaleMode
 from .problem import read_csv as read_csv
-from .vision import Camera as Camera
+from . import cameras as cameras
+from .cameras import Camera as Camera
 
 # Solve it, or certify somebody's answer.
 from .identifiability import FreeDirection as FreeDirection
@@ -75,7 +76,7 @@ from . import odometry as odometry
 from . import runs as runs
 from . import rig as rig
 from . import trajectories as trajectories
-from . import vision as vision
+from . import detect as detect
 from .runs import calibrate_log as calibrate_log
 
 # Other methods, other libraries' calls, and problems whose truth is known.

@@ -17,12 +17,12 @@ import numpy as np
 from places import CELL
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.detect.many_images import detect_in_images
 from gtsam_rwhec.errors import RwhecWarning
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, open_log
 from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.many_images import detect_in_images
 
 IMAGES = 6
 

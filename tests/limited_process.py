@@ -95,8 +95,8 @@ def _copy(path: str) -> Any:
 
 
 def _image(path: str, size: list[int] | None = None) -> Any:
+    from gtsam_rwhec.detect.images import decode_gray
     from gtsam_rwhec.logs.records import ImageRecord
-    from gtsam_rwhec.vision.images import decode_gray
 
     record = ImageRecord(0, 0, "/cam", "cam", "any", Path(path).read_bytes())
     gray = decode_gray(record, None if size is None else (size[0], size[1]))
@@ -144,12 +144,6 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
 def _serve() -> None:
     import rosbags.highlevel
     import rosbags.typesys  # noqa: F401
-
-    import gtsam_rwhec.logs.image_folder
-    import gtsam_rwhec.logs.mcap_writer
-    import gtsam_rwhec.logs.ros_bags
-    import gtsam_rwhec.logs.transforms
-    import gtsam_rwhec.vision.images  # noqa: F401
 
     for line in sys.stdin:
         how, path, options = json.loads(line)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from places import REPOSITORY
 
-from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.cameras.camera import Camera
 
 BENCHMARKS = REPOSITORY / "benchmarks"
 #: Their imports need what is only in the extra `bench`.

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from places import DATA
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, TfBuffer, open_log
 from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.vision.camera import Camera
 
 CELL = DATA / "cell"
 #: name of a log's rig file, of its truth, of its cameras' poses in it and of its targets'

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OutliersWarning, RwhecWarning, WeightsWarning
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.vision.camera import Camera
 
 #: The verdict says better what these warn of.
 SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)

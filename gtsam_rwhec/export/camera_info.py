@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.export.camera_words import comment, lacks, origin, plain_names, row
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
-from gtsam_rwhec.vision.camera import Camera
 
 #: sensor_msgs/distortion_models: the name of a model by our model and the number of coefficients up to which it goes.
 _MODELS = (

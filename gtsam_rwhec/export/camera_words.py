@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
-from gtsam_rwhec.vision.camera import Camera
 
 #: A remark in a file has at most this many characters.
 LONGEST_COMMENT = 2_000

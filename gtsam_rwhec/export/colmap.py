@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_files import PIXEL_CENTRE
 from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, sorted_out
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.colmap_cameras import PIXEL_CENTRE
 
 #: COLMAP's model by our model and the number of coefficients up to which it goes, which are then as many.
 _MODELS = (

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.export.camera_info import ros_lacks
 from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, plain_names, row, sorted_out
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
-from gtsam_rwhec.vision.camera import Camera
 
 #: OpenCV's own files begin so; without it OpenCV does not read them.
 FIRST_LINES = "%YAML:1.0\n---\n"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from rwhec_factors.se3 import inverse
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.camera import Camera
 
 #: Metres. The points that are tried have depths between these two.
 NEAR_M, FAR_M = 0.2, 20.0

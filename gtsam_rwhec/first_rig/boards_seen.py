@@ -17,15 +17,15 @@ from itertools import product
 import cv2
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid
+from gtsam_rwhec.detect.board_evidence import evidence
+from gtsam_rwhec.detect.checkerboards import find_checkerboard
+from gtsam_rwhec.detect.circle_grids import find_circle_grid
+from gtsam_rwhec.detect.images import Gray
+from gtsam_rwhec.detect.saddles import regions
 from gtsam_rwhec.first_rig.lattice import asymmetric_size, lattice_size
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_evidence import evidence
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.checkerboards import find_checkerboard
-from gtsam_rwhec.vision.circle_grids import find_circle_grid
-from gtsam_rwhec.vision.images import Gray
-from gtsam_rwhec.vision.saddles import regions
-from gtsam_rwhec.vision.targets import CORNERS, Checkerboard, CircleGrid
 
 #: The smallest board that is looked for, in corners or circles a side, and the largest.
 SMALLEST, LARGEST = 3, 30

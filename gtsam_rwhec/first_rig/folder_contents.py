@@ -15,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_files import read_cameras
+from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import CameraError, FileFormatError, ImageError, LogError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.whole_files import read_whole
@@ -24,9 +27,6 @@ from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE
 from gtsam_rwhec.logs.matched_images import image_stamps, match, pose_stamps
 from gtsam_rwhec.logs.pose_files import TABLES, TREES, read_poses
 from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.images import Gray, decode_gray
-from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
 #: Folders are looked at to this depth.
 DEPTH = 4

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.yaml_lines import KeyPath
@@ -28,9 +31,6 @@ from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 from gtsam_rwhec.trajectories.trajectory import Trajectory
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.targets import Target
 
 #: At most this number of images of each folder, spread over all, is searched for targets, and solved for roles.
 IMAGES = 16

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.first_rig.boards_seen import BoardSeen
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.unknown_intrinsics import estimated_intrinsics
 
 #: Beside intrinsics that were found: who calibrated the camera says so.
 STATED = "stated: calibration if this camera was calibrated, with this lens and focus"

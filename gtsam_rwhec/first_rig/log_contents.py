@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.detect.images import Gray, decode_gray
+from gtsam_rwhec.detect.tags import BY_TRUST, SeenTag, tags_in_image
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
 from gtsam_rwhec.logs.message_kinds import schema_word
 from gtsam_rwhec.rig.field_types import is_text
-from gtsam_rwhec.vision.images import Gray, decode_gray
-from gtsam_rwhec.vision.tag_survey import BY_TRUST, SeenTag, tags_in_image
 
 #: This number of images of each topic, taken evenly from all, is searched for tags.
 IMAGES = 12

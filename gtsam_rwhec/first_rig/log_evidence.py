@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Tag, Target, family_named
+from gtsam_rwhec.detect.detector import Detection, Detector
 from gtsam_rwhec.errors import CameraError, LogError, PoseError, StampError, TransformError
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, LogContents
 from gtsam_rwhec.first_rig.pose_origin import Origin, Rest, origin_of, rest_of
@@ -14,9 +17,6 @@ from gtsam_rwhec.first_rig.roles import RoleEvidence, Seen, evidence_of_roles
 from gtsam_rwhec.logs import Log, TfBuffer
 from gtsam_rwhec.rig.sections import PoseSource, Sensor
 from gtsam_rwhec.trajectories.trajectory import Trajectory
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detection import Detection, Detector
-from gtsam_rwhec.vision.targets import Tag, Target, family_named
 
 #: Seconds. Between poses further apart in time nothing is interpolated.
 MAX_GAP_S = 0.5

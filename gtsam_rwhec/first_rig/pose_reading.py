@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.first_rig.folder_contents import FolderPoses, ImageFolder, poses_read
 from gtsam_rwhec.first_rig.roles import RoleEvidence, Seen, evidence_of_roles
 from gtsam_rwhec.logs.pose_rows import PoseStatement
-from gtsam_rwhec.vision.detection import Detection
-from gtsam_rwhec.vision.targets import Target
 
 #: Conventions of three angles that arms' controllers and programs write, the commonest first.
 AXES = ("ZYX", "xyz", "XYZ", "rotation_vector", "ZYZ", "zyx")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.first_rig.boards_seen import boards_seen
@@ -26,7 +27,6 @@ from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
-from gtsam_rwhec.vision.unknown_intrinsics import CORNERS
 
 #: Written where a log has none, for a person to replace.
 _NO_INTRINSICS = Intrinsics(file="camera.yaml")

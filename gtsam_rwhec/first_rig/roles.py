@@ -20,14 +20,14 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.trial_fits import TrialFit, fitted
+from gtsam_rwhec.cameras.board_turns import choose_turns, turns_about_z
+from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target
+from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.vision.ambiguity import choose_over_time
-from gtsam_rwhec.vision.board_turns import choose_turns, turns_about_z
-from gtsam_rwhec.vision.detection import Detection
-from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target
 
 #: A sensor's target counts with at least this number of images.
 LEAST_IMAGES = 6

@@ -13,8 +13,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from gtsam_rwhec.detect.tags import SeenTag
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.tag_survey import SeenTag
 
 #: A ChArUco board is counted by squares, the others by tags.
 Kind = Literal["charuco", "aprilgrid", "tag_grid"]

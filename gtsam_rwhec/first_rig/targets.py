@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, family_named
+from gtsam_rwhec.detect.tags import SeenTag
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.first_rig.boards_seen import BoardSeen
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
@@ -21,8 +23,6 @@ from gtsam_rwhec.rig.target_sections import (
     TagTarget,
     TargetSection,
 )
-from gtsam_rwhec.vision.tag_survey import SeenTag
-from gtsam_rwhec.vision.targets import FAMILIES, Checkerboard, family_named
 
 #: Metres. A tag's side has this value in a first rig file, until a person measures it.
 TAG_M = 0.1

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.vision.camera import Camera
 
 #: The name of a board's size among its numbers: its covariance is that of the target's scale.
 SIZE = "size"

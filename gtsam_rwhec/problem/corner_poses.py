@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError, TargetError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.camera import Camera
 
 #: Corners do not belong to a board where they miss it by this share of its extent in the image, in half of the images.
 FARTHEST = 0.2
@@ -37,7 +37,7 @@ class Candidates:
 
     def by_carriers(self, A: Array) -> np.ndarray:
         """The candidates (N,) that agree with the carriers' poses A (N, 4, 4) over all images."""
-        from gtsam_rwhec.vision.ambiguity import choose_over_time
+        from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
 
         order = SECOND_NS * np.arange(len(A))  # neighbours are compared whatever time is between them: A is known
         return choose_over_time(order, self.T, self.squared_px, self.covariance, self.corner_px, A).which
@@ -58,7 +58,7 @@ def candidates_of(camera: Camera, board: Array, pixels: Array, corner_px: float,
     TargetError
         The corners do not belong to the board.
     """
-    from gtsam_rwhec.vision.pose import plane_poses
+    from gtsam_rwhec.cameras.target_poses import plane_poses
 
     known = np.asarray(np.isfinite(pixels).all(axis=2))
     found = plane_poses(

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError, CountError, NoiseError, TargetError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real, real_array
-from gtsam_rwhec.vision.camera import Camera
 
 #: Corners of an image, fewer of which determine no pose.
 FEWEST = 4
@@ -197,7 +197,7 @@ def _whole_board(board_points: Any, known: Array | None, where: str) -> Array:
         if known is None:
             raise TargetError(
                 f"{where}: corners without a model of the board; give board_points, (n, 3) in metres in the target's "
-                "frame, such as rw.vision.Checkerboard(...).corners()"
+                "frame, such as rw.cameras.Checkerboard(...).corners()"
             )
         return known
     points = _checked_board(_rows(board_points, 3, f"{where}: board_points"), where)

@@ -8,13 +8,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError, TargetError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
 from gtsam_rwhec.problem.corners import check_camera, check_corner_px, same_board
 from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, positive_weights
-from gtsam_rwhec.vision.camera import Camera
 
 ScaleMode = Literal["known", "shared", "per_target"]
 #: Scales below this are refused, as weights are: no target has them, and their squares overflow.

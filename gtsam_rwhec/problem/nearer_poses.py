@@ -8,12 +8,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.corner_poses import candidates_of
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.vision.camera import Camera
 
 #: Entries of two rotations that are one pose of an image.
 SAME_POSE = 1e-3

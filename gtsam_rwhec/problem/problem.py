@@ -8,6 +8,7 @@ from typing import Literal
 
 from numpy.typing import ArrayLike
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import PosesLike, QuaternionOrder, as_transforms
@@ -22,7 +23,6 @@ from gtsam_rwhec.problem.many_measurements import GivenMany
 from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements, Section
 from gtsam_rwhec.problem.moments import BLOCK, Moments
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.vision.camera import Camera
 
 
 class Problem(Contents):

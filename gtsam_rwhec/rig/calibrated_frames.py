@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 from rwhec_factors.se3 import inverse
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import FrameError, StampError
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.rig.field_types import NAME
-from gtsam_rwhec.vision.camera import Camera
 
 
 class CalibratedFrame(NamedTuple):

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target, print_of
+from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.errors import OptionError, TargetError
 from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
 from gtsam_rwhec.rig.odometry_section import OdometrySensor
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
-from gtsam_rwhec.vision.options import DetectionOptions
-from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target, print_of
 
 Fault = tuple[KeyPath, str]
 

@@ -10,8 +10,8 @@ from pydantic import AfterValidator, BeforeValidator, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema
 
+from gtsam_rwhec.cameras.targets import LARGEST_M
 from gtsam_rwhec.files.yaml_lines import shown
-from gtsam_rwhec.vision.targets import LARGEST_M
 
 #: A frame's name must match this pattern.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")

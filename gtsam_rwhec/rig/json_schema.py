@@ -12,8 +12,8 @@ from typing import Any
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
+from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.rig.rig import RigFile
-from gtsam_rwhec.vision.options import DetectionOptions
 
 #: Editors know this version of JSON Schema, all of them.
 DIALECT = "http://json-schema.org/draft-07/schema#"

@@ -8,6 +8,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from gtsam_rwhec.cameras.targets import FAMILIES
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.given_section import GivenDirection, GivenDistance, GivenGround, GivenSection
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
@@ -17,7 +18,6 @@ from gtsam_rwhec.rig.rig import RigFile
 from gtsam_rwhec.rig.section import keys_of
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Link, PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import BundleTagPlace, TargetSection
-from gtsam_rwhec.vision.targets import FAMILIES
 
 #: Before the tables.
 HEAD = """\

@@ -12,6 +12,8 @@ from pydantic import ConfigDict, Discriminator, Field, ValidationError, model_va
 from pydantic import Tag as UnionTag
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.files.yaml_lines import KeyPath, dotted
 from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Name
@@ -22,8 +24,6 @@ from gtsam_rwhec.rig.reference_carrier import with_what_follows
 from gtsam_rwhec.rig.section import Section
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
-from gtsam_rwhec.vision.options import DetectionOptions
-from gtsam_rwhec.vision.targets import Target
 
 #: Sensors that see targets have images or detections; others have odometry.
 AnySensor: TypeAlias = Annotated[

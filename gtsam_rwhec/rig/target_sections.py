@@ -6,10 +6,20 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 
+from gtsam_rwhec.cameras.targets import (
+    FAMILIES,
+    AprilGrid,
+    Bundle,
+    BundleTag,
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    Tag,
+    TagGrid,
+    Target,
+)
 from gtsam_rwhec.rig.field_types import InSchema, Length, Positive, list_of
 from gtsam_rwhec.rig.section import Section
-from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid
-from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 
 #: How many there are across and down, as the board is printed upright.
 Counts: TypeAlias = Annotated[tuple[int, int], list_of(2, "two whole numbers, [across, down]")]

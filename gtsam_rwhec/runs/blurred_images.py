@@ -10,13 +10,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.clues import motion_blur_px
+from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs import ImageRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.sensor_detections import SensorDetections
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.image_quality import motion_blur_px
-from gtsam_rwhec.vision.images import Gray, decode_gray
 
 #: So many images of a sensor, and this share of them, have no target that is used.
 FEWEST, UNREAD = 3, 0.15

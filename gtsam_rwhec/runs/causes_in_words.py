@@ -8,14 +8,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, CircleGrid, Tag, Target, is_same_print
+from gtsam_rwhec.detect.clues import About, edge_blur_px
+from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.logs import DetectionRecord
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.sensor_detections import SensorDetections
-from gtsam_rwhec.vision.clues import About
-from gtsam_rwhec.vision.image_quality import edge_blur_px
-from gtsam_rwhec.vision.images import Gray
-from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import FAMILIES, Checkerboard, CircleGrid, Tag, Target, is_same_print
 
 #: A reason for rejections is a cause if it is that of at least this share of a target's detections.
 MOSTLY = 0.3

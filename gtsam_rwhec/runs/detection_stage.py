@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -35,7 +36,6 @@ from gtsam_rwhec.runs.output_paths import check_is_not_read, check_writable
 from gtsam_rwhec.runs.seen_sheet import write_contact_sheet
 from gtsam_rwhec.runs.sensor_detections import detection_report
 from gtsam_rwhec.runs.topics_of_rig import check_topics
-from gtsam_rwhec.vision.camera import Camera
 
 
 @one_blas_thread()

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import cv2
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.images import decode_gray
+from gtsam_rwhec.detect.pictures import draw
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.progress import Counted, Progress, silent
@@ -18,9 +21,6 @@ from gtsam_rwhec.runs.image_options import check_drawable
 from gtsam_rwhec.runs.log_contract import detections_topic, records_of
 from gtsam_rwhec.runs.log_metadata import read_cameras, read_embedded_rig
 from gtsam_rwhec.runs.output_paths import made_folder
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.drawn_detections import draw
-from gtsam_rwhec.vision.images import decode_gray
 
 
 def draw_log(

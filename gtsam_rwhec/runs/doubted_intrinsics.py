@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_evidence import LEAST_CORNERS, IntrinsicsEvidence, View, evidence_of_intrinsics
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.seen_corners import seen_corners
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.intrinsics_evidence import LEAST_CORNERS, IntrinsicsEvidence, View, evidence_of_intrinsics
 
 #: Fitted numbers over the stated ones are a half or two within this share: of an image of another resolution.
 RESOLUTION_SHARE = 0.1

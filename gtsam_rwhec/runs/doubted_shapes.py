@@ -7,15 +7,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.shape_evidence import (
+    LEAST_IMAGES,
+    BoardView,
+    Key,
+    ShapeEvidence,
+    evidence_of_shape,
+    never_seen,
+)
+from gtsam_rwhec.cameras.targets import AprilGrid, Bundle, Charuco, TagGrid, Target
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.seen_corners import seen_corners
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.shape_evidence import BoardView, Key, ShapeEvidence, evidence_of_shape
-from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Target
-from gtsam_rwhec.vision.unseen_parts import LEAST_IMAGES, never_seen
 
 
 def doubted_shapes(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[Finding, ...]:

@@ -7,6 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.target_poses import plane_poses
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import CameraError, LogError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log
@@ -15,10 +19,6 @@ from gtsam_rwhec.runs.carrier_motion import check_order
 from gtsam_rwhec.runs.image_detections import message_count
 from gtsam_rwhec.runs.sensor_detections import SensorDetections
 from gtsam_rwhec.runs.tracks import target_of
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.pose import plane_poses
-from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import Target
 
 #: A driver's corners are assumed to have this standard deviation (pixels), which drivers do not state. If the noise is
 #: estimated, only the proportions between covariances count.

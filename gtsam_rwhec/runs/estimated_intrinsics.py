@@ -18,6 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS, ENOUGH, EstimatedIntrinsics, Lens, estimated_intrinsics
+from gtsam_rwhec.detect.board_layout import plane_coordinates
+from gtsam_rwhec.detect.detections import Detection, Rejection, layouts_over_track
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.detect.images import Size, stated_size
+from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images
 from gtsam_rwhec.errors import CameraError, LogError, LogWarning
 from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.geometry.poses import Array
@@ -27,15 +35,6 @@ from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.image_detections import check_usable, detections_of_sensor, message_count
 from gtsam_rwhec.runs.likely_causes import likely_causes
 from gtsam_rwhec.runs.seen_sheet import write_contact_sheet
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detected import Detection, layouts_over_track
-from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.image_sizes import Size, stated_size
-from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images
-from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.tag_agreement import plane_coordinates
-from gtsam_rwhec.vision.targets import Target
-from gtsam_rwhec.vision.unknown_intrinsics import CORNERS, ENOUGH, EstimatedIntrinsics, Lens, estimated_intrinsics
 
 #: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
 FIRST, TIMES = 16, 4

@@ -8,6 +8,13 @@ from functools import partial
 
 import numpy as np
 
+from gtsam_rwhec.cameras.board_turns import Turns, choose_turns, turn_between
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target
+from gtsam_rwhec.detect.detections import Rejection, layouts_over_track, turned_detection
+from gtsam_rwhec.detect.detector import Detection, Detector
+from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Counted, Progress, Remark
 from gtsam_rwhec.geometry.poses import Array
@@ -18,14 +25,6 @@ from gtsam_rwhec.runs.causes_in_words import of_size
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.log_contract import IMAGES_METADATA, detections_topic, image_key
 from gtsam_rwhec.runs.sensor_detections import LookedAt, SensorDetections
-from gtsam_rwhec.vision.ambiguity import choose_over_time
-from gtsam_rwhec.vision.board_turns import Turns, choose_turns, turn_between, turned_detection
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detected import layouts_over_track
-from gtsam_rwhec.vision.detection import Detection, Detector
-from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, measured_corner_px
-from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target
 
 #: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
 CHECKED_AFTER = (10, 100, 1000, 10_000)

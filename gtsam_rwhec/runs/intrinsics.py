@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_files import read_cameras
 from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogError
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
 #: Lens models without rays for more than this share of the image are warned of.
 FOLDED = 0.01

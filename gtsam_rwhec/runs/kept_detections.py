@@ -17,12 +17,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
+from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.atomic_write import appending_stream, write_atomically
 from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.vision.detected import Detection, ImageDetections
-from gtsam_rwhec.vision.many_images import DetectedImage
-from gtsam_rwhec.vision.rejection import Rejection
 
 #: The kinds of objects that a line has, by the names that it has for them.
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection)}

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.clues import About, Clue, clues
+from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.causes_in_words import nothing_explains, of_rejections, sentence
 from gtsam_rwhec.runs.sensor_detections import SensorDetections
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.clues import About, Clue, clues
-from gtsam_rwhec.vision.images import Gray, decode_gray
-from gtsam_rwhec.vision.targets import Target
 
 #: At most this number of images is looked at, of several targets at least `LEAST` for each; nothing more is tried after
 #: this number of seconds of the processor.

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
@@ -21,7 +22,6 @@ from gtsam_rwhec.runs.log_contract import (
     IMAGES_METADATA,
     RIG_METADATA,
 )
-from gtsam_rwhec.vision.camera import Camera
 
 Report = TypeVar("Report", bound=BaseModel)
 

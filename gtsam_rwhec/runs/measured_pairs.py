@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, LogWriter, PairRecord
@@ -17,7 +18,6 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.log_contract import pairs_topic, records_of
 from gtsam_rwhec.runs.tracks import Track
 from gtsam_rwhec.trajectories.trajectory import Trajectory
-from gtsam_rwhec.vision.rejection import Rejection
 
 #: Noise of a target's poses where nothing is known yet: 5 mm and half a degree. It is estimated from there.
 BEFORE_ESTIMATE = {"sigma": 0.005, "kappa": 1.0 / (2.0 * np.radians(0.5) ** 2)}

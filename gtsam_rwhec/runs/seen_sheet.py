@@ -10,15 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.contact_sheet import WIDTH, Band, Detail, Outcome, Outline, Tile, contact_sheet, detail_of
+from gtsam_rwhec.detect.images import Gray, decode_small
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.image_names import image_name, image_names
 from gtsam_rwhec.runs.sensor_detections import SensorDetections
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.contact_sheet import WIDTH, Band, Detail, Outcome, Outline, Tile, contact_sheet, detail_of
-from gtsam_rwhec.vision.images import Gray, decode_small
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4

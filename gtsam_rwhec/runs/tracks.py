@@ -10,6 +10,8 @@ from typing import Self
 
 import numpy as np
 
+from gtsam_rwhec.cameras.targets import Bundle, Tag, Target, is_same_print
+from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log
@@ -18,9 +20,6 @@ from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import check_order
 from gtsam_rwhec.runs.log_contract import detections_topic, records_of
-from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.tag_boards import Bundle
-from gtsam_rwhec.vision.targets import Tag, Target, is_same_print
 
 
 @dataclass(frozen=True, eq=False)

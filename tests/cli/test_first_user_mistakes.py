@@ -15,15 +15,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rendered
 from given_commands import command
 from places import REPOSITORY
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.vision.targets import Checkerboard, Tag
+from gtsam_rwhec.cameras.targets import Checkerboard, Tag
 
-sys.path[:0] = [str(REPOSITORY / "tests" / part) for part in ("vision", "runs")]
-import rendered  # noqa: E402
-import synthetic_logs as made  # noqa: E402
+sys.path.append(str(REPOSITORY / "tests" / "runs"))
+import synthetic_logs as made
 
 IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"

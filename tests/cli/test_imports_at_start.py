@@ -46,5 +46,5 @@ def test_solving_brings_in_no_images_and_no_files() -> None:
 
 
 def test_vision_brings_in_no_drawing_and_no_downloads() -> None:
-    code = "import gtsam_rwhec as rw\nrw.vision.Detector, rw.runs.calibrate_log"
+    code = "import gtsam_rwhec as rw\nrw.detect.Detector, rw.runs.calibrate_log"
     assert brought_in(code).isdisjoint({"matplotlib", "requests", "scipy.optimize"})

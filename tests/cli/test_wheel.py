@@ -16,7 +16,7 @@ import pytest
 from places import REPOSITORY
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.vision.intrinsics_files import read_cameras
+from gtsam_rwhec.cameras.intrinsics_files import read_cameras
 
 CELL = REPOSITORY / "data" / "cell"
 

@@ -1,4 +1,4 @@
-"""The calls with OpenCV's names beside OpenCV 4's own: OpenCV 5 lacks them (tests/vision/test_other_opencv.py)."""
+"""The calls with OpenCV's names beside OpenCV 4's own: OpenCV 5 lacks them (tests/detect/test_other_opencv.py)."""
 
 import cv2
 import numpy as np

@@ -9,8 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.vision.camera import Camera
 
 K = np.array([[421.5, 0.0, 318.25], [0.0, 420.75, 241.125], [0.0, 0.0, 1.0]])
 ANGLES = st.one_of(

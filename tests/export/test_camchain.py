@@ -9,9 +9,9 @@ import pytest
 import yaml
 from exported_rigs import ONE, camera, on_random_poses
 
+from gtsam_rwhec.cameras.intrinsics_files import read_kalibr_camchain
 from gtsam_rwhec.export import camchain_yaml
 from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.vision.intrinsics_files import read_kalibr_camchain
 
 
 @on_random_poses

@@ -19,12 +19,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from gtsam_rwhec.cameras.intrinsics_files import read_colmap_cameras
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.export import camchain_yaml, export_all, static_tf_launch, tf_yaml, urdf_xacro
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number, quaternion_xyzw
 from gtsam_rwhec.rig import CameraLink, RigFrames
 from gtsam_rwhec.rig.camera_link import link_of_optical
-from gtsam_rwhec.vision.colmap_cameras import read_colmap_cameras
 
 XACRO = {"xacro": "http://www.ros.org/wiki/xacro"}
 

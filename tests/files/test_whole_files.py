@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cameras.intrinsics_files import read_calibration_yaml, read_kalibr_camchain
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.whole_files import opened, read_whole
 from gtsam_rwhec.problem.csv_folder import read_pose_rows
-from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_kalibr_camchain
 
 
 def folder(path: Path) -> Path:

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from gtsam_rwhec.detect.tags import dictionary, tags_in_image
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.first_rig import propose_rig
 from gtsam_rwhec.first_rig.log_contents import ImageTopic, Tags
@@ -24,8 +25,6 @@ from gtsam_rwhec.first_rig.targets import targets_seen
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.rig import AprilGridTarget, CharucoTarget, Rig, parse_rig
 from gtsam_rwhec.rig.field_types import is_name
-from gtsam_rwhec.vision.dictionaries import dictionary
-from gtsam_rwhec.vision.tag_survey import tags_in_image
 
 STEP_NS = 100_000_000
 POSES = 12

@@ -10,10 +10,10 @@ import pytest
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
+from gtsam_rwhec.cameras.targets import Tag
+from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.first_rig.folder_contents import read_folder
 from gtsam_rwhec.first_rig.pose_reading import View, best_reading
-from gtsam_rwhec.vision.detection import Detection
-from gtsam_rwhec.vision.targets import Tag
 
 TAG = Tag("tag", "tag36h11", 0, 0.1)
 COUNT = 12

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rwhec_factors import se3
 
+from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid, Tag, Target
+from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.first_rig.roles import Seen, evidence_of_roles
-from gtsam_rwhec.vision.detection import Detection
-from gtsam_rwhec.vision.targets import CORNERS, Checkerboard, CircleGrid, Tag, Target
 
 TAG = Tag("tag", "tag36h11", 0, 0.1)
 

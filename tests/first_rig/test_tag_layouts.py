@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gtsam_rwhec.cameras import AprilGrid
+from gtsam_rwhec.cameras.targets import TagGrid
+from gtsam_rwhec.detect.tags import SeenTag
 from gtsam_rwhec.first_rig.tag_layouts import Kind, layout_of
-from gtsam_rwhec.vision import AprilGrid
-from gtsam_rwhec.vision.tag_survey import SeenTag
-from gtsam_rwhec.vision.targets import TagGrid
 
 KINDS: tuple[Kind, ...] = ("charuco", "tag_grid")
 SQUARE = 0.5 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])

@@ -10,8 +10,8 @@ import numpy as np
 from harness import Harness
 from mutations import numbers_in_bytes
 
+from gtsam_rwhec.detect import images
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision import images
 
 COMPRESSED = 0xFF
 RAW = images.RAW_ENCODINGS

@@ -10,7 +10,7 @@ from harness import Harness, scratch
 from intrinsics_samples import CAMCHAIN, OPENCV, ROS
 from mutations import words_and_lines
 
-from gtsam_rwhec.vision import camera, intrinsics_files
+from gtsam_rwhec.cameras import camera, intrinsics_files
 
 FOLDER = scratch()
 

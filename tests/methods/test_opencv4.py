@@ -1,4 +1,4 @@
-"""Shah and Li in closed form beside OpenCV 4: OpenCV 5 for Python lacks them (tests/vision/test_other_opencv.py)."""
+"""Shah and Li in closed form beside OpenCV 4: OpenCV 5 for Python lacks them (tests/detect/test_other_opencv.py)."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from gtsam_rwhec.solving.weights import contradicted_by
 
 Array = NDArray[np.float64]
 CAMERA = rw.Camera.of(1280, 960, "radtan", [[900, 0, 640], [0, 900, 480], [0, 0, 1]], [-0.1, 0.02, 0, 0], "test")
-BOARD = rw.vision.Checkerboard("board", 6, 4, 0.03).corners()
+BOARD = rw.cameras.Checkerboard("board", 6, 4, 0.03).corners()
 X = se3.expmap(np.array([[0.1, 0.2, -0.3, 0.05, 0.02, 0.1]]))[0]
 Y = se3.expmap(np.array([[-0.4, 0.1, 0.2, 0.3, -0.1, 0.2]]))[0]
 

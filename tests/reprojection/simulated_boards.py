@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from simulated_cells import BOARD, Cell, cell
 
-from gtsam_rwhec.vision.targets import Checkerboard
+from gtsam_rwhec.cameras.targets import Checkerboard
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,12 @@
 """What is doubtful is said in words, with the figure; and nothing where nothing is."""
 
 from __future__ import annotations
-
 from dataclasses import replace
-
 import numpy as np
 import pytest
-from simulated_cells import CAMERA, Cell, cell
-
+from simulated_cells import CAMERA
+from simulated_cells import Cell
+from simulated_cells import cell
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.corner_findings import findings_of
 from gtsam_rwhec.fitting.observations import Views
@@ -86,7 +85,7 @@ def test_a_calibration_that_is_contradicted_is_named_with_its_deviations() -> No
 
 @pytest.mark.parametrize("stated", ["nominal", "calibration"])
 def test_a_lens_that_was_left_out_is_named_with_the_terms_that_fit(good: Cell, stated: str) -> None:
-    pinhole = rw.vision.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
+    pinhole = rw.cameras.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
     without = replace(good.observations, cameras=dict.fromkeys(good.observations.cameras, pinhole))
     result = refined(replace(good, observations=without), replace(EXACT, stated=stated))
     lens = [words for words in result.findings if "have no distortion" in words]
@@ -102,7 +101,7 @@ def test_a_lens_that_was_left_out_is_named_with_the_terms_that_fit(good: Cell, s
 
 
 def test_a_lens_without_distortion_is_none(good: Cell) -> None:
-    bare = rw.vision.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
+    bare = rw.cameras.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
     given = cell(1, images=20, camera=bare)
     assert refined(given, EXACT).findings == ()
 

@@ -1,20 +1,23 @@
 """Refinement from corners: truth, noise, intrinsics that are off, outliers, words."""
 
 from __future__ import annotations
-
 from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rwhec_factors import se3
 from scipy.stats import chi2
-from simulated_cells import CAMERA, Cell, cell
-
+from simulated_cells import CAMERA
+from simulated_cells import Cell
+from simulated_cells import cell
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CameraError, FrameError, OptionError
-from gtsam_rwhec.fitting.stated_intrinsics import innovation_of, parameters_of, wider
+from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.fitting.stated_intrinsics import innovation_of
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
+from gtsam_rwhec.fitting.stated_intrinsics import wider
 
 Array = NDArray[np.float64]
 
@@ -98,7 +101,7 @@ def test_a_calibration_that_the_images_contradict_is_widened_and_said() -> None:
 
 def test_a_pinhole_that_nobody_calibrated_may_have_distortion() -> None:
     given = cell(6, images=30)
-    pinhole = rw.vision.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
+    pinhole = rw.cameras.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
     stated = replace(given.observations, cameras=dict.fromkeys(given.observations.cameras, pinhole))
     result = refined(replace(given, observations=stated), rw.CornerOptions(carrier_noise="exact"))
     assert pytest.approx(CAMERA.D, abs=0.02) == result.intrinsics["cam_0"].camera.D

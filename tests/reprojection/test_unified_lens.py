@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from simulated_cells import cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.cameras.camera import Camera
 
 #: 166 degrees from corner to corner.
 LENS = Camera.of(

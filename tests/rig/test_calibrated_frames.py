@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import FrameError, PoseError, StampError
 from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.vision.camera import Camera
 
 CAMERA = Camera.of(640, 480, "pinhole", [[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]], (), "test")
 

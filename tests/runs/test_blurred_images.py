@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import parse_rig
 from gtsam_rwhec.runs.blurred_images import blurred_images
 from gtsam_rwhec.runs.sensor_detections import LookedAt, SensorDetections
-from gtsam_rwhec.vision.camera import Camera
 
 RIG = parse_rig(
     """

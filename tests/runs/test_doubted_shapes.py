@@ -9,11 +9,11 @@ import pytest
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.rig import Rig, parse_rig
 from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.log_contract import detections_topic
-from gtsam_rwhec.vision.camera import Camera
 
 RIG = """\
 carriers: {{sensors: wrist, targets: base, poses: {{frames: [base, wrist]}}}}

@@ -14,6 +14,7 @@ from places import CELL
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.errors import CameraError, LogWarning
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import open_log
@@ -24,7 +25,6 @@ from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
 from gtsam_rwhec.runs.estimated_intrinsics import estimate_intrinsics
 from gtsam_rwhec.runs.folder_log import write_folder_log
 from gtsam_rwhec.runs.log_metadata import read_cameras, read_embedded_rig
-from gtsam_rwhec.vision.images import Gray
 
 UNKNOWN = CIRCLES.replace("{K: [550, 550, 320, 240], size: [640, 480]}", "estimate")
 BLANK = """\

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
+from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.logs import ImageRecord
 from gtsam_rwhec.runs.detection_inputs import differences
 from gtsam_rwhec.runs.kept_detections import KeptDetections, kept_inputs
-from gtsam_rwhec.vision.detected import Detection, ImageDetections
-from gtsam_rwhec.vision.many_images import DetectedImage
-from gtsam_rwhec.vision.rejection import Rejection
 
 INPUTS = {"file run.mcap": "12 bytes, changed at 5 ns"}
 

@@ -33,7 +33,7 @@ import os, signal, sys
 from pathlib import Path
 import gtsam_rwhec as rw
 from gtsam_rwhec.runs import all_stages, solution_plots
-from gtsam_rwhec.vision import many_images
+from gtsam_rwhec.detect import many_images
 
 folder, rig, out, *moments = sys.argv[1:]
 decode, give_name = many_images.decode_gray, os.replace

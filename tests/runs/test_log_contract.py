@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import synthetic_logs as made
 
+from gtsam_rwhec.cameras.targets import Tag
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.runs import log_contract
 from gtsam_rwhec.runs.tracks import target_of
-from gtsam_rwhec.vision.targets import Tag
 
 OF_DETECTION = {
     log_contract.detections_topic("rig/cam_0"),

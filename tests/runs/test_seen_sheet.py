@@ -10,6 +10,7 @@ import pytest
 import synthetic_logs as made
 from bad_logs import MOVING, WITH_IMAGES, images, picture
 
+from gtsam_rwhec.detect.contact_sheet import Outcome
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import DetectionRecord, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
@@ -17,7 +18,6 @@ from gtsam_rwhec.runs.detected_source import detect_source, sheet_beside
 from gtsam_rwhec.runs.image_names import image_name, picture_file
 from gtsam_rwhec.runs.log_contract import image_key
 from gtsam_rwhec.runs.seen_sheet import outcome_of, sample
-from gtsam_rwhec.vision.contact_sheet import Outcome
 
 FOUND, NOTHING = (Outcome.FOUND, "board"), (Outcome.NOTHING, "")
 SMALL, BLURRED = (Outcome.REJECTED, "board: small"), (Outcome.REJECTED, "board: blurred")

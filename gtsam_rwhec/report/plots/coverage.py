@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.plots.drawing import BLUE, picture, round_down, say, shortened
 from gtsam_rwhec.report.plots.plotted import PlottedCorners
-from gtsam_rwhec.vision.camera import Camera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.report.plots import PlottedCorners, PlottedIntrinsics, PlottedMeasurement
 from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.vision.camera import Camera
 
 TARGETS = ("tag_0", "tag_1", "tag_2", "tag_3", "board")
 REASONS = (

@@ -1,0 +1,17 @@
+from .camera import Camera as Camera
+from .intrinsics_files import read_calibration_yaml as read_calibration_yaml
+from .intrinsics_files import read_cameras as read_cameras
+from .intrinsics_files import read_kalibr_camchain as read_kalibr_camchain
+from .plane_ambiguity import Choice as Choice
+from .plane_ambiguity import choose_over_time as choose_over_time
+from .target_poses import PlanePoses as PlanePoses
+from .target_poses import plane_poses as plane_poses
+from .targets import AprilGrid as AprilGrid
+from .targets import Bundle as Bundle
+from .targets import BundleTag as BundleTag
+from .targets import Charuco as Charuco
+from .targets import Checkerboard as Checkerboard
+from .targets import CircleGrid as CircleGrid
+from .targets import Tag as Tag
+from .targets import TagGrid as TagGrid
+from .targets import Target as Target

@@ -1,0 +1,12 @@
+from .detections import Detection as Detection
+from .detections import DetectionOptions as DetectionOptions
+from .detections import ImageDetections as ImageDetections
+from .detections import Rejection as Rejection
+from .detector import Detector as Detector
+from .images import decode_gray as decode_gray
+from .many_images import DetectedImage as DetectedImage
+from .many_images import detect_in_images as detect_in_images
+from .tag_edges import RefinedCorners as RefinedCorners
+from .tag_edges import refine_corners as refine_corners
+from .tags import SeenTag as SeenTag
+from .tags import tags_in_image as tags_in_image

@@ -1,0 +1,381 @@
+"""Which tags of a board are where the board says: all of them must agree with one homography, or with one pose.
+
+A tag that was read wrongly, or a board that is not the stated one, is off by a tag's side and more. Errors of corners
+and of intrinsics are far smaller than that, so that `LARGEST_OFF` tells them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import AprilGrid, Bundle, Charuco, TagGrid, square
+from gtsam_rwhec.detect.tags import dictionary
+from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.geometry.poses import Array
+
+#: A tag's corners are off their places by at most this share of the tag's shorter side, or by `LEAST_PX`.
+LARGEST_OFF = 0.25
+LEAST_PX = 2.0
+#: Points are in one plane if they are nearer to it than this share of their extent.
+FLAT = 1e-4
+#: RANSAC for a pose tries this number of samples.
+SAMPLES = 200
+
+
+def agreeing(places: Array, flat: Array, off_px: Array | None = None) -> np.ndarray:
+    """Say which (m,) of a board's tags agree with the largest set of them that agrees. One tag agrees with itself.
+
+    Parameters
+    ----------
+    places : (m, 4, 3) array
+        The tags' corners in the board's frame, any unit.
+    flat : (m, 4, 2) array
+        Where they were seen, pixels of a camera without distortion, from its principal point; nan agrees with nothing.
+    off_px : (m,) array, optional
+        By how much a corner may be off; by default `LARGEST_OFF` of the tag's side.
+    """
+    seen = np.asarray(np.isfinite(flat).all(axis=(1, 2)))
+    if seen.sum() < 2:
+        return seen
+    largest = largest_off(flat) if off_px is None else off_px
+    in_plane = plane_coordinates(places)
+    agrees = np.zeros(len(places), dtype=bool)
+    if in_plane is not None:
+        agrees[seen] = _by_homography(in_plane[seen], flat[seen], largest[seen])
+    return agrees
+
+
+def largest_off(flat: Array) -> Array:
+    """By how much (m,) corners of tags (m, 4, 2) may be off, pixels: a share of the shorter side, area / longest."""
+    longest = np.linalg.norm(np.roll(flat, -1, axis=1) - flat, axis=2).max(axis=1)
+    first, second = flat[:, 2] - flat[:, 0], flat[:, 3] - flat[:, 1]
+    area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    return np.asarray(np.maximum(LARGEST_OFF * area / np.maximum(longest, 1e-9), LEAST_PX))
+
+
+def agreeing_in_space(places: Array, x: Array, off: Array) -> np.ndarray:
+    """Do as `agreeing` for tags of several planes, with x (m, 4, 2) and off (m,) in normalised coordinates."""
+    seen = np.asarray(np.isfinite(x).all(axis=(1, 2)))
+    agrees = np.zeros(len(places), dtype=bool)
+    if seen.sum() < 2:
+        return seen
+    points, pixels, largest = places[seen].reshape(-1, 3), x[seen].reshape(-1, 2), off[seen]
+    try:
+        found, turn, t, inliers = cv2.solvePnPRansac(
+            points[:, None], pixels[:, None], np.eye(3), None,
+            iterationsCount=SAMPLES, reprojectionError=float(np.median(largest)), flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+        if not found or inliers is None or len(inliers) < 6:
+            return agrees
+        good = np.ravel(inliers)
+        found, turn, t = cv2.solvePnP(
+            points[good][:, None], pixels[good][:, None], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:
+        return agrees  # degenerate samples only
+    predicted = cv2.projectPoints(points, turn, t, np.eye(3), None)[0].reshape(-1, 4, 2)
+    error = np.linalg.norm(predicted - pixels.reshape(-1, 4, 2), axis=2).max(axis=1)
+    agrees[seen] = (error <= largest) & bool(found)
+    return agrees
+
+
+def all_agree(plane: Array, flat: Array) -> bool:
+    """Whether all tags, in their plane (m, 4, 2) and seen at `flat` (m, 4, 2), agree with the least squares of all."""
+    H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), 0)
+    return bool(_near(np.asarray(H), plane, flat, largest_off(flat)).all())
+
+
+def spans_a_plane(plane: Array) -> bool:
+    """Whether the middles of tags (m, 4, 2) are not all on one line."""
+    if len(plane) < 3:
+        return False
+    off = plane.mean(axis=1) - plane.mean(axis=(0, 1))
+    return int(np.linalg.matrix_rank(off, tol=1e-6 * float(np.abs(plane).max()))) == 2
+
+
+def plane_coordinates(places: Array) -> Array | None:
+    """Coordinates (m, 4, 2) of corners (m, 4, 3) in their plane, with the side that is seen towards the viewer.
+
+    None where they are not in one plane.
+    """
+    points = places.reshape(-1, 3)
+    if not points[:, 2].any():
+        return places[..., :2]
+    middle = points.mean(axis=0)
+    _, extent, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if extent[2] > FLAT * extent[0]:
+        return None
+    across, down = places[0, 1] - places[0, 0], places[0, 2] - places[0, 1]
+    # A tag's normal is the cross product of its right and its up, the latter minus its third corner minus its second.
+    up = -down
+    sign = np.sign(np.linalg.det(np.stack([axes[0], axes[1], np.cross(across, up)])))
+    both = np.stack([axes[0], sign * axes[1]])
+    return np.asarray((places - middle) @ both.T)
+
+
+def _by_homography(plane: Array, flat: Array, largest: Array) -> np.ndarray:
+    """As `agreeing`, in the plane: RANSAC over the corners, then least squares over the tags that agree."""
+    everything = np.ones(len(plane), dtype=bool)
+    H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), 0)
+    agrees = _near(np.asarray(H), plane, flat, largest)
+    if agrees.all():
+        return everything
+    H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), cv2.RANSAC, float(np.median(largest)))
+    agrees = _near(np.asarray(H), plane, flat, largest)
+    for _ in range(2):
+        if agrees.sum() < 2:
+            break
+        H, _ = cv2.findHomography(plane[agrees].reshape(-1, 2), flat[agrees].reshape(-1, 2), 0)
+        again = _near(np.asarray(H), plane, flat, largest)
+        if again.sum() < agrees.sum():
+            break
+        agrees = again
+    return agrees
+
+
+def _near(H: Array, plane: Array, flat: Array, largest: Array) -> np.ndarray:
+    if H.dtype == object or not np.isfinite(H).all():
+        return np.zeros(len(plane), dtype=bool)
+    predicted = cv2.perspectiveTransform(plane.reshape(-1, 1, 2), H).reshape(flat.shape)
+    return np.asarray(np.linalg.norm(predicted - flat, axis=2).max(axis=1) <= largest)
+
+
+#: Fewer tags fit too many layouts.
+LEAST_TAGS = 3
+#: Boards with up to this number of columns are tried.
+MOST_COLUMNS = 30
+#: Orders of ids on a grid: whether they run from the left, from the top, and along rows first.
+ORDERS = [(left, top, along) for along in (True, False) for top in (True, False) for left in (True, False)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Where tags would be, (m, 4, 2) in any unit, and what the rig file would say."""
+
+    plane: Array
+    cure: str
+
+
+def layout_that_fits(board: Charuco | AprilGrid | TagGrid, ids: np.ndarray, flat: Array) -> str:
+    """What to write in the rig file so that all tags `ids` (m,), seen at `flat` (m, 4, 2), are where the board says.
+
+    Empty where nothing that is tried fits, and where fewer than three tags, or tags of one row, were seen.
+    """
+    if len(np.unique(ids)) < max(LEAST_TAGS, len(ids)) or not np.isfinite(flat).all():
+        return ""
+    for layout in _charucos(board, ids) if isinstance(board, Charuco) else _grids(board, ids):
+        turns = range(4) if isinstance(board, AprilGrid) else (0,)
+        if spans_a_plane(layout.plane) and any(all_agree(layout.plane, np.roll(flat, t, axis=1)) for t in turns):
+            return layout.cure
+    return ""
+
+
+def _charucos(board: Charuco, ids: np.ndarray) -> Iterator[_Layout]:
+    tried = [(replace_sizes(board, board.rows, board.columns), f"write squares: [{board.rows}, {board.columns}]")]
+    count = board.columns * board.rows // 2
+    for shift in range(-int(ids.min()), count):
+        if shift and board.first_id + shift <= ids.min() and ids.max() < board.first_id + shift + count:
+            tried.append((_shifted(board, shift), f"write first_id: {board.first_id + shift}"))
+    for columns in range(2, MOST_COLUMNS):
+        rows = int(np.ceil(2 * (ids.max() - board.first_id + 1) / columns))
+        whole = board.columns * board.rows // columns
+        words = (
+            f"count the squares: the markers fit {columns} columns, as in squares: [{columns}, {max(rows, whole, 2)}]"
+        )
+        tried.append((replace_sizes(board, columns, max(rows, whole, 2)), words))
+    for candidate, words in tried:
+        if candidate is None:
+            continue
+        for is_legacy in (False, True):
+            cells = _markers(candidate, is_legacy)
+            rows_of = ids - candidate.first_id
+            if rows_of.min() >= 0 and rows_of.max() < len(cells):
+                yield _Layout(_tags(cells[rows_of], candidate.square_m, candidate.marker_m), words)
+
+
+def replace_sizes(board: Charuco, columns: int, rows: int) -> Charuco | None:
+    """The board with other numbers of squares; None if its family has too few markers."""
+    try:
+        return replace(board, columns=columns, rows=rows)
+    except TargetError:
+        return None
+
+
+def _shifted(board: Charuco, shift: int) -> Charuco | None:
+    try:
+        return replace(board, first_id=board.first_id + shift)
+    except TargetError:
+        return None
+
+
+def _markers(board: Charuco, is_legacy: bool) -> Array:
+    """Columns and rows (n, 2) of a board's markers, by OpenCV's two patterns."""
+    rows, columns = np.indices((board.rows, board.columns))
+    odd = is_legacy and board.rows % 2 == 0
+    white = (rows + columns) % 2 == (0 if odd else 1)
+    return np.stack([columns[white], rows[white]], axis=1).astype(float)
+
+
+def _grids(board: AprilGrid | TagGrid, ids: np.ndarray) -> Iterator[_Layout]:
+    """Grids with other sizes, other first ids and other orders of ids."""
+    is_kalibrs = isinstance(board, AprilGrid)
+    gap = board.spacing * board.tag_m if isinstance(board, AprilGrid) else board.gap_m
+    first, usual = min(board.ids), (True, not is_kalibrs, True)
+    sizes = [(board.columns, board.rows), (board.rows, board.columns)]
+    count = board.columns * board.rows
+    shifts = [s for s in range(-count, count + 1) if s and first + s >= 0]
+    tried = [(size, 0, order) for order in sorted(ORDERS, key=lambda o: o != usual) for size in sizes]
+    tried += [(sizes[0], shift, usual) for shift in sorted(shifts, key=abs)]
+    tried += [((columns, 0), 0, usual) for columns in range(2, MOST_COLUMNS)]
+    for (columns, rows), shift, order in tried:
+        k = ids - first - shift
+        needed = int(k.max()) // columns + 1
+        if k.min() < 0 or (rows and k.max() >= columns * rows):
+            continue
+        cells = _cells(k, columns, rows or needed, order)
+        if order == usual and not rows:
+            size = [columns, max(needed, count // columns)]
+            cure = f"count the tags: the ids fit {columns} columns, as in tags: {size}"
+        elif order == usual:
+            cure = f"write first_id: {first + shift}" if shift else f"write tags: [{columns}, {rows}]"
+        else:
+            listed = _listed(columns, rows, order, first)
+            tags = f"tags: [{columns}, {rows}], ids: [{', '.join(map(str, listed))}]"
+            as_grid = f"type: tag_grid, tag_m: {board.tag_m:g}, gap_m: {gap:g}, "
+            cure = f"write {as_grid if is_kalibrs else ''}{tags}"
+        yield _Layout(_tags(cells, board.tag_m + gap, board.tag_m), cure)
+
+
+def _cells(k: np.ndarray, columns: int, rows: int, order: tuple[bool, bool, bool]) -> Array:
+    """Columns and rows from the top (m, 2) of the k-th tags (m,)."""
+    from_left, from_top, along_rows = order
+    column, row = (k % columns, k // columns) if along_rows else (k // rows, k % rows)
+    return np.stack(
+        [column if from_left else columns - 1 - column, row if from_top else rows - 1 - row], axis=1
+    ).astype(float)
+
+
+def _listed(columns: int, rows: int, order: tuple[bool, bool, bool], first: int) -> list[int]:
+    """All ids, left to right, from the top."""
+    cells = _cells(np.arange(columns * rows), columns, rows, order).astype(int)
+    found = np.zeros((rows, columns), dtype=int)
+    found[cells[:, 1], cells[:, 0]] = first + np.arange(columns * rows)
+    return [int(i) for i in found.ravel()]
+
+
+def _tags(cells: Array, step_m: float, side_m: float) -> Array:
+    """Corners (m, 4, 2) of tags in the middles of cells (m, 2), y up."""
+    middles = step_m * cells * [1.0, -1.0]
+    return np.asarray(middles[:, None] + square(side_m)[:, :2])
+
+
+#: Boards whose corners come from several tags.
+TagBoard: TypeAlias = Charuco | AprilGrid | TagGrid | Bundle
+#: At most this share of a board's tags, or one of three and more, may be elsewhere: they do not count. Where more are,
+#: the board is another.
+MOST_ELSEWHERE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class BoardTags:
+    """Tags of a board in an image.
+
+    Attributes
+    ----------
+    ids : (m,) integers
+    corners_px : (m, 4, 2) array
+        In the order of the board's own corners, right to about a pixel.
+    contradicted : bool
+        The tags are not where the board says: none may be used.
+    note : str
+        What the rig file would have to say instead, as far as it is known.
+    is_legacy : bool
+        Whether a ChArUco board has the pattern of OpenCV before 4.6.
+    """
+
+    ids: np.ndarray
+    corners_px: Array
+    contradicted: bool = False
+    note: str = ""
+    is_legacy: bool = False
+
+
+@cache
+def charuco_board(board: Charuco, is_legacy: bool = False) -> cv2.aruco.CharucoBoard:
+    """OpenCV's board. Boards with an even number of rows were printed with another phase before OpenCV 4.6."""
+    made = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows),
+        board.square_m,
+        board.marker_m,
+        dictionary(board.family),
+        np.array(board.ids, dtype=np.int32),
+    )
+    made.setLegacyPattern(is_legacy)
+    return made
+
+
+@cache
+def tag_places(board: TagBoard, is_legacy: bool = False) -> Array:
+    """Corners (n, 4, 3) of a board's tags in its frame, in the order of its ids, metres."""
+    if isinstance(board, Charuco):
+        # OpenCV's origin is the outer corner at the top left, y is down.
+        places = np.array(charuco_board(board, is_legacy).getObjPoints(), dtype=float).reshape(-1, 4, 3)
+        outer = 0.5 * board.square_m * np.array([-board.columns, board.rows, 0.0])
+        return np.asarray(places * [1.0, -1.0, 0.0] + outer)
+    return board.corners().reshape(-1, 4, 3)
+
+
+def tags_of_board(board: TagBoard, ids: np.ndarray, corners_px: Array, camera: Camera) -> BoardTags:
+    """Test tags (m,) of a board, seen at (m, 4, 2); the returned ones agree, unless the board is contradicted."""
+    x = camera.undistort(corners_px)
+    focal = camera.focal_px
+    number = {i: k for k, i in enumerate(board.ids)}
+    of_board = np.array([number[int(i)] for i in ids], dtype=int)
+    is_legacy = False
+    if isinstance(board, AprilGrid):
+        turn = _quarter_turns(tag_places(board)[of_board], x * focal)
+        corners_px, x = np.roll(corners_px, turn, axis=1), np.roll(x, turn, axis=1)
+    agrees = _agrees(board, of_board, x, focal, False)
+    if isinstance(board, Charuco) and board.rows % 2 == 0 and not agrees.all():
+        as_before = _agrees(board, of_board, x, focal, True)
+        if as_before.sum() > agrees.sum():
+            agrees, is_legacy = as_before, True
+    if not agrees.all():
+        # Tags of one row agree in another layout too.
+        elsewhere = len(agrees) - int(agrees.sum())
+        note = "" if isinstance(board, Bundle) else layout_that_fits(board, ids, x * focal)
+        few = not (isinstance(board, Bundle) or spans_a_plane(tag_places(board, is_legacy)[of_board[agrees], :, :2]))
+        if note or few or agrees.sum() < 2 or elsewhere > max(1.0, MOST_ELSEWHERE * len(agrees)):
+            return BoardTags(ids, corners_px, True, note)
+    once = np.array([np.sum(ids[agrees] == i) == 1 for i in ids], dtype=bool)
+    kept = agrees & once
+    return BoardTags(ids[kept], corners_px[kept], is_legacy=is_legacy)
+
+
+def _agrees(board: TagBoard, of_board: np.ndarray, x: Array, focal: float, is_legacy: bool) -> np.ndarray:
+    places = tag_places(board, is_legacy)[of_board]
+    if isinstance(board, Bundle) and len(places) > 1 and plane_coordinates(places) is None:
+        return agreeing_in_space(places, x, largest_off(x * focal) / focal)
+    return agreeing(places, x * focal)
+
+
+def _quarter_turns(places: Array, flat: Array) -> int:
+    """By how many corners the tags of a grid are turned in their places: generators print them differently."""
+    if not np.isfinite(flat).all():
+        return 0
+    errors = []
+    for turn in range(4):
+        turned = np.roll(flat, turn, axis=1)
+        H, _ = cv2.findHomography(places[..., :2].reshape(-1, 2), turned.reshape(-1, 2), 0)
+        if H is None:
+            return 0
+        predicted = cv2.perspectiveTransform(places[..., :2].reshape(-1, 1, 2), H).reshape(flat.shape)
+        errors.append(float(np.median(np.linalg.norm(predicted - turned, axis=2).max(axis=1))))
+    return int(np.argmin(errors))

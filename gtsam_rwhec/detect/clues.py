@@ -1,0 +1,366 @@
+"""How sharp and how bright an image is, and the same image made brighter, smaller or larger, with its camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import cv2
+import numpy as np
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import CORNERS, AprilGrid, Checkerboard, CircleGrid, Tag, Target, is_same_print
+from gtsam_rwhec.detect.board_corners import refined_corners
+from gtsam_rwhec.detect.board_evidence import evidence, smallest_step
+from gtsam_rwhec.detect.checkerboards import OF_SQUARE
+from gtsam_rwhec.detect.detections import DetectionOptions
+from gtsam_rwhec.detect.detector import Detection, Detector
+from gtsam_rwhec.detect.images import Gray
+from gtsam_rwhec.detect.saddles import regions
+from gtsam_rwhec.detect.tags import BY_TRUST, DOUBLE, identified, quadrangles, tags_in_image, unlike
+from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.geometry.poses import Array
+
+#: Gray values from which a pixel is saturated.
+SATURATED = 253
+#: An image is smoothed by the first standard deviation (pixels) against its noise, and blurred by the second, to see
+#: how much that changes its edges; with the second pair where they are wider than `WIDE_PX`.
+AGAIN_PX, WIDE_PX = ((0.7, 1.5), (2.0, 4.0)), 1.8
+#: The strongest edges that are looked at, as a share of the pixels, and their gradient at least (gray values a pixel).
+EDGES, LEAST_GRADIENT = 0.003, 2.0
+#: Edges are looked at by this number of directions, each where it has this number of them.
+DIRECTIONS, FEWEST_EDGES = 8, 40
+#: A brightened image goes from black to white between these percentiles of its gray values.
+DARKEST, BRIGHTEST = 0.5, 99.7
+
+
+def edge_blur_px(gray: Gray) -> float:
+    """The standard deviation of the blur across an image's strongest edges, pixels; nan without any.
+
+    Of a step that is blurred by s, a blur by s0 more lowers the gradient in its middle by R = sqrt(1 + s0^2 / s^2)
+    (Zhuo and Sim 2011, equation 5). Wide edges are measured again with a larger s0, which noise disturbs less.
+    """
+    blur_px = _edge_blur_px(gray, *AGAIN_PX[0])
+    return _edge_blur_px(gray, *AGAIN_PX[1]) if blur_px > WIDE_PX else blur_px
+
+
+def motion_blur_px(gray: Gray) -> tuple[float, float]:
+    """The blur of edges by their direction, where it is widest and where it is narrowest (pixels); nan without both.
+
+    The standard deviation as in `edge_blur_px`, of edges by their direction: what moves blurs the edges across its way,
+    and leaves those along it sharp. A lens that is out of focus blurs all alike.
+    """
+    smooth = cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), AGAIN_PX[0][0])
+    again = cv2.GaussianBlur(smooth, (0, 0), AGAIN_PX[0][1])
+    x, y = _slopes(np.asarray(smooth))
+    first, second = np.asarray(cv2.magnitude(x, y)), _gradient(np.asarray(again))
+    peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
+    direction = np.rint(np.arctan2(y, x) % np.pi / np.pi * DIRECTIONS).astype(int) % DIRECTIONS
+    found = []
+    for number in range(DIRECTIONS):
+        of_these = peak & (direction == number)
+        if of_these.sum() < FEWEST_EDGES:
+            continue
+        some = of_these & (first >= np.median(first[of_these]))
+        ratio = max(float(np.median(first[some] / np.maximum(second[some], 1e-6))), 1.01)
+        found.append(float(np.sqrt(max(AGAIN_PX[0][1] ** 2 / (ratio**2 - 1.0) - AGAIN_PX[0][0] ** 2, 0.0))))
+    return (max(found), min(found)) if len(found) > 1 else (float("nan"), float("nan"))
+
+
+def _edge_blur_px(gray: Gray, first_px: float, again_px: float) -> float:
+    smooth = cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), first_px)
+    again = cv2.GaussianBlur(smooth, (0, 0), again_px)
+    first, second = (_gradient(np.asarray(values, dtype=np.float32)) for values in (smooth, again))
+    peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
+    strong = np.sort(first[peak])[-max(20, round(EDGES * gray.size)) :]
+    if len(strong) < 20:
+        return float("nan")
+    some = peak & (first >= strong[0])
+    ratio = max(float(np.median(first[some] / np.maximum(second[some], 1e-6))), 1.01)
+    # What the gradients were first smoothed by is taken off again.
+    return float(np.sqrt(max(again_px**2 / (ratio**2 - 1.0) - first_px**2, 0.0)))
+
+
+def saturated_share(gray: Gray) -> float:
+    """The share of the pixels that are saturated."""
+    return float((gray >= SATURATED).mean())
+
+
+def brightest_value(gray: Gray) -> float:
+    """The gray value that 99.7 % of the pixels are below."""
+    return float(np.percentile(gray[::2, ::2], BRIGHTEST))
+
+
+def brightened(gray: Gray) -> Gray:
+    """The image with its gray values stretched from black to white, after a little blur against its noise."""
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
+    low, high = np.percentile(smooth[::2, ::2], (DARKEST, BRIGHTEST))
+    light: Gray = np.clip(np.rint(255.0 * (smooth - low) / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+    return light
+
+
+def folded(gray: Gray, level: float) -> Gray:
+    """How far gray values are from a level, eight times as far: what is darker and what is lighter become light.
+
+    A black square on ground that is nearly as dark gets a light margin where the level is the square's own.
+    """
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
+    apart: Gray = np.clip(8.0 * np.abs(smooth - level), 0.0, 255.0).astype(np.uint8)
+    return apart
+
+
+def resized(gray: Gray, camera: Camera, scale: float) -> tuple[Gray, Camera]:
+    """An image of another number of pixels, and its camera."""
+    height, width = (max(1, round(scale * n)) for n in gray.shape)
+    way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    K = camera.K.copy()
+    for row, factor in enumerate((width / camera.width, height / camera.height)):  # pixel centres are at whole numbers
+        K[row, :2] *= factor
+        K[row, 2] = factor * (K[row, 2] + 0.5) - 0.5
+    smaller = np.asarray(cv2.resize(gray, (width, height), interpolation=way), dtype=np.uint8)
+    return smaller, replace(camera, width=width, height=height, K=K)
+
+
+def _gradient(values: Array) -> Array:
+    return np.asarray(cv2.magnitude(*_slopes(values)))
+
+
+def _slopes(values: Array) -> tuple[Array, Array]:
+    x, y = (cv2.Sobel(values, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1)))
+    return np.asarray(x), np.asarray(y)
+
+
+#: A checkerboard of any size is looked for in regions with at least this number of saddles.
+LEAST_SADDLES = 9
+#: Regions that are searched, and the pixels of one: larger ones are made smaller first.
+MOST_REGIONS, MOST_PIXELS = 2, 400_000
+#: Percentiles of gray values that may be a tag's black.
+LEVELS = (2.0, 8.0, 20.0, 40.0, 60.0)
+#: An image of which this share is saturated is overexposed.
+TOO_BRIGHT = 0.25
+#: An image is made smaller by these factors to see whether blur is what hides a target, and larger by these.
+SMALLER, LARGER = (0.5, 0.25), (2.0, 3.0)
+#: An enlarged image has at most this number of pixels.
+LARGEST_ENLARGED = 9_000_000
+#: The brightest pixels of an image that may be too dark are below this gray value.
+TOO_DARK = 128.0
+#: Edges that are no wider than this (standard deviation, pixels) are sharp.
+SHARP_PX = 1.5
+
+
+class About(Enum):
+    """What a clue is about. The value says what its `Clue.value` is."""
+
+    COUNTS = "the board's counts, (across, down)"
+    DOT = "where the larger dot is, a word of `CORNERS` or empty for none"
+    FAMILY = "the tags' family"
+    ID = "the tag's id"
+    BORDER = "the modules of the tags' black border"
+    MARGIN = "nothing: the ground beside the black square is as dark"
+    SMALL = "nothing; the figure is the length of its shortest side, pixels"
+    BLURRED = "nothing; the figure is the edges' blur, pixels"
+    DARK = "nothing; the figure is the gray value of the brightest pixels"
+    BRIGHT = "nothing; the figure is the saturated share"
+
+
+@dataclass(frozen=True)
+class Clue:
+    """One thing that an image says about a target that was not read."""
+
+    about: About
+    value: tuple[int, int] | str | int | None = None
+    figure: float = float("nan")
+
+
+def clues(
+    gray: Gray, target: Target, camera: Camera, options: DetectionOptions, is_late: Callable[[], bool] = lambda: False
+) -> list[Clue]:
+    """What an image says about a target that was not read in it: clues of one kind, the surest.
+
+    Another target is surer than what is wrong with the image. Nothing more is tried when `is_late` says so.
+    """
+    tries: list[Callable[[], Iterator[Clue]]] = [
+        lambda: _another_target(gray, target, camera, options),
+        lambda: _too_small(gray, target, camera, options),
+        lambda: _too_dark(gray, target, camera, options),
+        lambda: _blurred(gray, target, camera, options),
+        lambda: _no_margin(gray, target),
+        lambda: _too_bright(gray),
+    ]
+    for attempt in tries:
+        if is_late():
+            break
+        found = list(attempt())
+        if found:
+            return found
+    return []
+
+
+def _another_target(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
+    if isinstance(target, Checkerboard):
+        return _other_board(gray, target, camera)
+    if isinstance(target, CircleGrid):
+        return _other_grid(gray, target, camera, options)
+    return _other_tags(gray, target)
+
+
+def _too_small(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
+    for scale in LARGER:
+        if gray.size * scale**2 <= LARGEST_ENLARGED:
+            seen = read(*resized(gray, camera, scale), target, options)
+            if seen is not None:
+                yield Clue(About.SMALL, figure=seen.side_px / scale)
+                return
+
+
+def _too_dark(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
+    value = brightest_value(gray)
+    if value < TOO_DARK and read(brightened(gray), camera, target, options) is not None:
+        yield Clue(About.DARK, figure=value)
+
+
+def _blurred(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
+    blur_px = edge_blur_px(gray)
+    if blur_px > SHARP_PX:
+        light = brightened(gray)
+        if any(read(*resized(light, camera, scale), target, options) is not None for scale in SMALLER):
+            yield Clue(About.BLURRED, figure=blur_px)
+
+
+def _no_margin(gray: Gray, target: Target) -> Iterator[Clue]:
+    """A tag of the target is read once what is as dark as its black is told from it."""
+    border = 2 if isinstance(target, AprilGrid) else 1
+    for level in np.percentile(gray[::2, ::2], LEVELS) if target.ids else ():
+        apart = folded(gray, float(level))
+        ids = identified(apart, unlike(quadrangles(apart), np.zeros((0, 4, 2))), target.family, border)
+        if set(ids.tolist()) & set(target.ids):
+            yield Clue(About.MARGIN)
+            return
+
+
+def _too_bright(gray: Gray) -> Iterator[Clue]:
+    if saturated_share(gray) >= TOO_BRIGHT:
+        yield Clue(About.BRIGHT, figure=saturated_share(gray))
+
+
+def read(gray: Gray, camera: Camera, target: Target, options: DetectionOptions) -> Detection | None:
+    """A target as it is read, and not rejected."""
+    (seen,) = Detector(camera, [target], options)([gray])
+    return next((detection for detection in seen.detections if detection.rejection is None), None)
+
+
+def _other_board(gray: Gray, board: Checkerboard, camera: Camera) -> Iterator[Clue]:
+    """The counts of the checkerboard that is in the image, in the order of the one that was looked for.
+
+    OpenCV's sector-based detector may find a board of any size, but its size is often one off; the classic detector is
+    asked for sizes about it and about the stated one, and what it finds is tested as every board is.
+    """
+    stated = (min(board.columns, board.rows), max(board.columns, board.rows))
+    for level in (1, 2):
+        for region in regions(gray, LEAST_SADDLES, level)[:MOST_REGIONS]:
+            part, of_part = _cut_out(gray, camera, region)
+            likely = [*_any_size(part), *_neighbours(stated)]
+            for size in dict.fromkeys([*likely, *(other for found in likely[:1] for other in _neighbours(found))]):
+                if size != stated and _is_board(part, size, of_part):
+                    yield Clue(About.COUNTS, size if board.columns <= board.rows else size[::-1])
+                    return
+
+
+def _cut_out(gray: Gray, camera: Camera, region: tuple[slice, slice]) -> tuple[Gray, Camera]:
+    """A region of an image, made smaller where it is large, and its camera."""
+    part = np.ascontiguousarray(gray[region])
+    K = camera.K.copy()
+    K[:2, 2] -= region[1].start, region[0].start
+    of_part = replace(camera, width=part.shape[1], height=part.shape[0], K=K)
+    scale = float(np.sqrt(min(MOST_PIXELS / part.size, 1.0)))
+    return resized(part, of_part, scale) if scale < 1.0 else (part, of_part)
+
+
+def _any_size(part: Gray) -> list[tuple[int, int]]:
+    """The counts, the smaller first, of the board that OpenCV finds when it may find any size."""
+    is_found, _, meta = cv2.findChessboardCornersSBWithMeta(part, (3, 3), cv2.CALIB_CB_LARGER)
+    if not is_found or meta is None or min(meta.shape[:2]) < 3:
+        return []
+    return [(min(meta.shape[:2]), max(meta.shape[:2]))]
+
+
+def _neighbours(size: tuple[int, int]) -> list[tuple[int, int]]:
+    """Sizes about one, the smaller count first: one less of both is where squares were counted."""
+    a, b = size
+    steps = [(-1, -1), (1, 1), (0, 0), (-1, 0), (0, -1), (1, 0), (0, 1), (-1, 1), (1, -1)]
+    sizes = [(min(a + i, b + j), max(a + i, b + j)) for i, j in steps]
+    return [(low, high) for low, high in sizes if low >= 3]
+
+
+def _is_board(part: Gray, size: tuple[int, int], camera: Camera) -> bool:
+    """Whether OpenCV's classic detector finds a board of a size, and its squares are as printed."""
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    is_found, corners = cv2.findChessboardCorners(part, size, flags=flags)
+    if not is_found:
+        return False
+    grid = np.reshape(corners, (size[1], size[0], 2)).astype(float)
+    half = int(np.clip(OF_SQUARE[0] * smallest_step(grid), 2, 9))
+    return (
+        evidence(part, refined_corners(part, grid.reshape(-1, 2), half).reshape(grid.shape), camera).rejection is None
+    )
+
+
+def _other_grid(gray: Gray, grid: CircleGrid, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
+    """Another place of the larger dot, none or one; then other numbers of circles."""
+    c, r = grid.columns, grid.rows
+    if c != r and read(gray, camera, replace(grid, columns=r, rows=c), options) is not None:
+        yield Clue(About.COUNTS, (r, c))  # as likely as another place of the dot, and the commoner mistake
+        return
+    dots: list[bool | str] = [word for word in (*CORNERS, False) if word != (grid.corner or False)]
+    if grid.asymmetric:  # such a grid has no larger dot
+        dots = []
+    for dot in dots:
+        if read(gray, camera, replace(grid, larger_dot=dot), options) is not None:
+            yield Clue(About.DOT, dot or "")
+            return
+    others = [(c + i, r + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    others += [(b + i, a + j) for a, b in [(c, r)] * (r != c) for i, j in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    for columns, rows in others:
+        try:
+            other = replace(grid, columns=columns, rows=rows)
+        except TargetError:
+            continue
+        if read(gray, camera, other, options) is not None:
+            yield Clue(About.COUNTS, (columns, rows))
+            return
+
+
+def tags_seen(gray: Gray) -> list[tuple[str, int, int]]:
+    """Family, border in modules (0: not known) and id of the tags of all families in an image, each place once."""
+    quads = quadrangles(gray)
+    quads = unlike(quads, quads[:0])
+    found: list[tuple[str, int, int]] = []
+    for family in BY_TRUST:
+        for border in (2, 1) if family == DOUBLE else (1,):
+            ids = identified(gray, quads, family, border)
+            found += [(family, border, int(i)) for i in ids[ids >= 0]]
+            quads = quads[ids < 0]
+    if not found:  # squares that touch the tags' corners, as on AprilGrids, hide quadrangles
+        found = [(DOUBLE, 2 if tag.is_double else 0, tag.id) for tag in tags_in_image(gray, [DOUBLE])]
+    return found
+
+
+def _other_tags(gray: Gray, target: Target) -> Iterator[Clue]:
+    """Another family, another border, or for a single tag another id."""
+    border = 2 if isinstance(target, AprilGrid) else 1
+    seen = tags_seen(gray)
+    mine = [(family, b, i) for family, b, i in seen if is_same_print(family, target.family)]
+    if mine:
+        if all(b not in (0, border) for _, b, _ in mine):
+            yield Clue(About.BORDER, mine[0][1])
+        elif isinstance(target, Tag):
+            for _, _, number in mine:
+                if number != target.id:
+                    yield Clue(About.ID, number)
+        return
+    several = 1 if isinstance(target, Tag) else 2
+    for family in dict.fromkeys(family for family, _, _ in seen):
+        ids = [i for of, _, i in seen if of == family]
+        if len(ids) >= several:
+            yield Clue(About.FAMILY, family)

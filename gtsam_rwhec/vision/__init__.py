@@ -1,5 +1,0 @@
-"""Poses of tags and boards from the images of a log, with covariances and the reasons of rejected detections."""
-
-from gtsam_rwhec.files.optional_packages import lazy_names
-
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -1,0 +1,70 @@
+"""Saddles of boards are put in order whatever is missing and whatever lies beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rendered import PINHOLE, pose, printed, projected, render
+
+from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.detect.saddle_lattices import boards_in, lattices
+from gtsam_rwhec.detect.saddles import Saddles, saddles
+
+CHESS = Checkerboard("chess", 5, 4, 0.03)
+
+
+def grids(found: Saddles, rows: int = 4, columns: int = 5) -> list[np.ndarray]:
+    members = np.arange(len(found.places))
+    return [
+        grid
+        for lattice in lattices(found, members, rows * columns)
+        for grid, _ in boards_in(lattice, found.places, rows, columns)
+    ]
+
+
+def off(grid: np.ndarray, T: np.ndarray) -> float:
+    """The largest distance to the truth, whichever way the grid is turned or mirrored."""
+    there = projected(PINHOLE, CHESS.corners(), T).reshape(4, 5, 2)
+    ways = (there, there[::-1], there[:, ::-1], there[::-1, ::-1])
+    return min(float(np.abs(grid - way).max()) for way in ways)
+
+
+@pytest.mark.parametrize("turn", [0.0, 45.0, 100.0])
+def test_a_boards_corners_come_in_order(turn: float) -> None:
+    T = pose((35.0, -25.0, turn), (0.0, 0.0, 0.3))
+    found = saddles(render(PINHOLE, [(printed(CHESS), T)]))
+    assert off(grids(found)[0], T) < 1.0
+
+
+def test_corners_that_are_missing_are_filled_in_and_others_left_out() -> None:
+    T = pose((20.0, -15.0, 30.0), (0.0, 0.0, 0.3))
+    found = saddles(render(PINHOLE, [(printed(CHESS), T)]))
+    generator = np.random.default_rng(0)
+    kept = generator.permutation(len(found.places))[3:]
+    stray = generator.uniform((0, 0), (320, 240), (30, 2))
+    turned = generator.normal(size=(3, 30, 2))
+    turned /= np.linalg.norm(turned, axis=2, keepdims=True)
+    mixed = Saddles(
+        np.concatenate([found.places[kept], stray]),
+        np.concatenate([found.edges[kept], turned[:2].swapaxes(0, 1)]),
+        np.concatenate([found.light[kept], turned[2]]),
+    )
+    assert min(off(grid, T) for grid in grids(mixed)) < 2.0
+
+
+def test_a_larger_board_has_several_parts_and_a_smaller_one_none() -> None:
+    T = pose((5.0, 5.0, 5.0), (0.0, 0.0, 0.3))
+    larger = saddles(render(PINHOLE, [(printed(Checkerboard("larger", 7, 4, 0.025)), T)]))
+    assert len(grids(larger)) >= 3
+    (lattice,) = lattices(larger, np.arange(len(larger.places)), 20)
+    assert all(goes_on for _, goes_on in boards_in(lattice, larger.places, 4, 5))
+    assert not any(goes_on for _, goes_on in list(boards_in(lattice, larger.places, 4, 7))[:1])
+    smaller = saddles(render(PINHOLE, [(printed(Checkerboard("smaller", 4, 3, 0.03)), T)]))
+    assert grids(smaller) == []
+
+
+def test_two_boards_are_two_lattices() -> None:
+    places = (-0.08, 0.08)
+    scene = [(printed(Checkerboard("c", 5, 4, 0.014)), pose((0.0, 0.0, 10.0), (x, 0.0, 0.3))) for x in places]
+    found = saddles(render(PINHOLE, scene, blur_px=0.5))
+    assert [len(lattice.members) for lattice in lattices(found, np.arange(len(found.places)), 20)] == [20, 20]

@@ -1,0 +1,82 @@
+"""A board that looks the same turned has one frame in all images of all cameras, or the run says which are unsure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rendered import PINHOLE, pose, printed, render
+from rwhec_factors import se3
+
+from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.image_detections import detect_in_log
+from gtsam_rwhec.runs.intrinsics import read_intrinsics
+
+BOARD = Checkerboard("board", 5, 3, 0.03)
+IMAGES = 8
+CAMERA = "{images: /IMAGES, intrinsics: {model: pinhole, width: 320, height: 240, K: [300, 302, 157, 121.5]}}"
+RIG = f"""
+carriers: {{sensors: base, targets: hand, poses: {{frames: [base, hand]}}}}
+sensors:
+  left: {CAMERA.replace("IMAGES", "left")}
+  right: {CAMERA.replace("IMAGES", "right")}
+targets:
+  board: {{type: checkerboard, inner_corners: [5, 3], square_m: 0.03}}
+"""
+
+
+@pytest.fixture(scope="module")
+def log_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two cameras on the base, the right one turned by 130 degrees about its line of sight, and a board on the hand."""
+    generator = np.random.default_rng(5)
+    path = tmp_path_factory.mktemp("turned") / "log.mcap"
+    T_hand_board = se3.expmap(generator.normal(size=(1, 6)))[0]
+    with LogWriter(path) as out:
+        for name, about_z in (("left", 0.0), ("right", 130.0)):
+            T_camera_base = se3.expmap(generator.normal(size=(1, 6)))[0]
+            for k in range(IMAGES):
+                stamp = 1_000_000_000 * (1 + k + (IMAGES if name == "right" else 0))
+                tilt = (*generator.uniform(-30.0, 30.0, 2), about_z + generator.uniform(-120.0, 120.0))
+                T = pose(tilt, (*generator.uniform(-0.01, 0.01, 2), 0.35))
+                T_base_hand = np.linalg.inv(T_camera_base) @ T @ np.linalg.inv(T_hand_board)
+                out.transforms("/tf", stamp, [("base", "hand", T_base_hand)])
+                image = cv2.imencode(".png", render(PINHOLE, [(printed(BOARD), T)], seed=k))[1].tobytes()
+                out.compressed_image(f"/{name}", stamp, name, "png", image)
+    return path
+
+
+def test_a_board_has_one_frame_for_two_cameras(log_path: Path) -> None:
+    rig = parse_rig(RIG, "rig.yaml")
+    with open_log(log_path) as log:
+        motion = read_carrier_motion(log, rig)
+        found = detect_in_log(log, rig, read_intrinsics(log, rig), motion, workers=1, progress=silent)
+    hand_board = []
+    for sensor in ("left", "right"):
+        records = found[sensor].records
+        assert [record.reason for record in records] == [""] * IMAGES
+        A = motion.A_where_known(np.array([record.stamp_ns for record in records]), 1.0)
+        B = np.array([record.T_camera_tag for record in records])
+        # Axes of the board in the hand's frame: A_i^-1 A_j = X B_i^-1 B_j X^-1.
+        a, b = (se3.so3_logmap(x[:-1, :3, :3].swapaxes(1, 2) @ x[1:, :3, :3]) for x in (A, B))
+        U, _, Vt = np.linalg.svd(a.T @ b)
+        hand_board.append(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+        assert np.abs(a - b @ hand_board[-1].T).max() < np.radians(3.0)
+    np.testing.assert_allclose(hand_board[0], hand_board[1], atol=0.05)
+
+
+def test_turns_that_a_camera_without_poses_cannot_tell_are_ambiguous(log_path: Path) -> None:
+    rig = parse_rig(RIG, "rig.yaml")
+    with open_log(log_path) as log:
+        motion = read_carrier_motion(log, rig)
+        late = motion.trajectory.stamps_ns[-1] - motion.trajectory.stamps_ns[0] + 10**12
+        moved = type(motion)(type(motion.trajectory)(motion.trajectory.stamps_ns + late, motion.trajectory.T), None)
+        found = detect_in_log(log, rig, read_intrinsics(log, rig), moved, workers=1, progress=silent)
+    for sensor in ("left", "right"):
+        assert {record.reason for record in found[sensor].records} == {Rejection.AMBIGUOUS}
