@@ -17,6 +17,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.geometry.poses import Array
 
 #: Gauss-Newton takes at most this many steps.
@@ -86,7 +87,8 @@ def plane_poses(
 
 def _starts(points: Array, x: Array) -> Array:
     """First poses (2, 4, 4) from corners (n, 3) and normalised coordinates; nan where there is none."""
-    import cv2
+    with extra_named():
+        import cv2
 
     if len(points) < 4 or not points[:, 2].any():
         return _ippe(points, x)
@@ -113,7 +115,8 @@ def _starts(points: Array, x: Array) -> Array:
 
 def _ippe(points: Array, x: Array) -> Array:
     """IPPE's two poses (2, 4, 4) from normalised coordinates. A pose that is not found is nan."""
-    import cv2
+    with extra_named():
+        import cv2
 
     T = np.full((2, 4, 4), np.nan)
     if len(x) < 4 or not np.isfinite(x).all():

@@ -17,6 +17,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
 from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.geometry.poses import Array
 
 #: Which coefficients of distortion are estimated: none; k1 and k2; or k1, k2, p1 and p2.
@@ -66,7 +67,8 @@ def fitted_to_planes(
     K : (3, 3) array, optional
         The start; by default the homographies give one.
     """
-    import cv2
+    with extra_named():
+        import cv2
 
     fixed = {
         "none": cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3,
@@ -92,7 +94,8 @@ def fisheye_fitted_to_planes(
     corners_m: Sequence[Array], corners_px: Sequence[Array], size: tuple[int, int], coefficients: int = 4
 ) -> PlanesFitted | None:
     """As `fitted_to_planes`, for an equidistant lens whose first so many coefficients are free, and the others 0."""
-    import cv2
+    with extra_named():
+        import cv2
 
     points = [np.ascontiguousarray(p, dtype=np.float64)[None] for p in corners_m]
     pixels = [np.ascontiguousarray(u, dtype=np.float64)[None] for u in corners_px]
@@ -117,7 +120,8 @@ def fisheye_fitted_to_planes(
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
     """One thread of OpenCV's: its sums over views then have one order, and the same views give the same bits."""
-    import cv2
+    with extra_named():
+        import cv2
 
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -129,7 +133,8 @@ def one_opencv_thread() -> Iterator[None]:
 
 def _fisheye_flag(name: str) -> int:
     """OpenCV 5 has the fisheye model's flags beside the others, OpenCV 4 in a module of their own."""
-    import cv2
+    with extra_named():
+        import cv2
 
     return int(getattr(cv2.fisheye if hasattr(cv2.fisheye, name) else cv2, name))
 
@@ -273,7 +278,8 @@ def _well_read(views: list[tuple[Array, Array]], size: tuple[int, int]) -> list[
 
 def _outline(points: Array, pixels: Array) -> Array:
     """Where the corners of the smallest upright rectangle about a view's corners are in the image (8,)."""
-    import cv2
+    with extra_named():
+        import cv2
 
     H, _ = cv2.findHomography(points[:, :2], pixels, 0)
     if H is None:

@@ -28,7 +28,7 @@ def test_other_missing_modules_are_left_alone() -> None:
 @pytest.mark.parametrize(
     ("package", "statement", "extra"),
     [
-        ("cv2", "rw.vision.decode_gray", "log"),
+        ("cv2", "rw.detect.decode_gray", "log"),
         ("mcap", "rw.calibrate_log", "log"),
         ("requests", "rw.datasets.fetch_utias", "cli"),
     ],
