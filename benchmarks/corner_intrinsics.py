@@ -13,23 +13,22 @@ zero outside of its 99 % interval; with A known, where it is below zero outside 
 """
 
 from __future__ import annotations
+
 import sys
-from dataclasses import dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
-from loky import ProcessPoolExecutor
 import simulated_cells
+from bars import Row, benchmark_parser, print_rows
+from loky import ProcessPoolExecutor
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE, parameters_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
 

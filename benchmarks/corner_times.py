@@ -9,20 +9,21 @@ clock; the processor's own are in brackets.
 """
 
 from __future__ import annotations
+
 import resource
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
 import simulated_cells
 import simulated_clocks
+from bars import Row, benchmark_parser, print_rows
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.observations import Views
 from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.fitting.observations import Views
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
 

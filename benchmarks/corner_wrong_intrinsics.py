@@ -14,29 +14,25 @@ with the prior P and the posterior C would, without noise, show as m = (P - C) P
 """
 
 from __future__ import annotations
+
 import sys
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+import placements
+import simulated_cells
+from bars import Row, benchmark_parser, print_rows
 from binomial import Share
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
-import placements
-import simulated_cells
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
-from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import PARTS
-from gtsam_rwhec.fitting.stated_intrinsics import TOLD
-from gtsam_rwhec.fitting.stated_intrinsics import free_model
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
-from gtsam_rwhec.fitting.stated_intrinsics import prior_of
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.stated_intrinsics import PARTS, TOLD, free_model, parameters_of, prior_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
 

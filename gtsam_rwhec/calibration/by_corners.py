@@ -6,31 +6,27 @@ answer says otherwise, they are computed again, and all is settled once more.
 """
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
+
 from gtsam_rwhec.calibration.clock_stage import Answer
 from gtsam_rwhec.calibration.corner_choice import thinned
-from gtsam_rwhec.calibration.corner_stage import CornersFound
-from gtsam_rwhec.calibration.corner_stage import corners_found
+from gtsam_rwhec.calibration.corner_stage import CornersFound, corners_found
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.run import Run
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError, RwhecError
 from gtsam_rwhec.fitting.corner_findings import is_doubtful
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
 from gtsam_rwhec.fitting.fit_options import CornerOptions
-from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.observations import check_corners_can_hold
-from gtsam_rwhec.fitting.observations import check_corners_everywhere
+from gtsam_rwhec.fitting.observations import Observations, check_corners_can_hold, check_corners_everywhere
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refinement import as_stated
-from gtsam_rwhec.fitting.refinement import observed
+from gtsam_rwhec.fitting.refinement import as_stated, observed
 from gtsam_rwhec.problem.nearer_poses import nearer_poses
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.cameras.camera import Camera
 
 #: Poses of targets are computed again at most so often.
 AGAIN = 2

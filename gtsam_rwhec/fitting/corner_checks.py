@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, OptionError, OutlierError, UnderdeterminedError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_model import Model, Point
@@ -20,7 +21,6 @@ from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.stated_intrinsics import CENTRE_PX
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.vision.camera import Camera
 
 #: Corners whose median error is above this, pixels, do not belong to the poses.
 FARTHEST_PX = 30.0

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.distortion import coefficient_jacobian, distorted
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.distortion import coefficient_jacobian, distorted
 
 #: fx, fy, cx, cy come before the coefficients.
 PINHOLE = 4

@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from rwhec_factors import se3
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.corner_residuals import shaped
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import SIZE, WARPS, Reprojection
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
-from gtsam_rwhec.vision.camera import Camera
 
 #: An image's longer side has so many cells, and its shorter side so many, for the share that has corners.
 CELLS = (8, 6)

@@ -1,21 +1,16 @@
 """The section of a rig file that says where a camera's intrinsics are, and how far they can be trusted."""
 
 from __future__ import annotations
-from typing import Annotated
-from typing import Any
-from typing import Literal
-from typing import TypeAlias
-from pydantic import BeforeValidator
-from pydantic import Field
-from pydantic import model_validator
-from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.rig.field_types import OrText
-from gtsam_rwhec.rig.field_types import Text
-from gtsam_rwhec.rig.field_types import list_of
-from gtsam_rwhec.rig.section import Section
-from gtsam_rwhec.rig.section import one_of
+
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import BeforeValidator, Field, model_validator
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import Lens
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.rig.field_types import OrText, Text, list_of
+from gtsam_rwhec.rig.section import Section, one_of
 
 #: The word for intrinsics that nobody states; a file of this name is {file: estimate}.
 ESTIMATE = "estimate"

@@ -1,13 +1,14 @@
 """Calibrated frames of a refinement, with the intrinsics that were estimated with the poses in place of stated ones."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
-from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
-from gtsam_rwhec.cameras.camera import Camera
 
 #: Parameters that are focal lengths and principal points, in pixels; coefficients follow them.
 IN_PIXELS = 4

@@ -1,11 +1,13 @@
 """Observations for methods on corners: two cameras on a hand see a board and a small tag."""
 
 from __future__ import annotations
+
 import numpy as np
 from rwhec_factors import se3
+
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.cameras.camera import Camera
 
 CAMERAS = {
     "left": Camera.of(

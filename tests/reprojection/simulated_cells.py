@@ -1,20 +1,20 @@
 """Cells with fixed cameras and a board on the hand, whose truth is known: corners are drawn with their noise."""
 
 from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors import se3
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.corner_residuals import shaped
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import camera_with
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_of
-from gtsam_rwhec.fitting.stated_intrinsics import prior_of
-from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.fitting.stated_intrinsics import camera_with, parameters_of, pixels_of, prior_of
 
 Array = NDArray[np.float64]
 BOARD = Checkerboard("board", 7, 5, 0.04)

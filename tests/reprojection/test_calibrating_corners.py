@@ -1,17 +1,18 @@
 """From corners alone: intrinsics nobody stated, certified poses, refinement."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
-from simulated_cells import CAMERA
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import CAMERA, Cell, cell
+
 import gtsam_rwhec as rw
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.fitting.observations import Views
-from gtsam_rwhec.cameras.camera import Camera
 
 UNKNOWN = rw.CornerOptions(stated="unknown")
 FISHEYE = Camera.of(

@@ -1,12 +1,13 @@
 """What is doubtful is said in words, with the figure; and nothing where nothing is."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 import pytest
-from simulated_cells import CAMERA
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import CAMERA, Cell, cell
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.corner_findings import findings_of
 from gtsam_rwhec.fitting.observations import Views

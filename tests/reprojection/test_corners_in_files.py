@@ -1,27 +1,26 @@
 """Result files of refinements from corners: intrinsics come back bit for bit, and damage is refused with its place."""
 
 from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 import pytest
 from made_as_refined import made
 from problems_of_corners import problem_of
-from simulated_cells import CAMERA
-from simulated_cells import cell
+from simulated_cells import CAMERA, cell
+
 import gtsam_rwhec as rw
+from gtsam_rwhec.cameras.intrinsics_files import read_calibration_yaml, read_cameras
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.fitting.reprojection_record import Consequence
-from gtsam_rwhec.fitting.reprojection_record import Reprojection
-from gtsam_rwhec.fitting.reprojection_record import SensorReprojection
-from gtsam_rwhec.fitting.reprojection_record import TriedModel
+from gtsam_rwhec.fitting.reprojection_record import Consequence, Reprojection, SensorReprojection, TriedModel
 from gtsam_rwhec.results.result_file import read_result
-from gtsam_rwhec.cameras.intrinsics_files import read_calibration_yaml
-from gtsam_rwhec.cameras.intrinsics_files import read_cameras
+
 
 @cache
 def refined() -> rw.Refined:

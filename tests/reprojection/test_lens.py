@@ -1,15 +1,14 @@
 """Pixels as functions of a camera's parameters."""
 
 from __future__ import annotations
+
 import cv2
 import gtsam
 import numpy as np
 import pytest
-from gtsam_rwhec.fitting.stated_intrinsics import camera_with
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_of
+
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.fitting.stated_intrinsics import camera_with, parameters_of, pixels_and_derivatives, pixels_of
 
 K = [[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]
 LENSES = {

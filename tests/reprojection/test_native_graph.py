@@ -1,21 +1,21 @@
 """GTSAM's own factors and ours: the same cost, the same optimum, the same deviations."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from native_graph import NativeGraph
 from rwhec_factors import se3
-from simulated_cells import CAMERA
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import CAMERA, Cell, cell
 from simulated_models import model_and_point
-from gtsam_rwhec.fitting.corner_graph import CornerGraph
-from gtsam_rwhec.fitting.corner_model import Model
-from gtsam_rwhec.fitting.corner_model import Point
-from gtsam_rwhec.fitting.corner_noise import Reduced
+
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.fitting.corner_graph import CornerGraph
+from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Reduced
 
 SIZE = (CAMERA.width, CAMERA.height)
 LENSES = {

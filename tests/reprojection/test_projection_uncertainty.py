@@ -1,21 +1,23 @@
 """How sure projections are over the image."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
-from simulated_cells import CAMERA
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import CAMERA, Cell, cell
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.projection_uncertainty import by_region
-from gtsam_rwhec.fitting.projection_uncertainty import lens_deviations_over
-from gtsam_rwhec.fitting.projection_uncertainty import projection_deviations
-from gtsam_rwhec.fitting.projection_uncertainty import uneven_words
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.fitting.projection_uncertainty import (
+    by_region,
+    lens_deviations_over,
+    projection_deviations,
+    uneven_words,
+)
 
 EXACT = rw.CornerOptions(carrier_noise="exact")
 

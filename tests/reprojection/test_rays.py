@@ -1,19 +1,19 @@
 """Lens models that fold back nearer to the centre than a corner was seen: said with sensor, image and pixel."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
 from scipy.stats import chi2
-from simulated_cells import CAMERA
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import CAMERA, Cell, cell
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.fitting.corner_checks import findings_of_rays
-from gtsam_rwhec.fitting.corner_checks import without_rays
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.fitting.corner_checks import findings_of_rays, without_rays
 
 #: It folds back where r^2 = 1 / (3 * 1.5), 440 pixels from the centre; corners are seen to 570.
 FOLDED = Camera.of(1920, 1080, "radtan", CAMERA.K, (-1.5, 0.0, 0.0, 0.0), "cell")

@@ -1,23 +1,20 @@
 """Refinement from corners: truth, noise, intrinsics that are off, outliers, words."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rwhec_factors import se3
 from scipy.stats import chi2
-from simulated_cells import CAMERA
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import CAMERA, Cell, cell
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.stated_intrinsics import innovation_of
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
-from gtsam_rwhec.fitting.stated_intrinsics import wider
+from gtsam_rwhec.errors import CameraError, FrameError, OptionError
+from gtsam_rwhec.fitting.stated_intrinsics import innovation_of, parameters_of, wider
 
 Array = NDArray[np.float64]
 

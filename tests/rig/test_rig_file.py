@@ -1,48 +1,45 @@
 """Rig files: everything that one can say, every fault with its line, and what is written reads back equal."""
 
 from __future__ import annotations
+
 import re
-from dataclasses import asdict
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
-from typing import get_args
+from typing import Any, get_args
+
 import pytest
 import yaml
-from hypothesis import HealthCheck
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from places import CELL
-from places import REPOSITORY
-from rig_texts import FULL
-from rig_texts import MINIMAL
+from places import CELL, REPOSITORY
+from rig_texts import FULL, MINIMAL
+
+from gtsam_rwhec.cameras.targets import AprilGrid, Charuco, Checkerboard, Tag
+from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.fitting.fit_options import Robust
-from gtsam_rwhec.rig import AprilGridTarget
-from gtsam_rwhec.rig import BundleTarget
-from gtsam_rwhec.rig import Carriers
-from gtsam_rwhec.rig import CharucoTarget
-from gtsam_rwhec.rig import CheckerboardTarget
-from gtsam_rwhec.rig import Cleaning
-from gtsam_rwhec.rig import DetectionNoise
-from gtsam_rwhec.rig import Intrinsics
-from gtsam_rwhec.rig import Link
-from gtsam_rwhec.rig import PoseNoise
-from gtsam_rwhec.rig import PoseSource
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import Sensor
-from gtsam_rwhec.rig import TagGridTarget
-from gtsam_rwhec.rig import TagTarget
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.rig import rig_text
+from gtsam_rwhec.rig import (
+    AprilGridTarget,
+    BundleTarget,
+    Carriers,
+    CharucoTarget,
+    CheckerboardTarget,
+    Cleaning,
+    DetectionNoise,
+    Intrinsics,
+    Link,
+    PoseNoise,
+    PoseSource,
+    Rig,
+    Sensor,
+    TagGridTarget,
+    TagTarget,
+    parse_rig,
+    read_rig,
+    rig_text,
+)
 from gtsam_rwhec.rig.target_sections import BundleTagPlace
-from gtsam_rwhec.cameras.targets import AprilGrid
-from gtsam_rwhec.cameras.targets import Charuco
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.detect.detections import DetectionOptions
+
 
 def test_everything_is_read(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
