@@ -25,7 +25,7 @@ from rwhec_factors.se3 import expmap
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.calibration.plausibility import implausible
+from gtsam_rwhec.calibration.trial_fits import implausible
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.simulate import Motion, Noise, cameras, general, sphere
 from gtsam_rwhec.simulate.transforms import random_poses

@@ -10,7 +10,7 @@ from rwhec_factors.se3 import inverse, pose
 from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.geometry.poses import Array
 
 

@@ -6,25 +6,29 @@ measurements: B = Y^-1 A X.
 """
 
 from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
-
+from typing import Literal
+from typing import get_args
 import numpy as np
-
-from gtsam_rwhec.calibration.folds import Fold, Split, folds_of
-from gtsam_rwhec.calibration.prediction_errors import HoldOutError, PredictionError, prediction_errors
-from gtsam_rwhec.errors import CountError, OptionError, OutlierError, RwhecWarning, ScaleError, UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import OutlierError
+from gtsam_rwhec.errors import RwhecWarning
+from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import check_progress
+from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
+from gtsam_rwhec.geometry.real_numbers import is_one_of
+from gtsam_rwhec.geometry.real_numbers import is_whole
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -32,6 +36,128 @@ from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
+from collections.abc import Iterator
+from typing import NamedTuple
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.trajectories.local_paths import LocalPaths
+
+Split = Literal["time", "pair", "sensor"]
+
+
+class Fold(NamedTuple):
+    """Measurements held out together, as (N,) booleans for each pair that has some, and a name for messages."""
+
+    name: str
+    held_out: dict[Pair, np.ndarray]
+
+
+def folds_of(raw: Mapping[Pair, Measurements], by: Split, number: int) -> Iterator[Fold]:
+    """The folds of a split; with ``by="time"`` there are ``number`` folds."""
+    if by == "time":
+        return _blocks(raw, number)
+    return _pairs(raw) if by == "pair" else _halves(raw)
+
+
+def _in_time(one: Measurements) -> np.ndarray:
+    """The rank (N,) of each measurement in time."""
+    count = len(one.A)
+    if one.stamps_ns is None:
+        return np.arange(count)
+    rank = np.empty(count, dtype=np.int64)
+    rank[np.argsort(one.stamps_ns, kind="stable")] = np.arange(count)
+    return rank
+
+
+def _blocks(raw: Mapping[Pair, Measurements], folds: int) -> Iterator[Fold]:
+    # The middle of each measurement's share of the pair: few measurements are spread over all folds.
+    block = {pair: ((_in_time(one) + 0.5) * folds / len(one.A)).astype(np.int64) for pair, one in raw.items()}
+    for fold in range(folds):
+        yield Fold(f"block {fold + 1} of {folds}", {pair: number == fold for pair, number in block.items()})
+
+
+def _pairs(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
+    for pair, one in raw.items():
+        yield Fold(pair.label, {pair: np.ones(len(one.A), dtype=bool)})
+
+
+def _halves(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
+    for sensor in dict.fromkeys(sensor for _, sensor in raw):
+        own = {pair: 2 * _in_time(one) < len(one.A) for pair, one in raw.items() if pair.sensor == sensor}
+        yield Fold(f"{sensor}, first half", own)
+        yield Fold(f"{sensor}, second half", {pair: ~mask for pair, mask in own.items()})
+
+
+@dataclass(frozen=True)
+class PredictionError:
+    """The distance of predicted measurements from the measured ones.
+
+    Attributes
+    ----------
+    count : int
+        Number of predicted measurements.
+    translation_rms_mm, translation_median_mm, translation_95_mm : float
+        Root mean square, median and 95th percentile of |t_measured / scale - t_predicted|, true millimetres; nan if
+        no measurement was predicted.
+    rotation_rms_deg, rotation_median_deg, rotation_95_deg : float
+        Root mean square, median and 95th percentile of the angle of R_measured' R_predicted, degrees.
+    """
+
+    count: int
+    translation_rms_mm: float
+    translation_median_mm: float
+    translation_95_mm: float
+    rotation_rms_deg: float
+    rotation_median_deg: float
+    rotation_95_deg: float
+
+    @staticmethod
+    def of(translation_m: Array, rotation_rad: Array) -> PredictionError:
+        """The statistics of single errors; nan marks a measurement that was not predicted."""
+        known = np.isfinite(translation_m)
+        mm, deg = 1e3 * translation_m[known], np.degrees(rotation_rad[known])
+        return PredictionError(len(mm), *_rms_median_95(mm), *_rms_median_95(deg))
+
+
+@dataclass(frozen=True)
+class HoldOutError:
+    """The errors of held-out measurements, and of the same measurements with a calibration from all measurements.
+
+    Attributes
+    ----------
+    held_out, training : PredictionError
+        If the two differ much, there are too few measurements, or too many unknowns, for the noise. If both are large,
+        there are outliers, a wrong model (intrinsics, a size, a delay), or much noise.
+    not_predicted : int
+        Number of measurements of frames that the other measurements do not determine.
+    """
+
+    held_out: PredictionError
+    training: PredictionError
+    not_predicted: int
+
+
+def prediction_errors(problem: Problem, answer: Solution | RefinedPoses, pair: Pair, one: Measurements) -> Array:
+    """The errors (2, N) of a pair's predicted measurements, in true metres and radians; nan if a pose is not known."""
+    poses: dict[str, Array] = {name: pose.matrix() for name, pose in (answer.X | answer.Y).items()}
+    poses = {**problem.fixed, **poses}
+    scales = answer.scale
+    scale = {**problem.fixed_scales, **scales}.get(pair.target) if isinstance(scales, Mapping) else scales
+    if scale is None or any(name not in poses for name in pair):
+        return np.full((2, len(one.A)), np.nan)
+    A = one.A
+    offset = getattr(answer, "time_offsets_s", {}).get(pair.sensor, 0.0)
+    if offset and one.stamps_ns is not None:
+        A = A @ LocalPaths.of(A, one.stamps_ns, pair.label).motion(offset)
+    predicted = np.linalg.inv(poses[pair.sensor]) @ A @ poses[pair.target]
+    translation = np.linalg.norm(one.B[:, :3, 3] / scale - predicted[:, :3, 3], axis=1)
+    chord = np.linalg.norm(one.B[:, :3, :3] - predicted[:, :3, :3], axis=(1, 2))  # sqrt(8) sin(angle / 2)
+    return np.stack([translation, 2.0 * np.arcsin(np.minimum(1.0, chord / np.sqrt(8.0)))])
+
+
+def _rms_median_95(values: Array) -> tuple[float, float, float]:
+    if len(values) == 0:
+        return np.nan, np.nan, np.nan
+    return float(np.sqrt(np.mean(values**2))), float(np.median(values)), float(np.percentile(values, 95.0))
 
 
 @dataclass(frozen=True)

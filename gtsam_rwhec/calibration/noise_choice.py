@@ -1,16 +1,15 @@
-"""By which model the noise is found, and the inliers under it."""
+"""The stage of the noise: by which model it is found, the refined answer under it, and what is said of it."""
 
 from __future__ import annotations
-
 from dataclasses import replace
-
 import numpy as np
-
-from gtsam_rwhec.calibration.noise_found import NoiseFound
-from gtsam_rwhec.calibration.options import CalibrateOptions
-from gtsam_rwhec.errors import CountError, NoiseError
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.fit_options import Component
+from gtsam_rwhec.fitting.fit_options import NoiseOptions
+from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.fitting.refined import Refined
@@ -20,11 +19,76 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
+import math
+from dataclasses import dataclass
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
+from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.calibrate_options import offsets_of
+from gtsam_rwhec.calibration.outliers import Inliers
+from gtsam_rwhec.calibration.outliers import spare_equations
+from gtsam_rwhec.calibration.verdict import REFINEMENT
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.noise_model.found import MOST_BY_CHANCE
+from gtsam_rwhec.noise_model.found import ratio_words
+from gtsam_rwhec.solving.weights import contradicted_by
+from gtsam_rwhec.solving.weights import overstated_by
+
+@dataclass(frozen=True)
+class NoiseFound:
+    """The noise that a calibration counts with, one standard deviation an axis; ``str()`` is a sentence.
+
+    Attributes
+    ----------
+    source : str
+        Where it comes from: "estimated from the residuals", "as given".
+    rotation_rad, translation_m : dict of (target, sensor) to float
+        Of B, by pair: of the pair's median measurement, root mean square over axes.
+    carriers : str
+        The noise of A, in words.
+    model : NoiseInData or None
+        All that the data say of their noise, of A's, in time and over the configuration; None where B's alone was
+        estimated, or noise was given.
+    simple : str
+        Why B's alone was estimated; empty with a model.
+    has_failed : bool
+        Whether the model of all noise could not be computed, or the noise that was stated for A not used.
+    """
+
+    source: str
+    rotation_rad: dict[Pair, float]
+    translation_m: dict[Pair, float]
+    carriers: str
+    model: NoiseInData | None = None
+    simple: str = ""
+    has_failed: bool = False
+
+    def __str__(self) -> str:
+        if self.model is not None:
+            return str(self.model)
+        if not self.rotation_rad:
+            return f"Noise of B: {self.source}. Noise of A: {self.carriers}."
+        degrees = [math.degrees(value) for value in self.rotation_rad.values()]
+        millimetres = [1e3 * value for value in self.translation_m.values()]
+        return (
+            f"Noise of B: {_span(degrees)}° and {_span(millimetres)} mm for each axis of a typical measurement, "
+            f"{self.source}. Noise of A: "
+            f"{self.carriers}."
+        )
+
+
+def _span(values: list[float]) -> str:
+    low, high = rounded(min(values)), rounded(max(values))
+    return low if low == high else f"{low} to {high}"
+
+
+#: Where nothing could be estimated.
+NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
+
 
 #: Inliers are chosen again under the noise that is found at most this many times.
 MAX_CHOICES = 4
-
-Inliers = dict[Pair, np.ndarray]
 
 
 def estimated(
@@ -131,10 +195,127 @@ def _noise_of(refined: Refined, options: CalibrateOptions, model: NoiseInData | 
     )
 
 
-def offsets_of(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:
-    """The sensors whose time offsets are estimated, of those that the problem has."""
-    if options.time_offsets == "auto":
-        return False
-    if isinstance(options.time_offsets, bool):
-        return options.time_offsets
-    return tuple(name for name in options.time_offsets if name in problem.sensors)
+def refined_under_its_noise(
+    run: Run, solution: Solution, inliers: Inliers
+) -> tuple[Refined | None, NoiseFound, Solution, Inliers]:
+    """The refined calibration under the noise that is found, this noise, the certified solution, and the inliers.
+
+    Inliers are judged again under the noise, so the last two may differ from those that were given.
+    """
+    record = run.record
+    run.tell("refining")
+    try:
+        refined, noise, inliers = estimated(run.problem, solution, inliers, run.options, run.tell)
+    except (NoiseError, CountError, UnderdeterminedError) as error:
+        record.choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
+        number = run.problem.number_of_measurements
+        words = f"the {number} measurements are too few to tell how well the poses are known"
+        record.find(Ground.NO_COVARIANCE, words)
+        return None, NOT_KNOWN, solution, inliers
+    if run.options.noise == "given":
+        record.choose("noise of B", "as given", "an option says so")
+        _doubt_stated_noise(run, refined, inliers)
+    elif refined.noise_source == "given":
+        record.choose("noise of B", "as given", "the residuals are too few to estimate it")
+        _doubt_stated_noise(run, refined, inliers)
+    elif noise.model is None:
+        record.choose("noise", "that of B alone is estimated", noise.simple)
+        if noise.has_failed:
+            words = "the standard deviations lack the noise of A and errors that vary with the configuration"
+            record.find(Ground.COVARIANCE_DOUBTED, words)
+    else:
+        _say_sizes(run, refined, noise.model, inliers)
+        _say_drift(run, noise.model)
+        _say_systematic(run, noise.model)
+    return refined, noise, refined.solution, inliers
+
+
+def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Noise that was stated, and is larger: then the standard deviations are too small by as much."""
+    if refined.options.robust not in ("none", "gnc"):
+        return  # the cost of another loss is no chi-square
+    kept = selected(run.problem, inliers) if inliers else run.problem
+    ratio = contradicted_by(refined.cost, spare_equations(kept))
+    if ratio is not None:
+        words = f"the residuals are {rounded(math.sqrt(ratio))} times as large as the stated noise allows"
+        run.record.find(Ground.NOISE_UNDERSTATED, words)
+
+
+def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers) -> None:
+    """How large the noise is, in one line; ``model`` says the rest."""
+    number = sum(int(mask.sum()) for mask in inliers.values()) or run.problem.number_of_measurements
+    shown = f"that is what the residuals of {number} measurements show"
+    stated = run.options.carrier_noise
+    if stated is None:
+        run.record.choose("noise of A and B", f"estimated, for each axis {model.size_words}", shown)
+        return
+    run.record.choose("noise of B", f"estimated, for each axis {model.size_words_of_B}", f"{shown} beside A's")
+    size = f"{rounded(math.degrees(stated.rotation_rad))}° and {rounded(1e3 * stated.translation_m)} mm for each axis"
+    run.record.choose("noise of A", f"{size}, as you stated", "an option says so")
+    _doubt_noise_of_A(run, refined, inliers)
+
+
+def _doubt_noise_of_A(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Noise that was stated for A, and is far larger than the residuals: then the standard deviations are too large."""
+    kept = selected(run.problem, inliers) if inliers else run.problem
+    ratio = overstated_by(refined.cost, spare_equations(kept))
+    if ratio is not None:
+        factor = rounded(1.0 / math.sqrt(ratio))
+        words = f"the residuals are far smaller ({factor} times) than the noise that you stated for A makes them"
+        run.record.find(Ground.NOISE_OVERSTATED, words)
+
+
+def _say_drift(run: Run, model: NoiseInData) -> None:
+    """Whether errors of neighbours in time are alike."""
+    what, record = "drift", run.record
+    if model.is_drift_untried:
+        evidence = "more pairs are measured at the same instants than its model can hold"
+        record.choose(what, "seen, and not modelled; blocks of time widen the standard deviations", evidence)
+        words = (
+            "errors of neighbours in time are alike, and no model holds them; the standard deviations were widened as "
+            "blocks of time show, and may still be too small"
+        )
+        record.find(Ground.CORRELATED, words)
+    elif model.correlation is None:
+        if run.options.drift == "none":
+            record.choose(what, "none", "an option says so")
+        elif model.drift_not_sought:
+            record.choose(what, "no model of it was tried", model.drift_not_sought)
+        else:
+            order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"
+            record.choose(what, "none", f"errors of neighbours in time are no more alike than others{order}")
+    else:
+        kind = "a random walk" if model.correlation == 1.0 else f"errors correlated by {model.correlation:g} a step"
+        clock = "" if model.has_stamps else "; a late clock looks like this too, and there are no stamps to tell"
+        record.choose(
+            what,
+            f"{kind}; {model.instants} frames are worth about {model.worth:.0f}",
+            f"a model in which neighbours in time share errors explains the residuals far better "
+            f"({ratio_words(model.drift_evidence)}){clock}",
+        )
+
+
+def _say_systematic(run: Run, model: NoiseInData) -> None:
+    """Whether errors depend on the configuration, which is a finding too."""
+    what, record = "systematic errors", run.record
+    if not model.arms_assumed:
+        record.choose(what, "none", "an option says so")
+        return
+    tried = "a model with errors that vary with the carriers' configuration explains the residuals"
+    if not model.has_systematic:
+        how = "hardly" if model.systematic_evidence > 1.0 else "no"
+        record.choose(
+            what,
+            "none found; the covariances hold as much as could hide",
+            f"{tried} {how} better ({ratio_words(model.systematic_evidence)}; more than {MOST_BY_CHANCE:g} counts)",
+        )
+        return
+    evidence = f"{tried} far better ({ratio_words(model.systematic_evidence)}; more than {MOST_BY_CHANCE:g} counts)"
+    record.choose(what, "found, and in the covariances", evidence)
+    words = f"errors vary with the configuration of the carriers: {model.systematic_words}"
+    if not model.has_stamps:
+        words += (
+            "; it may also be a late clock, which looks like this where there are no stamps: give stamps, or stand "
+            "still at each pose"
+        )
+    record.find(Ground.SYSTEMATIC, words)

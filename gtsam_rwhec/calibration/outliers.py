@@ -1,15 +1,98 @@
-"""The measurements that a calibration left out, as a record."""
+"""Outliers: the measurements that agree, those that were left out, and which frames these contradict.
+
+Where every measurement counts, those that look wrong are found beside a robust fit of a sample. Where what was left out
+agrees with itself far better than what was kept (a planar target that is seen flipped), it is the other way round.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
+from gtsam_rwhec.calibration.calibrate_options import Run, offsets_of
+from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Sampled, TrialFit, fitted, implausible, residuals
+from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
+from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.graduated import graduated
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
+
+#: "Half of its measurements".
+HALF = 0.5
+#: Outliers that agree with each other (a planar target's other pose) may be nearly half, and then win by chance.
+NEARLY_HALF = 0.42
+#: From so many measurements on, nearly half is no accident.
+MANY_OF_A_FRAME = 10
+
+#: Which measurements of each pair count, (N,) booleans.
+Inliers = dict[Pair, np.ndarray]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """How many measurements of one sensor or target were left out as outliers; ``str()`` is a sentence's part."""
+
+    frame: str
+    left_out: int
+    measurements: int
+
+    def __str__(self) -> str:
+        return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
+
+    def is_beyond(self, share: float) -> bool:
+        """Whether more than this share of the measurements are outliers.
+
+        Of few measurements, more than half; where nearly half is asked, half: which half is right was then chance.
+        """
+        if self.measurements >= MANY_OF_A_FRAME:
+            return self.left_out > share * self.measurements
+        twice = 2 * self.left_out
+        return twice > self.measurements or (share < HALF and twice == self.measurements > 0)
+
+
+def contradicted_frames(
+    counts: Mapping[Pair, tuple[int, int]], nearly_half: float = NEARLY_HALF
+) -> tuple[LeftOut, ...]:
+    """The sensors and targets of which most measurements were left out: more than half, of few half, of many near it.
+
+    ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
+    likely to be wrong as they are: a clock, a size or a mounting may have changed. The frame with most outliers comes
+    first. Its outliers then count for no other frame: the targets are not to blame for a camera that contradicts all of
+    them. So frames with more than half come before those with nearly half: of two cameras that see one target, the
+    one that contradicts everything makes half of the target's measurements outliers.
+    """
+    rest = counts
+    everything = _by_frame(counts)
+    names: list[str] = []
+    for share in (HALF, nearly_half):
+        while beyond := [frame for frame in _by_frame(rest).values() if frame.is_beyond(share)]:
+            names.append(max(beyond, key=lambda frame: frame.left_out).frame)
+            rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
+    # A frame that was seen only together with contradicted frames rests on them.
+    known = {*names, *_by_frame(rest)}
+    names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(nearly_half)]
+    return tuple(everything[name] for name in names)
+
+
+def _by_frame(counts: Mapping[Pair, tuple[int, int]]) -> dict[str, LeftOut]:
+    """The counts of each sensor and target, over all its pairs."""
+    left_out, measurements = Counter[str](), Counter[str]()
+    for pair, (kept, number) in counts.items():
+        for name in pair.frames:
+            left_out[name] += number - kept
+            measurements[name] += number
+    return {name: LeftOut(name, left_out[name], number) for name, number in measurements.items()}
+
 
 #: A sentence about outliers names at most this many pairs.
 NAMED = 5
@@ -91,3 +174,287 @@ def few_words(frame: str, number: int) -> str:
     if number == 1:
         return f"{frame} rests on 1 measurement: a wrong one would not show"
     return f"{frame} rests on {number} measurements: a wrong one could not be told from the other"
+
+
+#: An error of so many medians is gross. Of Gaussian errors none is; of Student's t one in 4,000 with 5 degrees of
+#: freedom, one in 300 with 3.
+GROSS = 8.0
+#: A pair with fewer rows has no median of its own; that of all pairs counts.
+FEWEST_ROWS_OF_MEDIAN = 10
+#: At most so many pairs and measurements are looked at.
+MOST_PAIRS_ASKED, MOST_ASKED = 200, 10_000
+#: With fewer measurements in all, one cannot be told from the others.
+FEWEST_ASKED = 8
+
+
+@dataclass(frozen=True)
+class GrossErrors:
+    """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part.
+
+    Attributes
+    ----------
+    number, looked_at, in_all : int
+        Measurements that look wrong, those that were looked at, and those of the problem: of large problems a sample is
+        looked at, and pairs with a few measurements are left out.
+    """
+
+    number: int
+    looked_at: int
+    in_all: int
+
+    def __str__(self) -> str:
+        look = "looks" if self.number == 1 else "look"
+        rest = self.in_all - self.looked_at
+        others = f"; {rest} more {'was' if rest == 1 else 'were'} not looked at" if rest else ""
+        return (
+            f"{self.number} of {self.looked_at} measurements {look} wrong (off by more than {GROSS:g} times what half "
+            f"of the others are off by{others}), and still every measurement counts"
+        )
+
+
+def gross_errors(problem: Problem) -> GrossErrors | None:
+    """Measurements of a problem, or of a sample of it, that look wrong; None where none does, or none can be told."""
+    sampled = Sampled.of(problem, MOST_PAIRS_ASKED, MOST_ASKED)
+    if sampled is None or sampled.count < FEWEST_ASKED:
+        return None
+    fit = fitted(problem, sampled.as_read())
+    if fit is None:
+        return None
+    ends = np.cumsum([len(rows) for rows in sampled.rows.values()])[:-1]
+    errors = fit.errors / _stated(sampled)
+    medians = np.median(errors, axis=1, keepdims=True)
+    ratios = [_in_medians(of_pair, medians) for of_pair in np.split(errors, ends, axis=1)]
+    number = int((np.concatenate(ratios) > GROSS).sum())
+    return GrossErrors(number, sampled.count, problem.number_of_measurements) if number else None
+
+
+def _stated(sampled: Sampled) -> Array:
+    """The noise that was stated for each measurement (2, N), rad and m: only its ratios count."""
+    rows = [(sampled.whole[pair], chosen) for pair, chosen in sampled.rows.items()]
+    rotation = np.concatenate([np.sqrt(0.5 / raw.kappa[chosen]) for raw, chosen in rows])
+    return np.stack([rotation, np.concatenate([raw.sigma[chosen] for raw, chosen in rows])])
+
+
+def _in_medians(errors: Array, medians: Array) -> Array:
+    """The larger of both errors (2, N) of each measurement (N,), in medians of the pair, or of all pairs."""
+    own = np.median(errors, axis=1, keepdims=True) if errors.shape[1] >= FEWEST_ROWS_OF_MEDIAN else medians
+    return np.asarray((errors / np.maximum(np.maximum(own, medians), 1e-12)).max(axis=0))
+
+
+#: What was left out is looked at from this share of all measurements on, and from so many.
+SHARE_LEFT_OUT, FEWEST_LEFT_OUT = 0.25, 8
+#: The medians of its residuals, rotation times translation, are this many times smaller than those of what was kept.
+FAR_SMALLER = 25.0
+#: A measurement agrees with a fit within this many standard deviations, of rotation and of translation.
+AGREES_SIGMAS = 5.0
+
+
+def more_consistent(problem: Problem, inliers: Inliers) -> Inliers | None:
+    """The measurements that agree with those that were left out, where these agree far better with one another.
+
+    None where the choice of ``inliers``, by pair (N,) booleans, stands.
+    """
+    number = sum(len(mask) for mask in inliers.values())
+    left_out = sum(int((~mask).sum()) for mask in inliers.values())
+    if left_out < max(FEWEST_LEFT_OUT, SHARE_LEFT_OUT * number):
+        return None
+    raw = {pair: problem.measurements(*pair) for pair in inliers}
+    kept: Sample = {pair: (raw[pair].A[mask], raw[pair].B[mask]) for pair, mask in inliers.items() if mask.any()}
+    other: Sample = {pair: (raw[pair].A[~mask], raw[pair].B[~mask]) for pair, mask in inliers.items() if not mask.all()}
+    of_kept, of_other = fitted(problem, kept), fitted(problem, other)
+    if of_kept is None or of_other is None or _product(of_other) * FAR_SMALLER > _product(of_kept):
+        return None
+    if not all(name in of_other.frames for pair in inliers for name in pair.frames):
+        return None  # it does not tell all frames
+    spread = np.array([of_other.residual.rotation_rad, of_other.residual.translation_m]) / MEDIAN_OF_CHI
+    found: Inliers = {}
+    for pair in inliers:
+        scale = of_other.scale[pair.target] if isinstance(of_other.scale, dict) else of_other.scale
+        errors = residuals(of_other.frames, scale, pair, raw[pair].A, raw[pair].B)
+        found[pair] = np.asarray((errors < AGREES_SIGMAS * spread[:, None]).all(axis=0))
+    return found if sum(int(mask.sum()) for mask in found.values()) >= left_out // 2 else None
+
+
+def _product(fit: TrialFit) -> float:
+    return fit.residual.rotation_rad * fit.residual.translation_m
+
+
+#: Without at least so many equations more than unknowns a wrong measurement cannot be told from the others: it has six
+#: of its own, and the rest must tell noise from it.
+SPARE_EQUATIONS = 24
+#: The share of the measurements that agree where the noise is about right.
+MOST_AGREE = 0.5
+#: Of so large a share of outliers the verdict says something.
+MANY = 0.3
+#: Of fewer measurements than this, more than this share of outliers under the stated noise may be a noise stated too
+#: small: so it is where under the noise that the residuals show none is left out.
+FEW, MANY_OF_FEW = 20, 0.25
+#: So many that agree, with residuals of a sensor, are right, and the others are outliers.
+MAJORITY = 0.6
+
+
+def without_outliers(
+    run: Run, first: Solution | None, clearly_off: tuple[str, ...] = ()
+) -> tuple[Solution | None, Inliers]:
+    """The certified solution of the measurements that agree, and which these are: empty where every one counts.
+
+    Parameters
+    ----------
+    run : Run
+    first : Solution or None
+        The certified solution of all measurements; None where it has no positive scale.
+    clearly_off : tuple of str
+        Sensors whose clocks are clearly off. That makes some of what moves an outlier, so they are taken along.
+    """
+    problem, options, record = run.problem, run.options, run.record
+    spare = spare_equations(problem)
+    if options.robust == "none":
+        record.choose(OUTLIERS, "every measurement counts", "an option says so")
+        if gross := gross_errors(problem):
+            record.find(Ground.OUTLIERS_KEPT, str(gross))
+        return first, {}
+    if not problem.has_measurements:
+        record.choose(OUTLIERS, "every measurement counts", "the raw measurements were not kept")
+        return first, {}
+    if options.robust == "auto" and spare < SPARE_EQUATIONS:
+        record.choose(
+            OUTLIERS,
+            "not looked for",
+            f"{problem.number_of_measurements} measurements are too few to tell a wrong one from the others; "
+            f"{-((spare - SPARE_EQUATIONS) // 6)} more would do",
+        )
+        return first, {}
+    offsets = clearly_off or offsets_of(problem, options)
+    try:
+        solution, inliers = _agreeing(run, first, offsets)
+        other = more_consistent(problem, inliers)
+        if other is not None:
+            solution, inliers = solve(selected(problem, other), options=options.solve), other
+        return solution, inliers
+    except (OutlierError, NoiseError, ScaleError) as error:
+        record.choose(OUTLIERS, "not left out", f"it is not possible: {error}")
+        words = "too few measurements agree with one another to find out which are wrong"
+        record.find(Ground.CONTRADICTED, words)
+        return first, {}
+
+
+def _agreeing(run: Run, first: Solution | None, offsets: bool | tuple[str, ...]) -> tuple[Solution, Inliers]:
+    """The certified solution of the measurements that agree, and which these are.
+
+    Under a stated noise that is far too small nearly nothing agrees. Where most agree under the noise that the
+    residuals show, that noise decides; the stage of the noise says then that the stated one is too small.
+    """
+    if run.options.noise != "given":
+        return _agreeing_under(run, first, offsets, "estimate")
+    try:
+        found = _agreeing_under(run, first, offsets, "given")
+        share = _share_kept(found[1])
+        is_doubtful = run.problem.number_of_measurements < FEW and share < 1.0 - MANY_OF_FEW
+        if share > MOST_AGREE and not is_doubtful:
+            return found
+    except (OutlierError, NoiseError, ScaleError) as error:
+        found, share, why = None, 0.0, error
+    try:
+        other = _agreeing_under(run, first, offsets, "estimate")
+    except (OutlierError, NoiseError, ScaleError):
+        other = None
+    if other is not None and (_share_kept(other[1]) == 1.0 or (_share_kept(other[1]) > MOST_AGREE >= share)):
+        return other
+    if found is None:
+        raise why
+    return found
+
+
+def _share_kept(inliers: Inliers) -> float:
+    return float(np.concatenate(list(inliers.values())).mean())
+
+
+def _agreeing_under(
+    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
+) -> tuple[Solution, Inliers]:
+    problem, options = run.problem, run.options
+    has_more = problem.has_covariances or options.carrier_noise is not None or bool(offsets)
+    if first is not None and has_more:
+        return _inliers_under_the_full_noise(run, first, offsets, noise)
+    found = graduated(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=run.tell)
+    return found.solution, found.inliers
+
+
+def _inliers_under_the_full_noise(
+    run: Run, first: Solution, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
+) -> tuple[Solution, Inliers]:
+    """Inliers where sigma and kappa do not hold the whole noise: ``refine`` chooses them again under it."""
+    options = run.options
+    how = RefineOptions(
+        noise=noise,
+        noise_groups=options.noise_groups,
+        robust="gnc",
+        inlier_confidence=options.inlier_confidence,
+        carrier_noise=options.carrier_noise,
+        carrier_model="propagated",
+        time_offsets=offsets,
+        carrier_path=options.carrier_path if offsets else None,
+    )
+    try:
+        refined = refine(run.problem, first, how, progress=run.tell)
+    except NoiseError:
+        if options.carrier_noise is None:
+            raise
+        # More noise is stated for A than the residuals hold. They are judged by what they show, and again under
+        # the noise that is found.
+        refined = refine(run.problem, first, replace(how, carrier_noise=None), progress=run.tell)
+    return refined.solution, refined.inliers
+
+
+def share_that_agrees_plausibly(run: Run, first: Solution | None) -> float | None:
+    """The share of the measurements that agree with one another, with residuals that a sensor may have.
+
+    None where fewer than ``MAJORITY`` do: then outliers do not explain what is wrong with the others.
+    """
+    attempt = run.attempt()
+    solution, inliers = without_outliers(attempt, first)
+    if solution is None or not inliers or _share_kept(inliers) < MAJORITY:
+        return None
+    return None if implausible(selected(run.problem, inliers), solution) else _share_kept(inliers)
+
+
+def say_outliers(run: Run, inliers: Inliers) -> None:
+    """The choice of outliers, where they were looked for."""
+    if inliers:
+        outliers = Outliers.of(run.problem, inliers)
+        run.record.choices.append(outliers.choice("they are farther off than the noise of the others explains"))
+
+
+def outliers_of(run: Run, inliers: Inliers, *, is_answered: bool) -> Outliers:
+    """The outliers as a record; what they say against frames is found, and what they leave too little of."""
+    outliers = Outliers.of(run.problem, inliers)
+    sensors = run.problem.sensors
+    contradicted = contradicted_frames(outliers.counts)
+    for frame in contradicted:
+        run.record.find(Ground.CONTRADICTED if frame.frame in sensors else Ground.TARGET_CONTRADICTED, str(frame))
+    for name in outliers.left_out:
+        if name in sensors:
+            words = f"{name} has no pose, because no measurement of it is in the answer"
+            run.record.find(Ground.NO_ANSWER, words)
+    number = sum(len(mask) for mask in inliers.values())
+    left_out = sum(int((~mask).sum()) for mask in inliers.values())
+    if left_out > MANY * number and not contradicted:
+        words = f"{left_out} of {number} measurements contradict the answer and were left out"
+        run.record.find(Ground.MANY_OUTLIERS, words)
+    if is_answered:
+        known = {frame.frame for frame in contradicted} | {*run.problem.fixed, *run.problem.priors}
+        for name, number in outliers.resting_on_few.items():
+            if name not in known:
+                run.record.find(Ground.FEW_MEASUREMENTS, few_words(name, number))
+    return outliers
+
+
+def spare_equations(problem: Problem) -> int:
+    """How many more equations than unknowns there are: six for each measurement, and those of priors."""
+    free = [name for name in (*problem.targets, *problem.sensors) if name not in problem.fixed]
+    beliefs = [prior for name in free for prior in problem.priors.get(name, [])]
+    scales = {"known": 0, "shared": 1}.get(problem.scale)
+    if scales is None:
+        scales = len({pair.target for pair in problem.pairs} - set(problem.fixed_scales))
+    known = sum(3 * (prior.sigma is not None) + 3 * (prior.kappa is not None) for prior in beliefs)
+    return 6 * problem.number_of_measurements + known - 6 * len(free) - scales

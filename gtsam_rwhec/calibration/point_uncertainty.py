@@ -1,31 +1,360 @@
-"""How far off a point is, by a refined calibration: its ellipsoid in the frame in which it is expressed."""
+"""How far off is a point that a sensor sees: the uncertainty of a calibration in task units.
+
+A point p in the frame f, seen from a carrier or from another frame g on the same carrier, is q = T_g_f p. To first
+order an error xi = [omega, v] of T_g_f Expmap(xi) moves it by R_g_f (omega x p + v), so its covariance is J Sigma J'
+with J = R_g_f [-[p]x, I]. With one scale for all lengths, the point is taken as measured (true = measured / scale), and
+an error of the scale moves it by -p d(scale) / scale. On the other carrier, T_g_f has the pose A of the moment.
+The noise of one new measurement is told apart: it averages out over measurements, and the calibration's error does not.
+"""
 
 from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
-
-from gtsam_rwhec.calibration.seen_from import Carriers, place_of, sides_of
-from gtsam_rwhec.calibration.task_units import (
-    PointUncertainty,
-    ball_radius,
-    checked_level,
-    checked_point,
-    ellipsoid,
-    jacobian_of_point,
-)
-from gtsam_rwhec.calibration.views import SensorView
 from gtsam_rwhec.errors import PoseError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.poses import one_transform
 from gtsam_rwhec.problem.pairs import Pair
+from dataclasses import dataclass
+from rwhec_factors import se3
+from scipy.special import chdtr
+from scipy.special import fdtr
+from scipy.special import fdtri
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import LARGEST_M
+from gtsam_rwhec.geometry.real_numbers import is_real
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.refinement.refined import RefinedPoses
+
+#: Nodes of the quadrature over directions, in cos(polar angle) and in azimuth. With these the probability of a ball is
+#: right to 1e-6 for axes of any ratio that changes the radius.
+NODES = (48, 24)
+
+
+@dataclass(frozen=True, eq=False)
+class PointUncertainty:
+    """How far off a point is that is seen in one frame and expressed in another.
+
+    Attributes
+    ----------
+    point_m : (3,) array
+        The point in ``frame``, metres.
+    frame, seen_from : str
+        The frame of the point, and the frame in which it is expressed.
+    level : float
+        Probability of the ellipsoid and of the ball.
+    centre_m : (3,) array
+        The point in ``seen_from``, metres.
+    covariance_m2 : (3, 3) array
+        Covariance of the centre from the calibration's errors, in the axes of ``seen_from``, m^2; infinite in rows that
+        a free direction moves.
+    axes : (3, 3) array
+        Columns: the ellipsoid's axes in ``seen_from``, the longest first.
+    half_lengths_mm : (3,) array
+        The ellipsoid's half axes at the level, millimetres.
+    radius_mm : float
+        The true point is within this distance of the centre with probability ``level``, millimetres.
+    measurement_mm : float or None
+        The same radius for the noise of one new measurement alone, which is not in ``radius_mm``: of the sensor, and of
+        A where the point is expressed on the other carrier. None where nothing is measured, and where the noise is not
+        known.
+    """
+
+    point_m: Array
+    frame: str
+    seen_from: str
+    level: float
+    centre_m: Array
+    covariance_m2: Array
+    axes: Array
+    half_lengths_mm: Array
+    radius_mm: float
+    measurement_mm: float | None
+
+    def __str__(self) -> str:
+        distance_m = float(np.linalg.norm(self.point_m))
+        return point_sentence(self.frame, self.seen_from, distance_m, self.level, self.radius_mm, self.measurement_mm)
+
+
+def point_sentence(
+    frame: str, seen_from: str, distance_m: float, level: float, radius_mm: float, measurement_mm: float | None
+) -> str:
+    """How far off a point is, as one sentence."""
+    what = f"A point {distance_m:.2f} m from {frame}, expressed in {seen_from},"
+    if not np.isfinite(radius_mm):
+        return f"{what} is not determined: the measurements leave a direction free that moves it."
+    said = f"{what} is within {rounded(radius_mm)} mm of its true place with {100 * level:g} % probability"
+    if measurement_mm is None:
+        return f"{said}."
+    return f"{said}; the noise of one new measurement adds up to {rounded(measurement_mm)} mm."
+
+
+def checked_point(point: ArrayLike) -> Array:
+    """A point (3,) in metres; a PoseError for anything else."""
+    try:
+        result = np.asarray(point, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise PoseError(f"the point is {brief(point)}; give three numbers, metres") from error
+    if result.shape != (3,) or not (np.abs(result) <= LARGEST_M).all():
+        raise PoseError(f"the point is {brief(point)}; give three finite numbers, metres, up to {LARGEST_M:g}")
+    return result
+
+
+def checked_level(level: float) -> float:
+    """A probability between 0 and 1; an OptionError for anything else."""
+    if not (is_real(level) and 0.0 < level < 1.0):
+        raise OptionError(f"level={brief(level)}; give one between 0 and 1")
+    return float(level)
+
+
+def jacobian_of_point(R: Array, point: Array) -> Array:
+    """J (3, 6) = R [-[p]x, I]: the movement of R p + t by a right perturbation [omega, v]."""
+    return np.asarray(R @ np.hstack([-se3.hat(point), np.eye(3)]))
+
+
+def ellipsoid(covariance: Array, level: float, degrees_of_freedom: float) -> tuple[Array, Array, float]:
+    """Axes (3, 3), half lengths (3,) and the ball's radius, for a covariance (3, 3), in its unit of length.
+
+    With finite degrees of freedom (the noise was estimated) the error is a multivariate t, and the ellipsoid is that of
+    3 F(3, nu). The longest axis is first. Where rows are infinite, these axes come first and have infinite lengths.
+    """
+    free = ~np.isfinite(np.diagonal(covariance))
+    inside = np.flatnonzero(~free)
+    values, vectors = np.linalg.eigh(covariance[np.ix_(inside, inside)])
+    order = np.argsort(values)[::-1]
+    variances = np.concatenate([np.full(free.sum(), np.inf), np.maximum(values[order], 0.0)])
+    axes = np.zeros((3, 3))
+    axes[np.flatnonzero(free), np.arange(free.sum())] = 1.0
+    axes[np.ix_(inside, np.arange(free.sum(), 3))] = vectors[:, order]
+    infinite = np.isinf(degrees_of_freedom)
+    square = chdtri(3, 1.0 - level) if infinite else 3.0 * fdtri(3, degrees_of_freedom, level)
+    return axes, np.sqrt(square * variances), ball_radius(variances, level, degrees_of_freedom)
+
+
+def ball_radius(variances: Array, level: float, degrees_of_freedom: float = np.inf) -> float:
+    """The radius of the ball about the centre that holds a normal (or t) vector with this probability.
+
+    In polar coordinates z = rho u of the whitened error, u is uniform on the sphere and independent of rho^2, which is
+    chi-square with 3 degrees of freedom (or 3 F(3, nu)). So P(|e| <= r) is the mean over u of P(rho^2 <= r^2 / u'Vu).
+    """
+    if not np.isfinite(variances).all():
+        return float("inf")
+    largest = float(variances.max())
+    if largest <= 0.0:
+        return 0.0
+    x, wx = np.polynomial.legendre.leggauss(NODES[0])
+    y, wy = np.polynomial.legendre.leggauss(NODES[1])
+    cosine, azimuth = 0.5 * (x + 1.0), 0.25 * np.pi * (y + 1.0)  # one octant; the others are alike
+    weight = 0.25 * wx[:, None] * wy
+    sine = np.sqrt(1.0 - cosine**2)
+    direction = np.stack(
+        [
+            np.broadcast_to(cosine[:, None], weight.shape),
+            sine[:, None] * np.cos(azimuth),
+            sine[:, None] * np.sin(azimuth),
+        ]
+    )
+    spread = np.einsum("i,ixy->xy", np.sort(variances)[::-1] / largest, direction**2)
+
+    def lacking(square: float) -> float:
+        ratio = square / spread
+        known = chdtr(3, ratio) if np.isinf(degrees_of_freedom) else fdtr(3, degrees_of_freedom, ratio / 3.0)
+        return float((weight * known).sum()) - level
+
+    end = 1.0
+    while lacking(end) < 0.0:
+        end *= 4.0
+    from scipy.optimize import brentq  # here, since its import takes as long as a calibration of few poses
+
+    return float(np.sqrt(largest * brentq(lacking, 0.0, end, xtol=1e-12)))
+
+
+#: The words for a carrier that a problem does not name. Without A, each but one means the carrier of the point's own
+#: frame; with A, the other one.
+CARRIER_WORDS = {
+    "sensor": ("sensorcarrier", "hand", "base", "rig"),
+    "target": ("targetcarrier", "base", "hand", "world"),
+}
+#: Of these words, the one that is more often the other carrier. Without A it says too little.
+MORE_OFTEN_THE_OTHER = {"sensor": "base", "target": "hand"}
+
+
+@dataclass(frozen=True)
+class Carriers:
+    """The names of the carriers as the problem states them; None where it does not."""
+
+    sensors: str | None = None
+    targets: str | None = None
+
+    def of(self, side: str) -> str | None:
+        """The name of the carrier of "sensor" or "target"."""
+        return self.sensors if side == "sensor" else self.targets
+
+
+@dataclass(frozen=True)
+class Side:
+    """The frames on one carrier.
+
+    Attributes
+    ----------
+    kind : "sensor" or "target"
+    poses : dict of str to gtsam.Pose3
+        On the carrier.
+    words : tuple of str
+        What the carrier is called.
+    """
+
+    kind: str
+    poses: Mapping[str, gtsam.Pose3]
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a point is expressed.
+
+    Attributes
+    ----------
+    name : str
+    frame : gtsam.Pose3 or None
+        The pose of the frame on its carrier; None for the carrier itself.
+    is_across : bool
+        Whether it is on the other carrier than the point's own frame.
+    """
+
+    name: str
+    frame: gtsam.Pose3 | None
+    is_across: bool
+
+
+def sides_of(refined: RefinedPoses, frame: object, carriers: Carriers, *, has_A: bool) -> tuple[Side, Side]:
+    """The carrier of a frame, and the other one. A FrameError where there is no such frame."""
+    poses = {"sensor": refined.Y, "target": refined.X}
+    own = next((kind for kind, of in poses.items() if isinstance(frame, str) and frame in of), None)
+    if own is None:
+        raise FrameError(
+            f"there is no frame {brief(frame)}; there are the sensors {', '.join(refined.Y) or '(none)'} and the "
+            f"targets {', '.join(refined.X) or '(none)'}"
+        )
+
+    def side(kind: str, *, all_words: bool) -> Side:
+        name = carriers.of(kind)
+        known: tuple[str, ...] = CARRIER_WORDS[kind]
+        if not has_A:
+            known = tuple(word for word in known if word != MORE_OFTEN_THE_OTHER[kind])
+        words = (known if all_words else known[:1]) if name is None else (name, known[0])
+        return Side(kind, poses[kind], words)
+
+    other = "target" if own == "sensor" else "sensor"
+    return side(own, all_words=not has_A), side(other, all_words=has_A)
+
+
+def place_of(seen_from: object, frame: str, own: Side, other: Side, carriers: Carriers, *, has_A: bool) -> Place:
+    """Where a point of ``frame`` is expressed, by the word that a user gave, or None.
+
+    Raises
+    ------
+    FrameError
+        There is no such place, or it is on the other carrier and A is not given.
+    OptionError
+        A is given, and has no use.
+    """
+    place = _named(seen_from, frame, own, other, carriers, has_A=has_A)
+    is_unclear = isinstance(seen_from, str) and seen_from == MORE_OFTEN_THE_OTHER[own.kind]
+    if place is None and is_unclear and not has_A and carriers.of(own.kind) is None:
+        raise FrameError(
+            f"it is not clear which carrier {seen_from!r} is, as the problem does not name its carriers; name them: "
+            f'rw.Problem(sensor_carrier="hand", target_carrier="base"), or say seen_from="{own.words[0]}" for the '
+            f"carrier of {frame}; for the other carrier, which moves relative to {frame}, give the pose at that moment "
+            "too: uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
+        )
+    if place is None:
+        raise FrameError(
+            f"{brief(seen_from)} is no frame in which a point of {frame} can be expressed; there are its carrier "
+            f"{_listed(own, frame)}, and with A = T_sensorcarrier_targetcarrier the other carrier "
+            f"{_listed(other, frame)}"
+        )
+    if place.is_across and not has_A:
+        raise FrameError(
+            f"{place.name} is on the carrier of the {other.kind}s, which moves relative to {frame}; give the pose at "
+            "that moment too: uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
+        )
+    if has_A and not place.is_across:
+        raise OptionError(
+            f"A has no use: {place.name} and {frame} are on one carrier; leave A out, or take a frame on the other "
+            f"carrier {_listed(other, frame)}"
+        )
+    return place
+
+
+def _named(seen_from: object, frame: str, own: Side, other: Side, carriers: Carriers, *, has_A: bool) -> Place | None:
+    word = seen_from if isinstance(seen_from, str) else None
+    asked = next((side for side in (own, other) if word in side.words), None)
+    if seen_from is None:
+        asked = other if has_A else own
+    if asked is not None:
+        standing_in = f"the frame that carries {frame}" if asked is own else f"the frame that carries the {other.kind}s"
+        return Place(carriers.of(asked.kind) or standing_in, None, asked is other)
+    for side in (own, other):
+        if word is not None and word != frame and word in side.poses:
+            return Place(word, side.poses[word], side is other)
+    return None
+
+
+def _listed(side: Side, frame: str) -> str:
+    others = [name for name in side.poses if name != frame]
+    return f"({', '.join(side.words)}){' and ' + ', '.join(others) if others else ''}"
+
+
+#: Unit vectors whose mean is shorter than this have no common direction.
+NO_DIRECTION = 0.1
+
+
+@dataclass(frozen=True)
+class SensorView:
+    """Where a sensor saw its targets: the typical point (3,) in metres, and whether every one was in front of it."""
+
+    point_m: tuple[float, float, float]
+    in_front: bool
+
+
+def views_of(
+    problem: Problem, inliers: Mapping[Pair, np.ndarray], scale: float | dict[str, float]
+) -> dict[str, SensorView]:
+    """Where each sensor saw its targets: their median distance, in their mean direction, true metres."""
+    points: dict[str, list[np.ndarray]] = {}
+    if not problem.has_measurements:
+        return {}
+    for pair in problem.pairs:
+        if pair.is_motion:
+            continue
+        seen = problem.measurements(*pair).B[:, :3, 3]
+        if inliers:
+            seen = seen[inliers[pair]]
+        length = scale.get(pair.target) if isinstance(scale, dict) else scale
+        if len(seen) and length is not None:
+            points.setdefault(pair.sensor, []).append(seen / length)
+    return {sensor: _view(np.concatenate(seen)) for sensor, seen in points.items()}
+
+
+def _view(seen: np.ndarray) -> SensorView:
+    distances = np.linalg.norm(seen, axis=1)
+    mean = (seen / np.maximum(distances, 1e-300)[:, None]).mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    # Seen all around, the mean has no direction; then z, which is forward for cameras.
+    direction = mean / length if length > NO_DIRECTION else np.array([0.0, 0.0, 1.0])
+    x, y, z = (float(np.median(distances)) * direction).tolist()
+    return SensorView((x, y, z), bool((seen[:, 2] > 0.0).all()))
 
 
 def point_uncertainty(

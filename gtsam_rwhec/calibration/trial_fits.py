@@ -1,4 +1,4 @@
-"""Robust fits of a sample of a problem's measurements: what a reading of them leaves unexplained.
+"""Robust fits of a sample of the measurements: what a reading leaves unexplained, and whether that may be noise.
 
 A fit iterates re-weighted certified-form least squares: its weights come from its own residuals, so neither stated
 weights nor outliers decide, and the same measure serves a good reading and a wrong one. Only the search of the solver
@@ -7,16 +7,22 @@ runs: no certificate, no covariances.
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from rwhec_factors.se3 import inverse, pose
 
+from gtsam_rwhec.calibration.other_readings import OtherReading
 from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.descent import descend
@@ -228,3 +234,248 @@ def signal_of(sample: Sample) -> Spread:
         rotation.append(angles(R, mean))
         translation.append(np.linalg.norm(t - np.median(t, axis=0), axis=1))
     return Spread.of(np.concatenate(rotation), np.concatenate(translation))
+
+
+#: At most so many measurements of a pair, from all over its rows.
+MOST_OF_A_PAIR = 200
+#: At most so many pairs: those that join the frames with the most measurements.
+MOST_PAIRS = 24
+#: At most so many measurements in all.
+MOST_IN_ALL = 2000
+#: About so many blocks of neighbouring rows are compared.
+BLOCKS = 24
+#: A row turns by at most this share of what rows far apart differ by, where carriers move slowly.
+SLOW_SHARE = 0.3
+#: A pair with fewer measurements is not sampled where others have more: it says little, and has its own unknowns.
+FEWEST_OF_A_PAIR = 4
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The raw measurements of some pairs, and which rows of each are looked at."""
+
+    whole: dict[Pair, Measurements]
+    rows: dict[Pair, np.ndarray]
+
+    @staticmethod
+    def of(problem: Problem, most_pairs: int = MOST_PAIRS, most_in_all: int = MOST_IN_ALL) -> Sampled | None:
+        """A sample of a problem; None where it kept no measurements."""
+        if not problem.has_measurements:
+            return None
+        pairs = _pairs(problem, most_pairs)
+        most = max(min(MOST_OF_A_PAIR, most_in_all // len(pairs)), FEWEST_OF_A_PAIR)
+        whole = {pair: problem.measurements(*pair) for pair in pairs}
+        rows = {pair: np.unique(np.linspace(0, len(raw.A) - 1, most).astype(int)) for pair, raw in whole.items()}
+        return Sampled(whole, rows)
+
+    @property
+    def count(self) -> int:
+        """The number of measurements."""
+        return sum(map(len, self.rows.values()))
+
+    @property
+    def unknown_poses(self) -> int:
+        """The number of frames."""
+        return len({name for pair in self.rows for name in pair.frames})
+
+    def as_read(self) -> dict[Pair, tuple[Array, Array]]:
+        """A and B as they are."""
+        return {pair: (raw.A[self.rows[pair]], raw.B[self.rows[pair]]) for pair, raw in self.whole.items()}
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether every pair has stamps, and moves slowly from one row to the next: then rows tell a clock's offset.
+
+        A shift of such rows and an offset of the clock are one thing, and the offset is estimated.
+        """
+        for raw in self.whole.values():
+            if raw.stamps_ns is None or len(raw.A) < 3:
+                return False
+            R = raw.A[np.argsort(raw.stamps_ns), :3, :3]
+            apart = len(R) // 2
+            if np.median(angles(R[1:], R[:-1])) > SLOW_SHARE * np.median(angles(R[apart:], R[: len(R) - apart])):
+                return False
+        return True
+
+    @property
+    def all_poses(self) -> tuple[Array, Array]:
+        """A and B (N, 4, 4) of all pairs, as they are."""
+        A, B = (np.concatenate(poses) for poses in zip(*self.as_read().values(), strict=True))
+        return A, B
+
+    @property
+    def median_lengths(self) -> tuple[float, float]:
+        """Median lengths of A's translations about their own median, and of B's."""
+        A, B = (poses[:, :3, 3] for poses in self.all_poses)
+        centred = A - np.median(A, axis=0)
+        return float(np.median(np.linalg.norm(centred, axis=1))), float(np.median(np.linalg.norm(B, axis=1)))
+
+    def by(self, reading: OtherReading) -> dict[Pair, tuple[Array, Array]]:
+        """A and B by another reading. Motions have one frame, and their rows belong together: no roles, no shift."""
+        found = {}
+        for pair, raw in self.whole.items():
+            rows, shift = self.rows[pair][self._remains(pair, reading)], 0 if pair.is_motion else reading.shift
+            if len(rows):
+                found[reading.pair(pair)] = reading.changed(raw.A[rows], raw.B[rows + shift])
+        return found
+
+    def remains(self, reading: OtherReading) -> np.ndarray:
+        """Which measurements of ``as_read`` the reading has too, pair after pair: a shift leaves some out."""
+        return np.concatenate([self._remains(pair, reading) for pair in self.rows])
+
+    def _remains(self, pair: Pair, reading: OtherReading) -> np.ndarray:
+        shifted = self.rows[pair] + (0 if pair.is_motion else reading.shift)
+        return (shifted >= 0) & (shifted < len(self.whole[pair].B))
+
+    def blocks(self) -> np.ndarray:
+        """A block number of each measurement: blocks are contiguous rows of a pair, since neighbours share errors."""
+        of_a_pair = -(-BLOCKS // len(self.rows))
+        numbers, first = [], 0
+        for rows in self.rows.values():
+            many = min(of_a_pair, len(rows))
+            numbers.append(first + np.arange(len(rows)) * many // len(rows))
+            first += many
+        return np.concatenate(numbers)
+
+
+def _pairs(problem: Problem, most: int) -> list[Pair]:
+    """The pairs with the most measurements, each joined to those before it where there is such a pair."""
+    counts = {pair: problem.moments(*pair).count for pair in problem.pairs}
+    by_frame: dict[str, set[Pair]] = defaultdict(set)
+    for pair in counts:
+        for name in pair:
+            by_frame[name].add(pair)
+    enough = [pair for pair, count in counts.items() if count >= FEWEST_OF_A_PAIR] or list(counts)
+    left = sorted(enough, key=lambda pair: -counts[pair])
+    chosen: list[Pair] = []
+    names: set[str] = set()
+    while left and len(chosen) < most:
+        # A pair that closes a loop tells more than one with a frame of its own.
+        best = max(left, key=lambda pair: (sum(name in names for name in pair), counts[pair]))
+        chosen.append(best)
+        names.update(best)
+        left.remove(best)
+    return chosen
+
+
+#: No camera, lidar or motion capture turns a target by this much (degrees) in half of its measurements.
+LARGEST_DEG = 25.0
+#: From this much (degrees) on, a residual that is most of what B varies by is no noise either.
+LARGE_DEG = 12.0
+#: "Most of what B varies by": the calibration then explains next to nothing.
+UNEXPLAINED_PART = 0.6
+#: Half of a sensor's measurements are never off by this share of the target's distance.
+LARGEST_SHARE_OF_DISTANCE = 0.25
+
+
+class Unlikely(StrEnum):
+    """Why residuals are no measurement noise."""
+
+    #: The median rotation residual is larger than any sensor's.
+    ROTATION = "rotation"
+    #: Rotations of B vary as much after the calibration as before it.
+    ROTATION_UNEXPLAINED = "rotation_unexplained"
+    #: Translations of B vary as much after the calibration as before it.
+    TRANSLATION_UNEXPLAINED = "translation_unexplained"
+
+
+@dataclass(frozen=True)
+class Implausible:
+    """Residuals that no sensor has; ``str()`` is one sentence.
+
+    Attributes
+    ----------
+    why : Unlikely
+    rotation_deg, translation_mm : float
+        The median residuals; root mean squares where measurements were not kept.
+    varies_deg, varies_mm : float
+        What B varies by within its pairs, medians; nan where measurements were not kept.
+    """
+
+    why: Unlikely
+    rotation_deg: float
+    translation_mm: float
+    varies_deg: float
+    varies_mm: float
+
+    def __str__(self) -> str:
+        deg, mm = rounded(self.rotation_deg, 3), rounded(self.translation_mm, 3)
+        found = {
+            Unlikely.ROTATION: f"half of the measurements are off by {deg} deg or more ({mm} mm)",
+            Unlikely.ROTATION_UNEXPLAINED: f"the median residual of rotations, {deg} deg, is about "
+            f"as large as what B varies by ({rounded(self.varies_deg, 3)} deg)",
+            Unlikely.TRANSLATION_UNEXPLAINED: f"the median residual of translations, {mm} mm, is "
+            f"about as large as what B varies by ({rounded(self.varies_mm, 3)} mm)",
+        }[self.why]
+        return f"{found}: no sensor measures like that, so A and B do not belong together as given"
+
+
+def implausible(problem: Problem, solution: Solution | None) -> Implausible | None:
+    """Find residuals that are no measurement noise, with weights or without.
+
+    ``calibrate`` asks again of the measurements that agree: wrong ones may pull the fit of all of them to these.
+
+    Medians decide, of the solution or of a robust fit of a sample, whichever are smaller: outliers change nothing as
+    long as they are fewer than half. Without raw measurements the solution's root mean squares decide.
+
+    Parameters
+    ----------
+    problem : Problem
+    solution : Solution or None
+        The problem's solution; None where it has none.
+
+    Returns
+    -------
+    Implausible or None
+        None where the residuals may be noise.
+    """
+    sampled = Sampled.of(problem)
+    if sampled is None:
+        return _by_root_mean_squares(solution) if solution is not None else None
+    sample = sampled.as_read()
+    signal = signal_of(sample)
+    residual = residual_of(problem, solution) if solution is not None else None
+    if residual is not None and _why(residual, signal, median_distance(sample)) is None:
+        return None
+    fit = fitted(problem, sample)
+    found = [spread for spread in (residual, fit.residual if fit else None) if spread is not None]
+    reasons = [_why(spread, signal, median_distance(sample)) for spread in found]
+    if not found or None in reasons:
+        return None
+    why, best = min(zip(reasons, found, strict=True), key=lambda each: each[1].rotation_rad * each[1].translation_m)
+    assert why is not None
+    return _record(why, best, signal)
+
+
+def _why(residual: Spread, signal: Spread, distance_m: float) -> Unlikely | None:
+    degrees = math.degrees(residual.rotation_rad)
+    if degrees > LARGEST_DEG:
+        return Unlikely.ROTATION
+    if degrees > LARGE_DEG and residual.rotation_rad > UNEXPLAINED_PART * signal.rotation_rad:
+        return Unlikely.ROTATION_UNEXPLAINED
+    if (
+        residual.translation_m > UNEXPLAINED_PART * signal.translation_m
+        and residual.translation_m > LARGEST_SHARE_OF_DISTANCE * distance_m
+    ):
+        return Unlikely.TRANSLATION_UNEXPLAINED
+    return None
+
+
+def _by_root_mean_squares(solution: Solution) -> Implausible | None:
+    values = solution.residuals.values()
+    counts = np.array([value.number_of_measurements for value in values], dtype=float)
+    squares = np.array([(value.rotation_rms_rad**2, value.translation_rms_m**2) for value in values])
+    rotation, translation = np.sqrt(counts @ squares / counts.sum())
+    if math.degrees(rotation) <= LARGEST_DEG:
+        return None
+    return _record(Unlikely.ROTATION, Spread(float(rotation), float(translation)), Spread(np.nan, np.nan))
+
+
+def _record(why: Unlikely, residual: Spread, signal: Spread) -> Implausible:
+    return Implausible(
+        why,
+        math.degrees(residual.rotation_rad),
+        1e3 * residual.translation_m,
+        math.degrees(signal.rotation_rad),
+        1e3 * signal.translation_m,
+    )

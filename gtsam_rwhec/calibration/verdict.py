@@ -1,17 +1,14 @@
 """The verdict on a calibration: may its poses be used? Reports, files, exports and the exit status share this rule."""
 
 from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.identifiability.free_directions import FEW
 from gtsam_rwhec.solver.cause import Status
 from gtsam_rwhec.solving.solution import Solution
-
 
 class Verdict(StrEnum):
     """What to do with the poses. ``str()`` is a sentence; the value is the word that files have."""
@@ -390,3 +387,33 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
             )
         found.append(Finding(Ground.NOT_UNIQUE, words))
     return found
+
+
+#: What is chosen where the choice says why there is no refined calibration.
+REFINEMENT = "covariances"
+#: What is chosen of the frames and units of A and B.
+READING = "reading of A and B"
+#: What is chosen of outliers.
+OUTLIERS = "outliers"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One choice that ``calibrate`` made, or could not make; ``str()`` is one sentence.
+
+    Attributes
+    ----------
+    what : str
+        What was to be chosen: "outliers", "noise of B", "time offsets", ...
+    chosen : str
+        What was chosen, in words.
+    evidence : str
+        Why: what the data show, what an option said, or why no choice could be made.
+    """
+
+    what: str
+    chosen: str
+    evidence: str
+
+    def __str__(self) -> str:
+        return f"{self.what[:1].upper()}{self.what[1:]}: {self.chosen}, because {self.evidence}."

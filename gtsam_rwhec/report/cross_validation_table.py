@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 from rich.console import Console
 
-from gtsam_rwhec.calibration.cross_validation import CrossValidation
-from gtsam_rwhec.calibration.prediction_errors import HoldOutError
+from gtsam_rwhec.calibration.cross_validation import CrossValidation, HoldOutError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_list, print_sentence, print_tables, report_console

@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from gtsam_rwhec.calibration.task_units import PointUncertainty
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.files.terminal_text import LONGEST_LINE, shown, shown_path

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 
-from gtsam_rwhec.calibration.disagreement import HALF
+from gtsam_rwhec.calibration.outliers import HALF
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind
 from gtsam_rwhec.results.json_tree import from_json, in_words
 from gtsam_rwhec.results.log_history import OutlierCount, contradictions

@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from gtsam_rwhec.calibration.disagreement import NEARLY_HALF, contradicted_frames
+from gtsam_rwhec.calibration.outliers import NEARLY_HALF, contradicted_frames
 from gtsam_rwhec.calibration.sizes import is_size_doubted, is_size_uncertain
 from gtsam_rwhec.problem.pairs import Pair
 

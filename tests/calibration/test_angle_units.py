@@ -10,7 +10,7 @@ from misread_problems import in_degrees
 from rwhec_factors.se3 import inverse, pose
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.calibration.angle_units import readings_of_angles, stretched, stretched_euler, unwound
+from gtsam_rwhec.calibration.other_readings import readings_of_angles, stretched, stretched_euler, unwound
 from gtsam_rwhec.simulate import Noise, perturb
 
 GENERATOR = np.random.default_rng(0)

@@ -8,7 +8,7 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.clocks import FEWEST_STAMPS, Clock, offsets_worth_estimating
+from gtsam_rwhec.calibration.clock_offsets import FEWEST_STAMPS, Clock, offsets_worth_estimating
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.transforms import random_poses

@@ -11,8 +11,7 @@ from rich.console import Console
 from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.cross_validation import cross_validate
-from gtsam_rwhec.calibration.prediction_errors import PredictionError
+from gtsam_rwhec.calibration.cross_validation import PredictionError, cross_validate
 from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError, UnderdeterminedError
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.report.cross_validation_table import print_cross_validation

@@ -7,7 +7,7 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.exchanged_carriers import Exchange, exchange_of
+from gtsam_rwhec.calibration.misreadings import Exchange, exchange_of
 from gtsam_rwhec.simulate.transforms import random_poses
 
 

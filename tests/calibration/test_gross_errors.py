@@ -8,7 +8,7 @@ from refinement_problems import copied, rig
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.gross_errors import GrossErrors, gross_errors
+from gtsam_rwhec.calibration.outliers import GrossErrors, gross_errors
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 

@@ -7,9 +7,9 @@ import pytest
 from misread_problems import KINDS_OF_GRAPHS, Kind, in_millimetres, misread
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
 from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.other_readings import Mistake
+from gtsam_rwhec.calibration.sizes import doubted_lengths, undetectable
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)

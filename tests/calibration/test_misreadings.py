@@ -11,9 +11,8 @@ from rwhec_factors.se3 import expmap
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.calibration.readings import Mistake, shifted
-from gtsam_rwhec.calibration.samples import Sampled
-from gtsam_rwhec.calibration.trial_fits import fitted
+from gtsam_rwhec.calibration.other_readings import Mistake, shifted
+from gtsam_rwhec.calibration.trial_fits import Sampled, fitted
 from gtsam_rwhec.errors import OptionError, RwhecError
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses

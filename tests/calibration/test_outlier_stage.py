@@ -11,8 +11,8 @@ from rwhec_factors import se3
 from said import choice
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.outlier_stage import spare_equations
-from gtsam_rwhec.calibration.plausibility import implausible
+from gtsam_rwhec.calibration.outliers import spare_equations
+from gtsam_rwhec.calibration.trial_fits import implausible
 from gtsam_rwhec.identifiability.free_directions import FreeReason
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair

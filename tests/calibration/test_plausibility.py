@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.plausibility import Unlikely, implausible
+from gtsam_rwhec.calibration.trial_fits import Unlikely, implausible
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)

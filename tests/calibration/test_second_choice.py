@@ -6,7 +6,7 @@ import numpy as np
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.second_choice import more_consistent
+from gtsam_rwhec.calibration.outliers import more_consistent
 
 COUNT, GOOD = 30, 14
 FRAMES = ("board", "camera")

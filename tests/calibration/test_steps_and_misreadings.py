@@ -8,9 +8,8 @@ from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.exchanged_carriers import exchange_of
-from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.misreadings import exchange_of, misreadings
+from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.geometry.poses import Array
 
 STATIONS = 30

@@ -10,8 +10,7 @@ import pytest
 from refinement_problems import rig
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.seen_from import Carriers
-from gtsam_rwhec.calibration.task_units import ball_radius, ellipsoid, point_sentence
+from gtsam_rwhec.calibration.point_uncertainty import Carriers, ball_radius, ellipsoid, point_sentence
 from gtsam_rwhec.simulate import Noise
 
 POINT = np.array([0.1, -0.2, 0.8])

@@ -7,7 +7,7 @@ import pytest
 from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.turning import turning_of
+from gtsam_rwhec.calibration.stages import turning_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate.transforms import random_poses
 

@@ -7,7 +7,7 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.two_poses import two_poses
+from gtsam_rwhec.calibration.moved_frames import two_poses
 
 COUNT = 60
 MOVED = se3.expmap(np.array([[0.03, 0.0, 0.04, 0.03, 0.0, 0.02]]))[0]

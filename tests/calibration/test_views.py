@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refinement_problems import rig
 
-from gtsam_rwhec.calibration.views import views_of
+from gtsam_rwhec.calibration.point_uncertainty import views_of
 from gtsam_rwhec.problem.problem import Problem
 
 

@@ -12,7 +12,7 @@ import typer
 from places import CELL, DEMO
 from typer.testing import CliRunner
 
-from gtsam_rwhec.calibration.options import NoiseChoice, RobustChoice
+from gtsam_rwhec.calibration.calibrate_options import NoiseChoice, RobustChoice
 from gtsam_rwhec.cli import calibrate, convert, options
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.roads import command_of

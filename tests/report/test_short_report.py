@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.text import Text
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.task_units import PointUncertainty
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable

@@ -10,10 +10,9 @@ from problems_of_corners import problem_of
 from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.by_corners import with_better_poses
-from gtsam_rwhec.calibration.clock_stage import Answer
-from gtsam_rwhec.calibration.corner_stage import MEASUREMENTS
-from gtsam_rwhec.calibration.run import Run
+from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.clock_offsets import Answer
+from gtsam_rwhec.calibration.from_corners import MEASUREMENTS, with_better_poses
 from gtsam_rwhec.errors import CountError, OptionError
 
 pytestmark = pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.WeightsWarning")

@@ -7,36 +7,131 @@ step that cannot be taken is a choice that says so; only input that cannot be us
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
-from gtsam_rwhec.calibration.by_corners import answered_by_corners, check_observations, with_better_poses
-from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.calibration.choices import READING
-from gtsam_rwhec.calibration.clock_stage import Answer, answer, check_offsets, late_in_place_of_shifted
-from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
-from gtsam_rwhec.calibration.misreadings import are_too_few_to_tell
-from gtsam_rwhec.calibration.options import CalibrateOptions
-from gtsam_rwhec.calibration.outlier_stage import (
-    SPARE_EQUATIONS,
-    outliers_of,
-    share_that_agrees_plausibly,
-    spare_equations,
-)
-from gtsam_rwhec.calibration.plausibility import implausible
-from gtsam_rwhec.calibration.reading import Reading, reading_of
-from gtsam_rwhec.calibration.readings import Mistake
-from gtsam_rwhec.calibration.run import Run
-from gtsam_rwhec.calibration.seen_from import Carriers
-from gtsam_rwhec.calibration.sizes import TargetSize
-from gtsam_rwhec.calibration.statement_stage import doubt_one_pose, doubt_stated_poses, doubt_stated_sizes
-from gtsam_rwhec.calibration.turning import of_turning
-from gtsam_rwhec.calibration.verdict import Ground, Judgement, findings_of, proof_of
-from gtsam_rwhec.calibration.views import views_of
+import numpy as np
+from rwhec_factors.se3 import inverse
+from scipy.spatial.transform import Rotation
+
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run
+from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.clock_offsets import Answer, answer, check_offsets, late_in_place_of_shifted
+from gtsam_rwhec.calibration.from_corners import answered_by_corners, check_observations, with_better_poses
+from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, reading_of
+from gtsam_rwhec.calibration.other_readings import Mistake
+from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
+from gtsam_rwhec.calibration.point_uncertainty import Carriers, views_of
+from gtsam_rwhec.calibration.sizes import TargetSize, doubted_lengths, undetectable
+from gtsam_rwhec.calibration.stated_knowledge import doubt_one_pose, doubt_stated_poses, doubt_stated_sizes
+from gtsam_rwhec.calibration.trial_fits import implausible
+from gtsam_rwhec.calibration.verdict import READING, Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
+
+#: Standard deviations about the axis with the second most turning: below this the carriers turned too little.
+LITTLE_RAD = float(np.radians(2.0))
+#: A motion is planar where what it moves along its axis is below this share of what it moves across it.
+FLAT = 0.02
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How a carrier turned about its mean: standard deviations (3,) rad about its principal axes, the largest first.
+
+    Tsai and Lenz (1989), section IV: the error of a hand-eye rotation falls with the sine of the angle between the axes
+    of two motions, and that of its translation with the angle of the motions. So an arm that hardly turns magnifies
+    every error that does not average out, and no residual shows it.
+
+    Attributes
+    ----------
+    spread_rad : (3,) array
+    along_m, across_m : float
+        Standard deviations of what it moved along the axis with most turning, and across it.
+    """
+
+    spread_rad: Array
+    along_m: float
+    across_m: float
+
+    @property
+    def is_little(self) -> bool:
+        """Whether it hardly turned about a second axis."""
+        return bool(self.spread_rad[1] < LITTLE_RAD)
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether it moved in a plane, if it turned about one axis only."""
+        return self.along_m < FLAT * self.across_m
+
+
+def turning_of(A: Array) -> Turning:
+    """How a carrier turned in poses A (N, 4, 4), T_sensorcarrier_targetcarrier."""
+    moved = A @ inverse(A[:1])
+    rotations = Rotation.from_matrix(moved[:, :3, :3])
+    turns = (rotations * rotations.mean().inv()).as_rotvec()
+    values, axes = np.linalg.eigh(turns.T @ turns / len(A))
+    places = moved[:, :3, 3] - moved[:, :3, 3].mean(axis=0)
+    along = places @ axes[:, -1]
+    across = places - along[:, None] * axes[:, -1]
+    return Turning(
+        np.sqrt(np.maximum(values[::-1], 0.0)),
+        float(np.sqrt(np.mean(along**2))),
+        float(np.sqrt(np.mean((across**2).sum(axis=1)))),
+    )
+
+
+def of_turning(
+    problem: Problem, inliers: Mapping[Pair, np.ndarray], free: Iterable[FreeDirection], *, is_answered: bool
+) -> list[Finding]:
+    """What the carriers' turning says: why a direction is free, or that they turned too little.
+
+    The sensor whose carrier turned most counts: where sensors see the same targets, it determines the others too.
+    """
+    if not problem.has_measurements or problem.fixed or problem.priors:
+        return []
+    found = [turning_of(A) for A in _of_sensors(problem, inliers).values() if len(A) > 2]
+    if not found:
+        return []
+    most = max(found, key=lambda one: float(one.spread_rad[1]))
+    reasons = {direction.reason for direction in free}
+    if FreeReason.NO_ROTATION in reasons:
+        return [Finding(Ground.NOT_UNIQUE, "too little rotation: the carriers hardly turn")]
+    if FreeReason.ONE_AXIS in reasons:
+        if most.is_planar:
+            words = (
+                f"planar motion: the carriers turn about one axis only, and move {1e3 * most.across_m:.0f} mm across "
+                f"it but {1e3 * most.along_m:.1f} mm along it (standard deviations)"
+            )
+        else:
+            words = "motion about one axis only: the carriers never turn about a second one"
+        return [Finding(Ground.NOT_UNIQUE, words)]
+    if reasons or not is_answered or not most.is_little:
+        return []
+    first, second = (f"{np.degrees(spread):.2g} degrees" for spread in most.spread_rad[:2])
+    about = f"{first} about one axis and {second} about a second one"
+    words = (
+        f"too little rotation: the carriers turn by {about} (standard deviations), which magnifies every error that "
+    )
+    return [Finding(Ground.LITTLE_ROTATION, f"{words}does not average out, and no residual shows it")]
+
+
+def _of_sensors(problem: Problem, inliers: Mapping[Pair, np.ndarray]) -> dict[str, Array]:
+    """The carriers' poses (N, 4, 4) in all kept measurements of each sensor."""
+    of_sensor: dict[str, list[Array]] = {}
+    for pair in problem.pairs:
+        if not pair.is_motion:
+            A = problem.measurements(*pair).A
+            of_sensor.setdefault(pair.sensor, []).append(A[inliers[pair]] if pair in inliers else A)
+    return {name: np.concatenate(parts) for name, parts in of_sensor.items()}
+
 
 #: From fewer poses of the carriers their noise is not known, however often each was measured.
 FEWEST_POSES = 6

@@ -1,4 +1,4 @@
-"""Whether stamps and motion determine the offset of a sensor's clock, from the certified solution alone.
+"""Clocks: whether stamps and motion determine a sensor's offset, and the answer with the offsets that they determine.
 
 One step of Gauss-Newton with the offset beside the sensor's pose, its targets' poses and a scale tells how large the
 offset is about and how well it would be known. It is not worth estimating where the carriers' path between the stamps
@@ -6,21 +6,37 @@ is not known: they stood still, or the poses are stations, and what lies between
 """
 
 from __future__ import annotations
-
 from dataclasses import dataclass
-
 import numpy as np
-from scipy.special import chdtri, stdtrit
-
+from scipy.special import chdtri
+from scipy.special import stdtrit
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.pair_data import PairData, local_paths
+from gtsam_rwhec.fitting.pair_data import PairData
+from gtsam_rwhec.fitting.pair_data import local_paths
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.solution import Solution
-from gtsam_rwhec.trajectories.local_paths import WINDOW_S, LocalPaths
+from gtsam_rwhec.trajectories.local_paths import WINDOW_S
+from gtsam_rwhec.trajectories.local_paths import LocalPaths
 from gtsam_rwhec.trajectories.trajectory import Trajectory
+import math
+from dataclasses import field
+from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.calibrate_options import offsets_of
+from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN
+from gtsam_rwhec.calibration.noise_choice import NoiseFound
+from gtsam_rwhec.calibration.noise_choice import refined_under_its_noise
+from gtsam_rwhec.calibration.outliers import Inliers
+from gtsam_rwhec.calibration.outliers import say_outliers
+from gtsam_rwhec.calibration.outliers import without_outliers
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.unknowns import Unknown
+from gtsam_rwhec.refinement.unknowns import UnknownKind
 
 #: An offset that would be known less well than this, s, is not estimated: a camera's frames are about as far apart.
 LARGEST_SIGMA_S = 0.02
@@ -35,9 +51,9 @@ MOST_TARGETS = 40
 #: An offset of so many standard deviations is not zero.
 CLEARLY = 4.0
 #: Residuals beyond this many standard deviations are left out.
-GROSS = 4.5
+GROSS_SIGMAS = 4.5
 #: Blocks of time, with equal shares of the information; their scatter gives the standard deviation too.
-BLOCKS = 8
+BLOCKS_OF_TIME = 8
 
 
 @dataclass(frozen=True)
@@ -130,7 +146,7 @@ def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: T
             False,
             f"the carriers stood still, or how they moved between stamps {apart_s:.2g} s apart is not known{help_}",
         )
-    offset_s, sigma_s = _one_step(_Rows.of(data, solution, frozenset(problem.fixed_scales)))
+    offset_s, sigma_s = _one_step(_OffsetRows.of(data, solution, frozenset(problem.fixed_scales)))
     # What is wrong in the velocities stretches the offset.
     sigma_s = float(np.hypot(sigma_s, unknown * offset_s))
     about = f"motion tells it to +-{1e3 * sigma_s:.2g} ms"
@@ -157,14 +173,14 @@ def _unknown_share(paths: dict[Pair, LocalPaths]) -> float:
     return float(np.min(error / np.maximum(squares, 1e-18)))
 
 
-def _one_step(rows: _Rows) -> tuple[float, float]:
+def _one_step(rows: _OffsetRows) -> tuple[float, float]:
     """One step of Gauss-Newton from the certified solution: the offset, and its standard deviation, s."""
     good, weight = np.ones(len(rows.r), dtype=bool), np.ones(2)
     r = rows.r
     for _ in range(3):
         squares = (r**2).reshape(-1, 2, 3).sum(axis=2)
         variance = np.maximum(np.median(squares[good], axis=0) / chdtri(3, 0.5), 1e-24)
-        good = (squares / variance).max(axis=1) < 3.0 * GROSS**2
+        good = (squares / variance).max(axis=1) < 3.0 * GROSS_SIGMAS**2
         weight = np.repeat(1.0 / variance, 3)
         J = rows.J[good]
         H = np.einsum("nip,i,niq->pq", J, weight, J)
@@ -179,16 +195,16 @@ def _one_step(rows: _Rows) -> tuple[float, float]:
     scores = np.where(good, np.einsum("ni,i,ni->n", g, weight, r), 0.0)
     order = np.argsort(rows.stamps_ns, kind="stable")
     share = np.cumsum(information[order]) / max(float(information.sum()), 1e-300)
-    block = np.minimum((share * BLOCKS).astype(int), BLOCKS - 1)
+    block = np.minimum((share * BLOCKS_OF_TIME).astype(int), BLOCKS_OF_TIME - 1)
     filled = max(len(np.unique(block)), 2)
-    scatter = np.sqrt(float((np.bincount(block, scores[order], BLOCKS) ** 2).sum()) * filled / (filled - 1))
+    scatter = np.sqrt(float((np.bincount(block, scores[order], BLOCKS_OF_TIME) ** 2).sum()) * filled / (filled - 1))
     scatter *= float(stdtrit(filled - 1, 0.975)) / 1.96
     total = float(information.sum())
     return float(step[0]), max(np.sqrt(total), scatter) / max(total, 1e-300)
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _OffsetRows:
     """Residuals (N, 6) of a sensor and their derivatives (N, 6, p): by the offset, Y, each X, each scale."""
 
     r: Array
@@ -196,7 +212,7 @@ class _Rows:
     stamps_ns: np.ndarray
 
     @staticmethod
-    def of(data: list[PairData], solution: Solution, fixed_scales: frozenset[str]) -> _Rows:
+    def of(data: list[PairData], solution: Solution, fixed_scales: frozenset[str]) -> _OffsetRows:
         targets = list(dict.fromkeys(item.pair.target for item in data))
         owners = [] if solution.scale_mode == "known" else [name for name in targets if name not in fixed_scales]
         scale_at = {name: 7 + 6 * len(targets) + (i if solution.scale_mode == "per_target" else 0)
@@ -220,4 +236,170 @@ class _Rows:
             J.append(own)
             assert item.stamps_ns is not None
             stamps.append(item.stamps_ns)
-        return _Rows(np.concatenate(r), np.concatenate(J), np.concatenate(stamps))
+        return _OffsetRows(np.concatenate(r), np.concatenate(J), np.concatenate(stamps))
+
+
+#: A time offset of so many standard deviations explains rows that look shifted.
+LATE_SIGMAS = 5.0
+#: A clock that was taken as right moves poses by millimetres and more if it is off by more than this, s.
+LATE_S = 0.005
+#: Where more than this share of a sensor's measurements are outliers, its clock may have made them.
+MANY_LEFT_OUT = 0.25
+TIME_OFFSETS = "time offsets"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The certified solution of the inliers, the inliers, their refined calibration, and the noise that was found."""
+
+    solution: Solution | None
+    inliers: Inliers = field(default_factory=dict)
+    refined: Refined | None = None
+    noise: NoiseFound = NOT_KNOWN
+
+    @property
+    def time_offsets_s(self) -> dict[str, float]:
+        """By sensor; empty where none was estimated."""
+        return {} if self.refined is None else self.refined.time_offsets_s
+
+
+def check_offsets(run: Run) -> None:
+    """An OptionError for time offsets that are asked of no sensor."""
+    given = run.options.time_offsets
+    if isinstance(given, tuple):
+        unknown = [name for name in given if name not in run.problem.sensors]
+        if unknown:
+            raise OptionError(
+                f"CalibrateOptions.time_offsets names {unknown[0]!r}, which is not a sensor; give any of "
+                f"{', '.join(run.problem.sensors)}"
+            )
+
+
+def answer(run: Run, first: Solution | None) -> Answer:
+    """The answer without outliers, with the time offsets that stamps and motion determine, or that options say.
+
+    ``first`` is the certified solution of all measurements.
+    """
+    return _by_the_data(run, first) if run.options.time_offsets == "auto" else _by_option(run, first)
+
+
+def late_in_place_of_shifted(run: Run, first: Solution | None) -> Answer | None:
+    """The answer where a late clock explains rows that look shifted; None where it does not."""
+    if run.options.time_offsets != "auto":
+        return None
+    attempt = run.attempt()
+    found = answer(attempt, first)
+    if found.refined is None or not any(_is_late(found.refined, name) for name in found.time_offsets_s):
+        return None
+    chosen = "rows of A and B look shifted against each other, and a time offset is estimated in place of that"
+    run.record.choose("reading of A and B", "as given", f"{chosen}, since there are stamps")
+    run.record.take(attempt.record)
+    return found
+
+
+def _by_option(run: Run, first: Solution | None) -> Answer:
+    found = _with_offsets(run, first)
+    asked = offsets_of(run.problem, run.options)
+    run.record.choose(TIME_OFFSETS, "estimated" if asked else "not estimated", "an option says so")
+    if found.refined is not None:
+        _doubt_stated_clocks(run, _stated_clocks(run, found))
+    return found
+
+
+def _by_the_data(run: Run, first: Solution | None) -> Answer:
+    """Clocks are looked at before outliers are, and again without the outliers."""
+    before = _clocks(run, first, {})
+    attempt = run.attempt()
+    found = _with_offsets(attempt, first, _worth_estimating(before), before)
+    if found.solution is None or found.refined is None:
+        run.record.take(attempt.record)
+        run.record.choose(TIME_OFFSETS, "not estimated", "there are no residuals to test")
+        return found
+    after = _clocks(run, found.solution, found.inliers)
+    worth = _worth_estimating(after)
+    known = [name for name in worth if _is_known(found.refined, name)]
+    new = [name for name in worth if name not in found.time_offsets_s]
+    if new or len(known) != len(found.time_offsets_s):
+        # Outliers had hidden what the motion tells, or the motion of what is left tells less.
+        attempt = run.attempt()
+        found = _with_offsets(attempt, first, (*known, *new), after)
+    run.record.take(attempt.record)
+    names = ", ".join(found.time_offsets_s)
+    chosen = f"estimated for {names}" if names else "not estimated"
+    run.record.choose(TIME_OFFSETS, chosen, _evidence(after))
+    return found
+
+
+def _with_offsets(
+    run: Run, first: Solution | None, offsets: tuple[str, ...] | None = None, clocks: tuple[Clock, ...] = ()
+) -> Answer:
+    """The answer with the time offsets of the named sensors, or of those that the options say."""
+    clearly_off = tuple(clock.sensor for clock in clocks if clock.is_clearly_off)
+    solution, inliers = without_outliers(run, first, clearly_off)
+    if solution is None:
+        return Answer(None, inliers)
+    told = run if offsets is None else run.with_time_offsets(offsets)
+    refined, noise, solution, inliers = refined_under_its_noise(told, solution, inliers)
+    say_outliers(run, inliers)
+    return Answer(solution, inliers, refined, noise)
+
+
+def _clocks(run: Run, solution: Solution | None, inliers: Inliers) -> tuple[Clock, ...]:
+    if solution is None:
+        return ()
+    kept = selected(run.problem, inliers) if inliers else run.problem
+    return offsets_worth_estimating(kept, solution, run.options.carrier_path)
+
+
+def _evidence(clocks: tuple[Clock, ...]) -> str:
+    """The evidence of all clocks; what is true of several is said once."""
+    sensors: dict[str, list[str]] = {}
+    for clock in clocks:
+        sensors.setdefault(clock.evidence, []).append(clock.sensor)
+    if set(sensors) == {NO_STAMPS}:
+        return "the measurements have no stamps"
+    return "; ".join(f"{', '.join(names)}: {evidence}" for evidence, names in sensors.items())
+
+
+def _stated_clocks(run: Run, found: Answer) -> tuple[Clock, ...]:
+    """The clocks that were taken as right, by the measurements that agree.
+
+    A late clock makes outliers of what moves. So where many of a sensor's were left out, all of them are asked too.
+    """
+    stated = [name for name in run.problem.sensors if name not in found.time_offsets_s]
+    if not stated:
+        return ()
+    clocks = {clock.sensor: clock for clock in _clocks(run, found.solution, found.inliers)}
+    of_sensor = {
+        name: np.concatenate([mask for pair, mask in found.inliers.items() if pair.sensor == name])
+        for name in stated
+        if found.inliers
+    }
+    many = [name for name, kept in of_sensor.items() if np.mean(~kept) > MANY_LEFT_OUT]
+    if many:
+        clocks |= {clock.sensor: clock for clock in _clocks(run, found.solution, {}) if clock.sensor in many}
+    return tuple(clocks[name] for name in stated if name in clocks)
+
+
+def _doubt_stated_clocks(run: Run, clocks: tuple[Clock, ...]) -> None:
+    """Clocks that were taken as right, and that the motion contradicts."""
+    for clock in clocks:
+        if clock.is_clearly_off and clock.offset_s is not None:
+            ground = Ground.LATE_CLOCK if abs(clock.offset_s) > LATE_S else Ground.COVARIANCE_DOUBTED
+            run.record.find(ground, f"the clock of {clock.sensor} was taken as right, but {clock.evidence}")
+
+
+def _worth_estimating(clocks: tuple[Clock, ...]) -> tuple[str, ...]:
+    return tuple(clock.sensor for clock in clocks if clock.is_worth_estimating)
+
+
+def _is_known(refined: Refined, sensor: str) -> bool:
+    """Whether the answer has the sensor, and determines its time offset."""
+    offset = Unknown(UnknownKind.TIME_OFFSET, sensor)
+    return sensor in refined.time_offsets_s and bool(np.isfinite(refined.covariance(offset)).all())
+
+
+def _is_late(refined: Refined, sensor: str) -> bool:
+    """Whether the sensor's time offset is surely not zero."""
+    variance = float(refined.covariance(Unknown(UnknownKind.TIME_OFFSET, sensor))[0, 0])
+    return abs(refined.time_offsets_s[sensor]) > LATE_SIGMAS * math.sqrt(variance)

@@ -1,16 +1,37 @@
-"""The options of ``calibrate``: each overrules one choice that is otherwise made from the data."""
+"""The options of ``calibrate``, each of which overrules a choice, and the record that its stages write."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
-from typing import Literal, get_args
-
+from dataclasses import dataclass
+from dataclasses import field
+from typing import Literal
+from typing import get_args
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, CornerOptions, Drift, NoiseGroups
-from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
+from gtsam_rwhec.fitting.fit_options import About
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.fit_options import CornerOptions
+from gtsam_rwhec.fitting.fit_options import Drift
+from gtsam_rwhec.fitting.fit_options import NoiseGroups
+from gtsam_rwhec.geometry.real_numbers import is_one_of
+from gtsam_rwhec.geometry.real_numbers import is_real
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.trajectories.trajectory import Trajectory
+import warnings
+from collections.abc import Iterator
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from gtsam_rwhec.calibration.verdict import Choice
+from gtsam_rwhec.calibration.verdict import Finding
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.errors import NotCertifiedWarning
+from gtsam_rwhec.errors import NotUniqueWarning
+from gtsam_rwhec.errors import OutliersWarning
+from gtsam_rwhec.errors import RwhecWarning
+from gtsam_rwhec.errors import WeightsWarning
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.vision.camera import Camera
 
 NoiseChoice = Literal["auto", "given", "estimate"]
 RobustChoice = Literal["auto", "gnc", "none"]
@@ -129,3 +150,92 @@ _CHOICES = {
     "sizes": SizesChoice,
     "observations": ObservationChoice,
 }
+
+
+def offsets_of(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:
+    """The sensors whose time offsets are estimated, of those that the problem has."""
+    if options.time_offsets == "auto":
+        return False
+    if isinstance(options.time_offsets, bool):
+        return options.time_offsets
+    return tuple(name for name in options.time_offsets if name in problem.sensors)
+
+
+#: The verdict says better what these warn of.
+SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
+
+
+@dataclass
+class Record:
+    """What the stages chose and found, in the order in which they did."""
+
+    choices: list[Choice] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def choose(self, what: str, chosen: str, evidence: str) -> None:
+        """Say what was chosen, and why."""
+        self.choices.append(Choice(what, chosen, evidence))
+
+    def find(self, ground: Ground, words: str) -> None:
+        """Say what was found against the poses."""
+        self.findings.append(Finding(ground, words))
+
+    def start_again(self, ground: Ground, words: str) -> None:
+        """Forget all that was chosen and found: the answer to which it belongs is not given, for this reason."""
+        self.choices, self.findings = [], [Finding(ground, words)]
+        self.notes.clear()
+
+    def take(self, other: Record) -> None:
+        """Take over what an attempt chose and found, now that it counts."""
+        self.choices += other.choices
+        self.findings += other.findings
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Warnings of this library become notes, but for those that the verdict says better; others stay warnings."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield
+        for warning in caught:
+            if not isinstance(warning.message, RwhecWarning):
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+            elif not isinstance(warning.message, SAID_BY_THE_VERDICT):
+                self.notes.setdefault(str(warning.message))
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of ``calibrate``, or an attempt within it.
+
+    Attributes
+    ----------
+    problem : Problem
+    options : CalibrateOptions
+    tell : Progress
+        Is called with the name of each step.
+    record : Record
+    times : int
+        How often it was begun, since poses of targets were computed again.
+    cameras : dict of str to Camera
+        The intrinsics by which they were, where these are not the stated ones.
+    """
+
+    problem: Problem
+    options: CalibrateOptions
+    tell: Progress
+    record: Record = field(default_factory=Record)
+    times: int = 1
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+
+    def again(self, problem: Problem, cameras: Mapping[str, Camera]) -> Run:
+        """The run of a problem with other poses of targets, from its beginning."""
+        return Run(problem, self.options, self.tell, times=self.times + 1, cameras=cameras)
+
+    def attempt(self) -> Run:
+        """The same with an empty record: it may be thrown away."""
+        return replace(self, record=Record())
+
+    def with_time_offsets(self, of: tuple[str, ...]) -> Run:
+        """The same, told of which sensors to estimate the time offsets; the record is shared."""
+        return replace(self, options=replace(self.options, time_offsets=of))

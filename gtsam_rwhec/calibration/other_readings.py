@@ -1,0 +1,351 @@
+"""Readings: the ways in which a user's poses may have been misread, and how each is read right.
+
+Each reading changes A, B or their roles as its cure would. Some mistakes are one mistake to the data. A quaternion in
+the wrong order is the inverse rotation between two constant ones; a mirrored A is a mirrored B with other constants;
+names exchanged are both poses inverted. Where the residuals cannot tell two readings apart, both are named.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from rwhec_factors.se3 import expmap, inverse, pose, so3_logmap
+
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import of_rows, to_rotations
+from gtsam_rwhec.problem.pairs import Pair
+
+Rows = tuple[Array, Array]
+
+
+class Mistake(StrEnum):
+    """What was likely misread."""
+
+    #: Quaternions of A, of B or of both were read in the wrong order.
+    QUATERNION_ORDER = "quaternion_order"
+    #: A, B or both are the inverse of what was meant; for A: the base's and the hand's pose are exchanged.
+    INVERTED = "inverted"
+    #: Rotations of A or of B are transposed: rows for columns, or quaternions of the other convention (JPL).
+    TRANSPOSED = "transposed"
+    #: Targets were named as sensors, and sensors as targets.
+    ROLES_EXCHANGED = "roles_exchanged"
+    #: A or B is from a left-handed frame.
+    HANDEDNESS = "handedness"
+    #: A or B is in another unit than metres.
+    UNIT = "unit"
+    #: Lengths in B are wrong by a factor, though they were said to be true.
+    SCALE = "scale"
+    #: Rows of A and B are shifted against each other.
+    ROWS_SHIFTED = "rows_shifted"
+    #: Angles in radians were read as degrees, or the reverse.
+    ANGLE_UNIT = "angle_unit"
+
+
+@dataclass(frozen=True)
+class OtherReading:
+    """One way to read A and B otherwise; ``changed`` takes A and B (N, 4, 4) and returns them as they were meant.
+
+    ``likely`` and ``cure`` are parts of a sentence: what was misread, and what to do.
+    """
+
+    mistake: Mistake
+    likely: str
+    cure: str
+    changed: Callable[[Array, Array], Rows]
+    exchanges_roles: bool = False
+    shift: int = 0
+    of_small_angles: bool = False
+
+    def pair(self, pair: Pair) -> Pair:
+        """The pair as it was meant."""
+        return Pair(pair.sensor, pair.target) if self.exchanges_roles else pair
+
+
+def _unchanged(T: Array) -> Array:
+    return T
+
+
+def _inverted(T: Array) -> Array:
+    return inverse(T)
+
+
+def _transposed(T: Array) -> Array:
+    return pose(T[:, :3, :3].transpose(0, 2, 1), T[:, :3, 3])
+
+
+def mirrored(T: Array) -> Array:
+    """Poses in a frame of the other handedness: mirrored at the origin, R stays and t changes its sign.
+
+    Mirroring at a plane is the same up to constant rotations of both frames.
+    """
+    return pose(T[:, :3, :3], -T[:, :3, 3])
+
+
+def _reordered(columns: list[int]) -> Callable[[Array], Array]:
+    def reordered(T: Array) -> Array:
+        xyzw = of_rows(T[:, :3, :3].transpose(2, 1, 0).reshape(9, -1)).T
+        return pose(to_rotations(xyzw[:, columns]), T[:, :3, 3])
+
+    return reordered
+
+
+#: Rows x, y, z, w were read as w first: what was taken for w is x, and so on. In xyzw, the right ones.
+_XYZW_READ_AS_WXYZ = _reordered([3, 0, 1, 2])
+#: Rows w, x, y, z were read as x first.
+_WXYZ_READ_AS_XYZW = _reordered([1, 2, 3, 0])
+
+_SIDES = (("A",), ("B",), ("A", "B"))
+
+
+def _of_sides(sides: tuple[str, ...], change: Callable[[Array], Array]) -> Callable[[Array, Array], Rows]:
+    of_A, of_B = (change if side in sides else _unchanged for side in "AB")
+    return lambda A, B: (of_A(A), of_B(B))
+
+
+def _quaternions() -> list[OtherReading]:
+    found = []
+    for given, read, change in (("xyzw", "wxyz", _XYZW_READ_AS_WXYZ), ("wxyz", "xyzw", _WXYZ_READ_AS_XYZW)):
+        for sides in _SIDES:
+            found.append(
+                OtherReading(
+                    Mistake.QUATERNION_ORDER,
+                    f"the quaternions of {' and '.join(sides)} are {given}, and were read as {read}",
+                    f"read {' and '.join(sides)} with order={given!r} (CSV files have w first)",
+                    _of_sides(sides, change),
+                )
+            )
+    return found
+
+
+A_INVERTED = OtherReading(
+    Mistake.INVERTED,
+    "A is inverted (the poses of the base and the hand are exchanged)",
+    "give A = T_sensorcarrier_targetcarrier: the inverse of each pose in A",
+    _of_sides(("A",), _inverted),
+)
+_INVERTED = [
+    A_INVERTED,
+    OtherReading(
+        Mistake.INVERTED,
+        "B is inverted",
+        "give B = T_sensor_target, the target's pose in the sensor's frame: the inverse of each pose in B",
+        _of_sides(("B",), _inverted),
+    ),
+]
+_BOTH_INVERTED = OtherReading(
+    Mistake.INVERTED,
+    "A and B are both inverted",
+    "give the inverse of each pose in A and in B",
+    _of_sides(("A", "B"), _inverted),
+)
+#: The poses as they are; with a free scale it tells a wrong unit.
+AS_READ = OtherReading(Mistake.UNIT, "", "", lambda A, B: (A, B))
+_ROLES = OtherReading(
+    Mistake.ROLES_EXCHANGED,
+    "targets and sensors are exchanged",
+    "name the targets as targets and the sensors as sensors: problem.add(target, sensor, A, B)",
+    lambda A, B: (A, B),
+    exchanges_roles=True,
+)
+_TRANSPOSED = [
+    OtherReading(
+        Mistake.TRANSPOSED,
+        f"the rotations of {side} are transposed (rows for columns, or quaternions of the JPL convention)",
+        f"transpose the rotation matrices of {side}, and keep its translations",
+        _of_sides((side,), _transposed),
+    )
+    for side in "AB"
+]
+HANDEDNESS = OtherReading(
+    Mistake.HANDEDNESS,
+    "one of A and B is from a left-handed frame",
+    "mirror the poses of the one that is left-handed: M T M with M = diag(1, -1, 1, 1)",
+    _of_sides(("A",), mirrored),
+)
+
+
+def shifted(shift: int) -> OtherReading:
+    """Rows of B that are ``shift`` behind those of A; positive: A's row i belongs to B's row i + shift."""
+    n, rows = abs(shift), "row" if abs(shift) == 1 else "rows"
+    first, second = ("B", "A") if shift > 0 else ("A", "B")
+    return OtherReading(
+        Mistake.ROWS_SHIFTED,
+        f"the rows of {first} come {n} {rows} later than those of {second}, or the clocks differ by as much",
+        f"leave out the first {n} {rows} of {first} and the last {n} of {second}, in each pair; or give stamps and "
+        "estimate the time offsets",
+        lambda A, B: (A, B),
+        shift=shift,
+    )
+
+
+#: The simple mistakes, the more common first.
+SINGLE: tuple[OtherReading, ...] = (*_quaternions(), *_INVERTED, _ROLES, _BOTH_INVERTED, *_TRANSPOSED, HANDEDNESS)
+
+
+def _joined(first: OtherReading, second: OtherReading) -> OtherReading:
+    def changed(A: Array, B: Array) -> Rows:
+        return second.changed(*first.changed(A, B))
+
+    return OtherReading(
+        first.mistake,
+        f"{first.likely}, and {second.likely}",
+        f"{first.cure}; {second.cure}",
+        changed,
+        exchanges_roles=second.exchanges_roles,
+    )
+
+
+#: Two mistakes at once: the order of quaternions and a direction.
+DOUBLE: tuple[OtherReading, ...] = tuple(
+    _joined(first, second) for first in _quaternions() for second in (*_INVERTED, _ROLES)
+)
+
+
+#: Rotations of less than half a turn in degrees that were taken for radians, about one axis: 180 / 57.3 degrees.
+SMALL_RAD = np.pi / np.degrees(1.0)
+#: Three Euler angles may each be as large.
+SMALL_EULER_RAD = 1.8 * SMALL_RAD
+#: Fewer measurements of a pair do not determine the 18 unknowns of the axes' equations well.
+FEWEST_AXES = 8
+
+
+def _rotations(omega: Array) -> Array:
+    """Rotations (N, 3, 3) of rotation vectors (N, 3)."""
+    R: Array = expmap(np.concatenate([omega, np.zeros_like(omega)], axis=1))[:, :3, :3]
+    return R
+
+
+def stretched(T: Array) -> Array:
+    """Poses whose rotation vectors were in radians, and were divided by 57.3 as degrees are."""
+    return pose(_rotations(np.degrees(so3_logmap(T[:, :3, :3]))), T[:, :3, 3])
+
+
+def stretched_euler(order: tuple[int, ...]) -> Callable[[Array], Array]:
+    """The same for Euler angles about three axes (0, 1, 2 for x, y, z), each about the axes as turned before."""
+    i, j, k = order
+    sign = 1.0 if order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else -1.0
+
+    def change(T: Array) -> Array:
+        R = T[:, :3, :3]
+        # R = R_i(a) R_j(b) R_k(c): the entry (i, k) is the sine of b, and its row and column have a and c.
+        b = np.arcsin(np.clip(sign * R[:, i, k], -1.0, 1.0))
+        a = np.arctan2(-sign * R[:, j, k], R[:, k, k])
+        c = np.arctan2(-sign * R[:, i, j], R[:, i, i])
+        axes = np.eye(3)
+        turns = [_rotations(np.degrees(angle)[:, None] * axes[axis]) for angle, axis in ((a, i), (b, j), (c, k))]
+        return pose(turns[0] @ turns[1] @ turns[2], T[:, :3, 3])
+
+    return change
+
+
+def unwound(T: Array, other: Array) -> Array:
+    """Poses whose rotation vectors were in degrees, and were taken for radians; ``other`` are the right ones beside.
+
+    For A it is B, and for B it is A. Poses that cannot be unwound stay as they are.
+    """
+    if len(T) < FEWEST_AXES:
+        return T
+    omega = so3_logmap(T[:, :3, :3])
+    angle = np.linalg.norm(omega, axis=1)
+    axis = omega / np.maximum(angle, 1e-12)[:, None]
+    S = other[:, :3, :3]
+    # S P a = Q a, with S the other side's rotation. Where T is A, P is R_X' and Q is R_Y'; where T is B, P is R_X and Q
+    # is R_Y: 18 unknowns up to a factor.
+    of_P = np.einsum("nrp,nq->nrpq", S, axis).reshape(-1, 9)
+    of_Q = np.einsum("rp,nq->nrpq", np.eye(3), axis).reshape(-1, 9)
+    null = np.linalg.svd(np.concatenate([of_P, -of_Q], axis=1), full_matrices=False)[2][-1].reshape(2, 3, 3)
+    left, _, right = np.linalg.svd(null * np.sign(np.linalg.det(null[0])))
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    P, Q = left @ right
+    expected = np.einsum("ni,ni->n", so3_logmap(Q.T @ S @ P), axis)
+    # The true angle is (angle + whole turns) degrees.
+    turns = np.round((np.degrees(expected) - angle) / (2.0 * np.pi))
+    return pose(_rotations(np.radians(angle + 2.0 * np.pi * turns)[:, None] * axis), T[:, :3, 3])
+
+
+def readings_of_angles(A: Array, B: Array) -> Iterator[OtherReading]:
+    """The readings that angles in the wrong unit leave to try, for poses (N, 4, 4) of all pairs."""
+    for side, T in (("A", A), ("B", B)):
+        largest = float(np.linalg.norm(so3_logmap(T[:, :3, :3]), axis=1).max())
+        likely = f"the angles of {side} are in radians, and were read as degrees"
+        if largest <= SMALL_RAD * (1.0 + 1e-6):
+            cure = f"do not convert the rotation vectors of {side}: they are in radians"
+            yield OtherReading(
+                Mistake.ANGLE_UNIT, likely, cure, _of_side(side, _alone(stretched)), of_small_angles=True
+            )
+        if largest <= SMALL_EULER_RAD:
+            for order in itertools.permutations(range(3)):
+                letters = "".join("XYZ"[axis] for axis in order)
+                cure = f"do not convert the Euler angles of {side}: they are in radians (intrinsic {letters})"
+                change = _of_side(side, _alone(stretched_euler(order)))
+                yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, change, of_small_angles=True)
+        elif largest > SMALL_RAD:
+            likely = f"the rotation vectors of {side} are in degrees, and were read as radians"
+            cure = f"convert the rotation vectors of {side} to radians"
+            yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, _of_side(side, unwound))
+
+
+def _alone(change: Callable[[Array], Array]) -> Callable[[Array, Array], Array]:
+    """A change that needs nothing of the other side."""
+    return lambda T, other: change(T)
+
+
+def _of_side(side: str, change: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Rows]:
+    return (lambda A, B: (change(A, B), B)) if side == "A" else (lambda A, B: (A, change(B, A)))
+
+
+#: The number of each unit in a metre.
+UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 1.0 / 0.0254, "feet": 1.0 / 0.3048}
+#: A scale within this share of a unit's number is that unit.
+UNIT_SHARE = 0.03
+#: A scale this close to 1 is no misreading: a size may be wrong by as much, which ``sizes`` tests.
+NO_MISREADING = 0.1
+#: Median lengths above this (m) are of another unit: few carriers move so far, and few sensors see so far.
+LONG_M = 30.0
+
+
+@dataclass(frozen=True)
+class WrongUnit:
+    """Which lengths are in another unit, or wrong by a factor, in words; ``of_B`` divides B's lengths as given."""
+
+    mistake: Mistake
+    likely: str
+    cure: str
+    of_B: float
+
+
+def wrong_unit(scale: float, median_A: float, median_B: float, *, from_corners: bool = False) -> WrongUnit | None:
+    """What an estimated scale (lengths in B over those in A) says; None where it is about 1, or not positive.
+
+    ``median_A`` and ``median_B`` are median lengths of the translations as given: the long ones are of another unit.
+    ``from_corners``: B is made of corners, so that its unit is that of board_points.
+    """
+    if not scale > 0.0 or abs(scale - 1.0) < NO_MISREADING:
+        return None
+    longer, shorter = ("B", "A") if scale > 1.0 else ("A", "B")
+    ratio = max(scale, 1.0 / scale)
+    for unit, number in UNITS.items():
+        if abs(ratio / number - 1.0) > UNIT_SHARE:
+            continue
+        lengths = f"lengths in {longer} are {rounded(ratio, 4)} times those in {shorter}"
+        if (median_B if longer == "B" else median_A) > LONG_M or number < 1000.0:
+            of_B = number if longer == "B" else 1.0
+            if from_corners and longer == "B":
+                cure = f"give board_points in metres: divide them by {rounded(number, 4)}"
+                return WrongUnit(Mistake.UNIT, f"{lengths}: board_points are in {unit}", cure, of_B)
+            cure = f"give metres: divide the translations of {longer} by {rounded(number, 4)}"
+            return WrongUnit(Mistake.UNIT, f"{lengths}: {longer} is in {unit}", cure, of_B)
+        of_B = 1.0 / number if shorter == "B" else 1.0
+        cure = f"give metres: multiply the translations of {shorter} by {rounded(number, 4)}"
+        return WrongUnit(Mistake.UNIT, f"{lengths}: those of {shorter} are too small", cure, of_B)
+    return WrongUnit(
+        Mistake.SCALE,
+        f"lengths in B are {rounded(scale, 4)} times the true ones, and were said to be true (scale='known')",
+        "measure the targets again and state their true sizes, or let the scale be estimated (scale='shared')",
+        scale,
+    )

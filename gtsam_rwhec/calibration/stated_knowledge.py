@@ -1,0 +1,258 @@
+"""What the user stated, asked of the measurements: poses, sizes, and that each frame has one pose.
+
+The answer with a wrong stated pose is a compromise, whose residuals are taken for noise. So the measurements are asked
+without what was stated; what they say is compared with it under both covariances.
+"""
+
+from __future__ import annotations
+from dataclasses import replace
+from typing import Literal
+import numpy as np
+from gtsam_rwhec.calibration.moved_frames import moved_frame
+from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.calibration.sizes import TargetSize
+from gtsam_rwhec.calibration.sizes import common_factor
+from gtsam_rwhec.calibration.sizes import sizes
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.noise_search import CORRELATED
+from gtsam_rwhec.fitting.noise_search import likeness_of_neighbours
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.truncated_least_squares import graduated
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.solving.certified_solution import solve
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+import gtsam
+from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.moved_frames import Measured
+from gtsam_rwhec.calibration.moved_frames import TwoPoses
+from gtsam_rwhec.calibration.moved_frames import by_station
+from gtsam_rwhec.calibration.moved_frames import means_of
+from gtsam_rwhec.calibration.moved_frames import moved_with_outliers
+from gtsam_rwhec.calibration.moved_frames import residual_twists
+from gtsam_rwhec.calibration.moved_frames import two_poses
+from gtsam_rwhec.calibration.outliers import Inliers
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS
+from gtsam_rwhec.problem.knowledge import Prior
+
+#: Chance that a true stated pose is contradicted.
+CHANCE = 1e-6
+#: From this chance on it is doubted: that of 3.5 standard deviations of one number, as for sizes.
+DOUBTFUL_CHANCE = 4.65e-4
+#: A stated pose that is off by less is no mistake, but its standard deviation was too small: degrees, m.
+SMALL_DEG, SMALL_M = 0.5, 0.005
+#: Standard deviations of the prior that holds what the motion leaves free, m and rad.
+LOOSE_M, LOOSE_RAD = 10.0, 1.0
+
+
+@dataclass(frozen=True)
+class StatedPose:
+    """A stated pose that the measurements contradict; ``str()`` is one sentence.
+
+    Attributes
+    ----------
+    frame : str
+    rotation_deg, translation_m : float
+        How far the pose that the measurements give is from it; 0 for a part that was not stated.
+    sigmas : float
+        The same in standard deviations of their difference.
+    is_surely_off : bool
+        Whether the measurements contradict it beyond chance; otherwise it fits them badly.
+    """
+
+    frame: str
+    rotation_deg: float
+    translation_m: float
+    sigmas: float
+    is_surely_off: bool = True
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the answer hardly depends on it."""
+        return self.rotation_deg < SMALL_DEG and self.translation_m < SMALL_M
+
+    def __str__(self) -> str:
+        off = f"{rounded(self.rotation_deg)} deg and {rounded(1e3 * self.translation_m, 3)} mm"
+        return (
+            f"the stated pose of {self.frame} is {off} from the pose that the measurements give "
+            f"({rounded(self.sigmas)} standard deviations)"
+        )
+
+
+def contradicted_poses(problem: Problem, answer: Callable[[Problem], Refined | None]) -> tuple[StatedPose, ...]:
+    """Stated poses of a problem that its measurements contradict, or that fit them badly.
+
+    Parameters
+    ----------
+    problem : Problem
+    answer : callable
+        The refined calibration of a problem; None where it has none.
+    """
+    stated = stated_poses(problem)
+    found: list[StatedPose] = []
+    loose: set[str] = set()
+    without = _without(problem, loose)
+    for _ in range(2):
+        # What the motion leaves free is held loosely in the second round.
+        free = set()
+        refined = answer(without)
+        for name, priors in stated.items():
+            if refined is None or name not in refined.names or not np.isfinite(refined.covariance(name)).all():
+                free.add(name)
+            else:
+                found += [one for prior in priors if (one := _compared(name, prior, refined)) is not None]
+        if loose or not free:
+            break
+        loose, stated = free, {name: stated[name] for name in free}
+        without = _without(problem, loose)
+    return tuple(found)
+
+
+def stated_poses(problem: Problem) -> dict[str, list[Prior]]:
+    """What was stated of each frame that is measured; a fixed pose counts as a prior without noise."""
+    names = (*problem.targets, *problem.sensors)
+    found = {name: list(problem.priors.get(name, [])) for name in names}
+    for name in names:
+        if name in problem.fixed:
+            found[name] = [Prior(problem.fixed[name], 0.0, math.inf)]
+    return {name: priors for name, priors in found.items() if priors}
+
+
+def _without(problem: Problem, loose: set[str]) -> Problem:
+    """The problem without what was stated of frames; those of ``loose`` keep the pose with a large noise."""
+    stated = stated_poses(problem)
+    without = copy.copy(problem)  # the measurements are shared, what was stated is not
+    without.fixed, without.priors = {}, {}
+    for name in loose:
+        without.add_prior(name, stated[name][0].transform, LOOSE_M, 0.5 / LOOSE_RAD**2)
+    return without
+
+
+def _compared(name: str, prior: Prior, refined: Refined) -> StatedPose | None:
+    """The stated pose, if it is contradicted."""
+    pose: gtsam.Pose3 = (refined.X | refined.Y)[name]
+    difference: Array = gtsam.Pose3.Logmap(gtsam.Pose3(prior.transform).between(pose))
+    variance = np.zeros(6)
+    variance[:3] = 0.0 if prior.kappa is None else 0.5 / prior.kappa
+    variance[3:] = 0.0 if prior.sigma is None else prior.sigma**2
+    told = np.repeat([prior.kappa is not None, prior.sigma is not None], 3)
+    both = (refined.covariance(name) + np.diag(variance))[np.ix_(told, told)]
+    squared = float(difference[told] @ np.linalg.lstsq(both, difference[told], rcond=None)[0])
+    limit = refined.squared_radius(int(told.sum()), 1.0 - CHANCE)
+    if squared < refined.squared_radius(int(told.sum()), 1.0 - DOUBTFUL_CHANCE):
+        return None
+    turned_rad = 0.0 if prior.kappa is None else float(np.linalg.norm(difference[:3]))
+    moved_m = 0.0 if prior.sigma is None else float(np.linalg.norm(pose.translation() - prior.transform[:3, 3]))
+    return StatedPose(
+        name, math.degrees(turned_rad), moved_m, math.sqrt(squared), squared >= max(limit, CONTRADICTION_SIGMAS**2)
+    )
+
+
+def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Priors and fixed poses that the measurements contradict are found."""
+    if not stated_poses(run.problem):
+        return
+    run.tell("comparing the stated poses with the measurements")
+    options = replace(run.options, time_offsets=tuple(refined.time_offsets_s))
+    with_outliers = any(not mask.all() for mask in inliers.values())
+
+    def answer(without: Problem) -> Refined | None:
+        try:
+            agree = graduated(without, noise_scale="estimate").inliers if with_outliers else {}
+            kept = selected(without, agree) if agree else without
+            return estimated(without, solve(kept, options=options.solve), agree, options, silent)[0]
+        except (RwhecError, np.linalg.LinAlgError):
+            return None  # without what was stated there is no answer to compare with
+
+    found = contradicted_poses(run.problem, answer)
+    for one in found:
+        off = Ground.COVARIANCE_DOUBTED if one.is_small else Ground.POSE_DOUBTED
+        run.record.find(off if one.is_surely_off else Ground.POSE_UNCERTAIN, str(one))
+    chosen, do = ("as stated, and doubted", "") if found else ("as stated", "do not ")
+    run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")
+
+
+def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Frames that were at two poses are found."""
+    if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
+        return  # a late clock makes such groups
+    found = two_poses(run.problem, refined, inliers) or _moved(run, refined, inliers)
+    found = found or moved_with_outliers(refined, _with_outliers(run.problem, inliers))
+    if found is not None:
+        run.record.find(Ground.MOVED, str(found))
+
+
+def _with_outliers(problem: Problem, inliers: Inliers) -> dict[Pair, Measured]:
+    """All measurements of the pairs of which some were left out, and of the others."""
+    if not problem.has_measurements or not inliers:
+        return {}
+    raw = {pair: problem.measurements(*pair) for pair in inliers}
+    return {pair: Measured(of.A, of.B, inliers[pair]) for pair, of in raw.items()}
+
+
+def _moved(run: Run, refined: Refined, inliers: Inliers) -> TwoPoses | None:
+    """A frame that moved once, where residuals of neighbours are alike."""
+    if not run.problem.has_measurements:
+        return None
+    problem = selected(run.problem, inliers) if inliers else run.problem
+    raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
+    tracks = [means_of(residual_twists(refined, pair, of.A, of.B)[0], by_station(of.A)[0]) for pair, of in raw.items()]
+    if likeness_of_neighbours(tracks) < CORRELATED:
+        return None
+    run.tell("looking for a frame that moved")
+    found = moved_frame(run.problem, {pair: (of.A, of.B) for pair, of in raw.items()})
+    if found is None or found.from_row is None or not inliers:
+        return found
+    (mask,) = (mask for pair, mask in inliers.items() if found.frame in pair.frames)
+    return replace(found, from_row=int(np.flatnonzero(mask)[found.from_row - 1]) + 1)
+
+
+def doubt_stated_sizes(
+    run: Run, refined: Refined, inliers: Inliers, like: NoiseInData | None
+) -> tuple[TargetSize, ...]:
+    """What the motion says about sizes that were said to be known; those that it contradicts are found."""
+    problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
+    if problem.scale != "known":
+        return ()
+    if options.sizes == "known":
+        record.choose(what, "as stated", "an option says so")
+        return ()
+    noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
+    late = tuple(refined.time_offsets_s)
+    how = RefineOptions(
+        noise=noise,
+        noise_groups=options.noise_groups,
+        carrier_noise=options.carrier_noise,
+        time_offsets=late,
+        carrier_path=options.carrier_path if late else None,
+    )
+    # A target of a wrong size contradicts the others: then all of its measurements are asked, not those that agree.
+    kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
+    found = sizes(selected(problem, kept) if kept else problem, how, like=like, progress=run.tell)
+    doubted = [size for size in found if size.is_doubted]
+    together = common_factor(found)
+    uncertain = [size for size in found if size.is_uncertain]
+    if together is not None:
+        record.find(Ground.SIZE_DOUBTED, str(together))
+    else:
+        for size in doubted:
+            record.find(Ground.SIZE_DOUBTED, str(size))
+        for size in uncertain:
+            record.find(Ground.SIZE_UNCERTAIN, str(size))
+    if doubted or uncertain or together is not None:
+        record.choose(what, "as stated, and doubted", "the motion contradicts them")
+    elif any(size.sigma is not None for size in found):
+        record.choose(what, "as stated", "the motion does not contradict them")
+    else:
+        record.choose(what, "as stated", "the motion does not tell them, so a wrong size would not show")
+    return found
