@@ -6,54 +6,39 @@ stated intrinsics, and a flat board's was chosen of two: where the answer says o
 """
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
-from dataclasses import replace
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import OutlierError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.fitting.corner_findings import DETECTOR_PX
-from gtsam_rwhec.fitting.corner_findings import is_doubtful
-from gtsam_rwhec.fitting.corner_findings import lens_that_was_left_out
-from gtsam_rwhec.fitting.corner_refinement import refine_corners
-from gtsam_rwhec.fitting.corners_as_refined import as_refined
-from gtsam_rwhec.fitting.corners_as_refined import intrinsics_of
-from gtsam_rwhec.fitting.corners_as_refined import numbers_of
-from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.fit_options import CornerOptions
-from gtsam_rwhec.fitting.noise_in_data import NoiseInData
-from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refinement import beyond_independent_errors
-from gtsam_rwhec.fitting.reprojection_record import Intrinsics
-from gtsam_rwhec.fitting.reprojection_record import Reprojection
-from gtsam_rwhec.fitting.reprojection_record import TriedModel
-from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
-from gtsam_rwhec.calibration.calibrate_options import Run
+
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run
 from gtsam_rwhec.calibration.clock_offsets import Answer
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
+from gtsam_rwhec.errors import (
+    CameraError,
+    CountError,
+    MeasurementsNotKeptError,
+    OptionError,
+    OutlierError,
+    RwhecError,
+    UnderdeterminedError,
+)
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.fitting.corner_findings import DETECTOR_PX, is_doubtful, lens_that_was_left_out
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
+from gtsam_rwhec.fitting.corners_as_refined import as_refined, intrinsics_of, numbers_of
+from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
+from gtsam_rwhec.fitting.held_out import LeftOut, left_out
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.observations import Observations, Views, check_corners_can_hold, check_corners_everywhere
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement import as_stated, beyond_independent_errors, observed
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection, TriedModel
+from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.problem.nearer_poses import nearer_poses
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.held_out import LeftOut
-from gtsam_rwhec.reprojection.held_out import left_out
-from gtsam_rwhec.reprojection.observations import Views
-from gtsam_rwhec.reprojection.problem_corners import check_corners_can_hold
-from gtsam_rwhec.reprojection.problem_corners import check_corners_everywhere
-from gtsam_rwhec.reprojection.refined import RefinedIntrinsics
-from gtsam_rwhec.reprojection.refining import as_stated
-from gtsam_rwhec.reprojection.refining import observed
 from gtsam_rwhec.vision.camera import Camera
 
 #: At most so many images are looked at, and of a pair at least so many.

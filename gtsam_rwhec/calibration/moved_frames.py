@@ -16,11 +16,11 @@ from rwhec_factors import se3
 from scipy.spatial import cKDTree
 
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Spread, TrialFit, fitted
+from gtsam_rwhec.fitting.noise_rows import stations
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.noise_model.rows import stations
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.refined import Refined
 
 #: Two groups lie apart by this many times their own spread. (2,000 simulations each of white noise, random walks, walks
 #: with noise, Student's t with 2 degrees of freedom and smooth errors, 20 to 160 measurements: 1 of 30,000 was.)

@@ -17,13 +17,13 @@ from gtsam_rwhec.calibration.calibrate_options import Run, offsets_of
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Sampled, TrialFit, fitted, implausible, residuals
 from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.refinement_from_poses import refine
+from gtsam_rwhec.fitting.truncated_least_squares import graduated
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.graduated import graduated
-from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 

@@ -1,19 +1,19 @@
 """Whether the logs of a unit agree to one answer: what each log alone would change, against what its noise explains."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
+
 import numpy as np
 from scipy.special import chdtrc
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+
+from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fleet.detection_covariance import rows_of_pair
-from gtsam_rwhec.fleet.detection_covariance import weights_of_pair
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.fleet.detection_covariance import rows_of_pair, weights_of_pair
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.calibration.calibration_record import Calibration
 
 #: Logs disagree where a frame's changes are this many times what noise explains, by chance in one case of a million.
 TIMES, CHANCE = 2.0, 1e-6

@@ -1,19 +1,13 @@
 """Whether an old calibration still holds, on the terminal: the verdict, how far off it is, and what to keep in mind."""
 
 from __future__ import annotations
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.report.change_report import CHANGE_LEGEND
-from gtsam_rwhec.report.change_report import MOVED_HEADINGS
-from gtsam_rwhec.report.change_report import STYLES
-from gtsam_rwhec.report.change_report import moved_cells
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import report_console
-from gtsam_rwhec.results.verification import Verification
+
 from gtsam_rwhec.calibration.cross_validation import PredictionError
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.report.change_report import CHANGE_LEGEND, MOVED_HEADINGS, STYLES, moved_cells
+from gtsam_rwhec.report.pose_table import FrameTable
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
+from gtsam_rwhec.results.verification import Verification
 
 ERROR_HEADINGS = ("n", "old mm", "old°", "old px", "best mm", "best°")
 PIXELS = "old px"

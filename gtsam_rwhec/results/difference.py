@@ -1,30 +1,24 @@
 """``difference``: what changed from one calibration to the next, and whether by more than chance."""
 
 from __future__ import annotations
+
 from collections.abc import Collection
-from dataclasses import dataclass
-from dataclasses import field
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+
 import numpy as np
+
+from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.results.change_test import LEVEL
-from gtsam_rwhec.results.change_test import ChangeTest
-from gtsam_rwhec.results.change_test import change_test
-from gtsam_rwhec.results.change_test import checked_level
-from gtsam_rwhec.results.common_quantities import Movement
-from gtsam_rwhec.results.common_quantities import Quantities
-from gtsam_rwhec.results.common_quantities import quantities
+from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
+from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.results.schema import CalibrationFields
-from gtsam_rwhec.calibration.calibration_record import Calibration
+
 
 @dataclass(frozen=True)
 class NumberChange:

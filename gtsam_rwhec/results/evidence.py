@@ -12,8 +12,8 @@ from typing import Final, Literal
 
 from pydantic import Field, ValidationError
 
-from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
+from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.terminal_text import brief

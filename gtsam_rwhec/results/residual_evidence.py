@@ -1,17 +1,17 @@
 """What is left after the fit, measurement by measurement, against the noise that was found."""
 
 from __future__ import annotations
+
 from collections.abc import Iterator
+
 import numpy as np
 from pydantic import Field
 from rwhec_factors import se3
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
-from gtsam_rwhec.results.evidence_record import Row
-from gtsam_rwhec.results.evidence_record import Rows
-from gtsam_rwhec.results.linear_model import LinearModel
-from gtsam_rwhec.results.linear_model import inverse_of
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row, Rows
+from gtsam_rwhec.results.linear_model import LinearModel, inverse_of
 
 #: So many measurements are kept one by one; of more, every so-many-th.
 MOST_KEPT = 5_000

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from gtsam_rwhec.calibration.disagreement import LeftOut, contradicted_frames
-from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME
+from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.fitting.refined import RefinedPoses

@@ -17,10 +17,9 @@ import gtsam
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetPydanticSchema, model_validator
 
-from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.calibration.choices import Choice
-from gtsam_rwhec.calibration.task_units import PointUncertainty, point_sentence
-from gtsam_rwhec.calibration.verdict import Finding, Ground, Verdict
+from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, point_sentence
+from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground, Verdict
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
