@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import (
     NotCertifiedWarning,
     NotUniqueWarning,
@@ -24,7 +25,6 @@ from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.trajectories.trajectory import Trajectory
-from gtsam_rwhec.vision.camera import Camera
 
 NoiseChoice = Literal["auto", "given", "estimate"]
 RobustChoice = Literal["auto", "gnc", "none"]

@@ -15,6 +15,7 @@ import numpy as np
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run
 from gtsam_rwhec.calibration.clock_offsets import Answer
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import (
     CameraError,
     CountError,
@@ -39,7 +40,6 @@ from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection, Tr
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.problem.nearer_poses import nearer_poses
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.vision.camera import Camera
 
 #: At most so many images are looked at, and of a pair at least so many.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8

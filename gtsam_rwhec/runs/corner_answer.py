@@ -5,28 +5,23 @@ noise and findings are of them; where the corners contradict what was stated, al
 """
 
 from __future__ import annotations
-from collections.abc import Collection
-from collections.abc import Mapping
+
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+
 import gtsam
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+
+from gtsam_rwhec.calibration.from_corners import SIZE_SHARE, CornersFound, corners_found
+from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.errors import CameraError, RwhecError
 from gtsam_rwhec.fitting.fit_options import CornerOptions
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.settled_poses import SettledPoses
-from gtsam_rwhec.runs.settled_poses import settled_poses
-from gtsam_rwhec.runs.solving_rounds import Pairs
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import SynchronisedPairs
-from gtsam_rwhec.calibration.from_corners import SIZE_SHARE
-from gtsam_rwhec.calibration.from_corners import CornersFound
-from gtsam_rwhec.calibration.from_corners import corners_found
-from gtsam_rwhec.calibration.verdict import Choice
+from gtsam_rwhec.runs.settled_poses import SettledPoses, settled_poses
+from gtsam_rwhec.runs.solving_rounds import Pairs, SolvingRounds, SynchronisedPairs
+
 
 def corner_answer(
     settled: SettledPoses,
