@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.trajectories.trajectory import Trajectory
+from gtsam_rwhec.geometry.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 TRACKS = ("noise", "motion", "outliers", "pnp", "mixed", "monocular", "robot_error", "temporal")

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.sparse
 import scs
 
-from gtsam_rwhec.solver.local_blocks import local_indices
 from gtsam_rwhec.solver.rotations import CONSTRAINTS
+from gtsam_rwhec.solver.small_dual import local_indices
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from . import cameras as cameras
 from .cameras import Camera as Camera
 
 # Solve it, or certify somebody's answer.
-from .identifiability import FreeDirection as FreeDirection
-from .identifiability import Identifiability as Identifiability
-from .identifiability import PairIdentifiability as PairIdentifiability
+from .solver import FreeDirection as FreeDirection
+from .solver import Identifiability as Identifiability
+from .solver import PairIdentifiability as PairIdentifiability
 from .solver import Basis as Basis
 from .solver import Cause as Cause
 from .solver import Certificate as Certificate
@@ -22,10 +22,10 @@ from .solver import Region as Region
 from .solver import Residual as Residual
 from .solver import SolveOptions as SolveOptions
 from .solver import Status as Status
-from .solving import Solution as Solution
-from .solving import SolvedPart as SolvedPart
-from .solving import certify as certify
-from .solving import solve as solve
+from .solver import Solution as Solution
+from .solver import SolvedPart as SolvedPart
+from .solver import certify as certify
+from .solver import solve as solve
 
 # All of it in one call: outliers, noise, a verdict, and how far off a point is.
 from .calibration import CalibrateOptions as CalibrateOptions
@@ -42,6 +42,7 @@ from .calibration import calibrate as calibrate
 from .calibration import CrossValidation as CrossValidation
 from .calibration import cross_validate as cross_validate
 from .calibration import reading_of as reading_of
+from .geometry import Trajectory as Trajectory
 from .geometry import pose_covariances as pose_covariances
 from .fitting import CarrierNoise as CarrierNoise
 from .fitting import RefineOptions as RefineOptions
@@ -75,7 +76,6 @@ from . import logs as logs
 from . import odometry as odometry
 from . import runs as runs
 from . import rig as rig
-from . import trajectories as trajectories
 from . import detect as detect
 from .runs import calibrate_log as calibrate_log
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.identifiability import FreeKind
 from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver import FreeKind
 from gtsam_rwhec.solver.certificate import Basis
 
 X = gtsam.Pose3.Expmap(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.3])).matrix()

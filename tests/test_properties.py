@@ -16,12 +16,12 @@ from rwhec_factors.se3 import inverse, pose
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
+from gtsam_rwhec.solver.answers import answer_of
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
-from gtsam_rwhec.solver.variables import answer_of
 
 NOISE = Noise(0.01, 500.0)
 SEEDS = st.integers(0, 2**31 - 1)

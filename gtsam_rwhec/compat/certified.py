@@ -6,10 +6,10 @@ import numpy as np
 
 from gtsam_rwhec.compat.stations import Stations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solving.certified_solution import solve
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.solution import Solution
 
 #: Residuals (radians, or lengths over the spread of the translations) below this are rounding error of exact poses.
 LEAST_RESIDUAL = 1e-6

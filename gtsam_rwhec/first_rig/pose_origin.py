@@ -14,8 +14,8 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.rig.sections import PoseNoise
-from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: An arm's repeatability is ten times smaller; its absolute errors are of this size.
 ARM = PoseNoise(rotation_deg=0.03, translation_mm=0.2)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.moments import ONE, T_A, Gauge, Moments
-from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 
 #: A shift rounds each entry at most so often: four products and four sums for its row, as many for its column.

@@ -19,8 +19,7 @@ from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.fleet.extras import imported
 from gtsam_rwhec.fleet.rows import FailedLog, RobotRow, RowFrame
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.cause import Status
-from gtsam_rwhec.solver.certificate import Basis
+from gtsam_rwhec.solver.certificate import Basis, Status
 
 #: What the file's metadata call it, and the version of its columns.
 FORMAT, FORMAT_VERSION = "gtsam-rwhec fleet rows", 1

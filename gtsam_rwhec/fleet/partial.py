@@ -18,7 +18,7 @@ from gtsam_rwhec.fleet.container import packed, unpacked
 from gtsam_rwhec.fleet.log_facts import LogFacts
 from gtsam_rwhec.fleet.pair_moments import PairMoments
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 
 FOLDER = "partials"
 _TRIANGLE = np.triu_indices(6)

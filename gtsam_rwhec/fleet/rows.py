@@ -18,8 +18,7 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.cause import Status
-from gtsam_rwhec.solver.certificate import Basis
+from gtsam_rwhec.solver.certificate import Basis, Status
 
 #: What a file of rows calls itself, and the version of its fields.
 FORMAT, FORMAT_VERSION = "gtsam-rwhec fleet rows", 1

@@ -15,7 +15,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.methods.estimate import Outcome
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solver.certified_solution import solve
 
 
 def certified(request: Request) -> Outcome[Array]:

@@ -1,7 +1,7 @@
 """Free directions of AX = XB: what the motions do not determine.
 
 Noise in the measurements looks like motion, so real data never leave a direction exactly undetermined. As in
-``gtsam_rwhec.identifiability``, a direction is free when it has not significantly more information than noise alone
+``solver.identification``, a direction is free when it has not significantly more information than noise alone
 would create there. That noise is known from the answer:
 
 - With noise delta q_C, delta q_H, A_i has E |A_i p|^2 = E |delta q_C|^2 + E |delta q_H|^2 for *every* unit p, since L
@@ -22,8 +22,8 @@ from gtsam_rwhec.geometry.quaternions import to_rotations
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import best_translation
-from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
-from gtsam_rwhec.identifiability.threshold import free_threshold
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.solver.noise_bounds import free_threshold
 
 #: Information below this part of the largest is rounding error.
 ROUNDING = 1e-12

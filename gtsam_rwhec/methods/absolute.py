@@ -16,9 +16,9 @@ from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.normal_equations import FREE, solve_scaled
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import Gauge, Moments, edge_forms
-from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.parts import connected_components
 from gtsam_rwhec.solver.rotations import project

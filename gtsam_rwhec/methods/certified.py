@@ -8,9 +8,9 @@ from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, WeightsWar
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.options import SolveOptions
-from gtsam_rwhec.solving.certified_solution import solve
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solve_options import SolveOptions
 
 SOURCE = (
     "E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "

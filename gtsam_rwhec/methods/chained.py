@@ -23,9 +23,9 @@ from gtsam_rwhec.methods.applicability import refusal
 from gtsam_rwhec.methods.estimate import Estimate, Outcome
 from gtsam_rwhec.methods.method import Method, MethodOptions
 from gtsam_rwhec.methods.registry import estimate_of
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.solution import Solution
 
 #: X and Y of the one pair of a problem, metres.
 PairSolver = Callable[[Problem], tuple[PoseLike, PoseLike]]

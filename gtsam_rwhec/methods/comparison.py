@@ -20,10 +20,10 @@ from gtsam_rwhec.methods.chained import Chained, PairSolver, chained, solver_of,
 from gtsam_rwhec.methods.estimate import Estimate
 from gtsam_rwhec.methods.method import Method, MethodOptions, Takes, check_options
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.solution import Solution
 
 
 @dataclass(frozen=True)

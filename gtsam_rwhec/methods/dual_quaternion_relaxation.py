@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import dual_parts, left, of_vectors, right
 from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
-from gtsam_rwhec.solver.conic_solver import solve_conic, stacked, unstacked
+from gtsam_rwhec.solver.relaxation import solve_conic, stacked, unstacked
 
 #: The relaxation is solved for at most this many frames. A cone of 8 n takes a dense block of order 4 n (8 n + 1)
 #: squared.

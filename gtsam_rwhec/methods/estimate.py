@@ -9,9 +9,9 @@ from typing import Generic, TypeVar
 import gtsam
 
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.identifiability.free_directions import FreeDirection
-from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.solver.residuals import Residual
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.solver.answers import Residual
+from gtsam_rwhec.solver.free_directions import FreeDirection
 
 Poses = Mapping[str, PoseLike]
 X = TypeVar("X")

@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
-from gtsam_rwhec.solver.conic_solver import solve_conic, triangle, unstacked
+from gtsam_rwhec.solver.relaxation import solve_conic, triangle, unstacked
 from gtsam_rwhec.solver.rotations import project, unvec
 
 #: Order of a quaternion's entries, scalar first. The solver's last digits, and so its bound, depend on the order.

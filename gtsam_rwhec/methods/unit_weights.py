@@ -15,10 +15,10 @@ from gtsam_rwhec.errors import FrameError, ScaleError
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.answers import answer_of
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
-from gtsam_rwhec.solver.variables import answer_of
 
 #: The name of this cost in ``Estimate.proof``.
 COST = "J with all weights 1"

@@ -16,13 +16,12 @@ from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.methods.unit_weights import COST, UnitForm
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.answers import answer_of, as_point
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.interior_point import Relaxation
-from gtsam_rwhec.solver.local_blocks import scatter
-from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_clarabel
+from gtsam_rwhec.solver.relaxation import Relaxation, round_to_rotations, solve_by_clarabel
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers
-from gtsam_rwhec.solver.variables import answer_of, as_point
+from gtsam_rwhec.solver.small_dual import scatter
 
 #: The interior-point solver stops at this relative gap and infeasibility.
 TOLERANCE = 1e-10

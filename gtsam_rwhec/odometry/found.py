@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import Twist
-from gtsam_rwhec.solver.cause import Status
+from gtsam_rwhec.solver.certificate import Status
+from gtsam_rwhec.solver.free_directions import Twist
 
 #: What is given is contradicted by the data from so many standard deviations on.
 CONTRADICTED = 4.0

@@ -20,13 +20,11 @@ from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.found import JointCertificate
 from gtsam_rwhec.odometry.joint_form import JointForm
-from gtsam_rwhec.solver.cause import Status
+from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
-from gtsam_rwhec.solver.interior_point import solve_by_blocks
-from gtsam_rwhec.solver.local_blocks import scatter
-from gtsam_rwhec.solver.relaxation import round_to_rotations
+from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_blocks
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, constraint_values, kkt_multipliers, random_rotations
-from gtsam_rwhec.solver.small_dual import improve, stationary_multipliers
+from gtsam_rwhec.solver.small_dual import improve, scatter, stationary_multipliers
 
 #: Descents from so many random rotations, beside the given starts.
 RANDOM_STARTS = 4

@@ -9,8 +9,8 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.odometry.calibrated import OdometryCalibration
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 
 #: So many of them are named.
 NAMED = 4

@@ -2,5 +2,5 @@ from .csv_folder import read_csv as read_csv
 from .knowledge import Prior as Prior
 from .knowledge import ScaleMode as ScaleMode
 from .measurements import Measurements as Measurements
-from .pairs import Pair as Pair
+from .measurements import Pair as Pair
 from .problem import Problem as Problem

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moment_stack import MomentStack
+from gtsam_rwhec.problem.many_measurements import Sorted
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.moment_stack import MomentStack, PackedMoments
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
-from gtsam_rwhec.problem.packed_moments import PackedMoments
-from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.problem.segmented_moments import Sorted
 
 #: Up to this number of measurements the gauge moves and all moments are summed again, as one measurement does not tell
 #: the centre of a trajectory. Later measurements are summed about the gauge as it then is.

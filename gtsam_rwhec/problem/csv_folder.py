@@ -30,8 +30,7 @@ from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
-from gtsam_rwhec.problem.measurements import GivenMeasurements
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 
 COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +20,41 @@ from gtsam_rwhec.geometry.poses import (
     rows_to_transforms,
 )
 from gtsam_rwhec.geometry.real_numbers import real_array
-from gtsam_rwhec.problem.segmented_moments import Sorted
+
+Value = TypeVar("Value")
+
+
+class Pair(NamedTuple):
+    """A target and the sensor that saw it; for motions of a sensor (A Y = Y B), the sensor's name twice.
+
+    A pair is a tuple, so ``solution.residuals["tag_0", "cam_0"]`` finds it.
+    """
+
+    target: str
+    sensor: str
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether the measurements are motions of one sensor (AX = XB)."""
+        return self.target == self.sensor
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The names of the frames: target and sensor, or the sensor alone for motions."""
+        return (self.sensor,) if self.is_motion else tuple(self)
+
+    @property
+    def label(self) -> str:
+        """The pair's name in messages and tables: "tag_0-cam_0" or "the motions of cam_0"; also ``str(pair)``."""
+        return f"the motions of {self.sensor}" if self.is_motion else f"{self.target}-{self.sensor}"
+
+    def __str__(self) -> str:
+        return self.label
+
+
+#: Values by pair as users give them: a key may be a plain tuple.
+ByPair: TypeAlias = Mapping[Pair, Value] | Mapping[tuple[str, str], Value]
+
 
 #: sigma and kappa below this are refused: other terms of a sum would be lost to rounding.
 SMALLEST_WEIGHT = 1e-15
@@ -76,81 +112,6 @@ class Measurements:
             for name, poses in (("A", self.A), ("B", self.B))
         )
         return replace(self, A=A, B=B)
-
-    def kept(self) -> KeptMeasurements:
-        """A copy, since the caller's arrays may change, with one sigma and one kappa for each measurement."""
-        sigma, kappa = (np.broadcast_to(value, len(self.A)) for value in (self.sigma, self.kappa))
-        copied = replace(self, A=self.A.copy(), B=self.B.copy(), sigma=sigma, kappa=kappa)
-        return KeptMeasurements((copied,), self.covariances is not None)
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """The measurements of one pair among those of many."""
-
-    many: Sorted
-    index: int
-
-    @property
-    def count(self) -> int:
-        """The number of measurements."""
-        return int(self.many.first[self.index + 1] - self.many.first[self.index])
-
-    @property
-    def measurements(self) -> Measurements:
-        """They themselves, without a copy."""
-        at, many = self.many.section(self.index), self.many
-        sigma, kappa = (
-            np.broadcast_to(value, at.stop - at.start) if value.ndim == 0 else value[at]
-            for value in (many.sigma, many.kappa)
-        )
-        stamps, covariances = (None if each is None else each[at] for each in (many.stamps_ns, many.covariances))
-        return Measurements(many.A[at], many.B[at], sigma, kappa, stamps, covariances)
-
-
-@dataclass(frozen=True, slots=True)
-class KeptMeasurements:
-    """Raw measurements of a pair that are kept, batch by batch, and whether any batch had covariances."""
-
-    stored: tuple[Measurements | Section, ...] = ()
-    has_covariances: bool = False
-
-    def __add__(self, other: KeptMeasurements) -> KeptMeasurements:
-        return KeptMeasurements(self.stored + other.stored, self.has_covariances or other.has_covariances)
-
-    @property
-    def batches(self) -> tuple[Measurements, ...]:
-        """The measurements of each batch, without a copy."""
-        return tuple(each.measurements if isinstance(each, Section) else each for each in self.stored)
-
-    @property
-    def count(self) -> int:
-        """The number of measurements that are kept."""
-        return sum(each.count if isinstance(each, Section) else len(each.A) for each in self.stored)
-
-    def joined(self) -> Measurements:
-        """All batches in one, in the order in which they were added; stamps only where every batch has them."""
-        batches = self.batches
-        stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
-        return Measurements(
-            np.concatenate([b.A for b in batches]),
-            np.concatenate([b.B for b in batches]),
-            np.concatenate([b.sigma for b in batches]),
-            np.concatenate([b.kappa for b in batches]),
-            np.concatenate(stamps) if len(stamps) == len(batches) else None,
-            np.concatenate([b.covariance_of_B() for b in batches]) if self.has_covariances else None,
-            self._pixels(),
-        )
-
-    def _pixels(self) -> Array | None:
-        """Corners of all batches; nan for those that were given as poses."""
-        shapes = {b.pixels.shape[1:] for b in self.batches if b.pixels is not None}
-        if not shapes:
-            return None
-        (shape,) = shapes  # a target has one board
-        return np.concatenate(
-            [np.full((len(b.A), *shape), np.nan) if b.pixels is None else b.pixels for b in self.batches]
-        )
 
 
 @dataclass(frozen=True)

@@ -1,31 +1,83 @@
 """The problem as the user states it: measurements by pair, and the knowledge of frames and scales."""
 
 from __future__ import annotations
-
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Literal
-
 from numpy.typing import ArrayLike
-
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import MeasurementsNotKeptError
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import PosesLike, QuaternionOrder, as_transforms
-from gtsam_rwhec.problem.accumulation import Accumulator, Batch
-from gtsam_rwhec.problem.checked_arguments import SIDES, check_measurements, seen_pair, warn_of_projected
-from gtsam_rwhec.problem.contents import Contents
-from gtsam_rwhec.problem.corner_poses import candidates_of
-from gtsam_rwhec.problem.corners import EachImage, check_camera, check_corner_px, check_in_image, seen_corners
-from gtsam_rwhec.problem.knowledge import ScaleMode, check_name
-from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
+from gtsam_rwhec.geometry.poses import PosesLike
+from gtsam_rwhec.geometry.poses import QuaternionOrder
+from gtsam_rwhec.geometry.poses import as_transforms
+from gtsam_rwhec.problem.accumulation import Accumulator
+from gtsam_rwhec.problem.accumulation import Batch
+from gtsam_rwhec.problem.corners import EachImage
+from gtsam_rwhec.problem.corners import check_camera
+from gtsam_rwhec.problem.corners import check_corner_px
+from gtsam_rwhec.problem.corners import check_in_image
+from gtsam_rwhec.problem.corners import seen_corners
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.knowledge import check_name
+from gtsam_rwhec.problem.long_translations import LongTranslations
+from gtsam_rwhec.problem.long_translations import warn_of_millimetres
 from gtsam_rwhec.problem.many_measurements import GivenMany
-from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements, Section
-from gtsam_rwhec.problem.moments import BLOCK, Moments
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import GivenMeasurements
+from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.moments import BLOCK
+from gtsam_rwhec.problem.moments import Moments
+import warnings
+from gtsam_rwhec.errors import RotationsProjectedWarning
+from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE
+from gtsam_rwhec.problem.corners import candidates_of
+from gtsam_rwhec.problem.knowledge import Knowledge
+from gtsam_rwhec.problem.many_measurements import KeptMeasurements
+from gtsam_rwhec.problem.many_measurements import Section
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.moment_stack import MomentStack
+from gtsam_rwhec.problem.moments import Gauge
+
+#: What the names of a pair are.
+SIDES: tuple[Literal["target"], Literal["sensor"]] = ("target", "sensor")
 
 
-class Problem(Contents):
+def warn_of_projected(where: str, projected: int, stacklevel: int) -> None:
+    """Warn of rotations that were not exact."""
+    warnings.warn(
+        f"{where}: {projected} rotations were not exact: R'R differs from I, by less than "
+        f"{ROTATION_TOLERANCE:g}; they were projected to the nearest rotation",
+        RotationsProjectedWarning,
+        stacklevel=stacklevel + 1,
+    )
+
+
+def seen_pair(target: str, sensor: str) -> Pair:
+    """A target and the sensor that saw it; a FrameError where their names are none, or one."""
+    check_name(target, "the target's name")
+    check_name(sensor, "the sensor's name")
+    if target == sensor:
+        raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
+    return Pair(target, sensor)
+
+
+def check_measurements(measurements: object) -> None:
+    """Raise an OptionError for anything but raw measurements by pair."""
+    if not isinstance(measurements, Mapping):
+        raise OptionError(f"measurements is a {type(measurements).__name__}; give {{pair: Measurements}}")
+    for pair, raw in measurements.items():
+        if not isinstance(pair, Pair) or not isinstance(raw, Measurements):
+            raise OptionError(
+                f"measurements has a {type(raw).__name__} for {brief(pair)}; give "
+                "{Pair(target, sensor): Measurements}"
+            )
+
+
+class Problem(Knowledge):
     """A calibration problem: A_i X_j = Y_k B_i for targets j, sensors k and measurements i.
 
     A = T_sensorcarrier_targetcarrier (known: kinematics, motion capture, SLAM), B = T_sensor_target (measured),
@@ -52,7 +104,7 @@ class Problem(Contents):
         sensor_carrier: str | None = None,
         target_carrier: str | None = None,
     ) -> None:
-        super().__init__(scale, keep_measurements)
+        super().__init__(scale)
         for name, what in ((sensor_carrier, "sensor_carrier"), (target_carrier, "target_carrier")):
             if name is not None:
                 check_name(name, what)
@@ -60,6 +112,11 @@ class Problem(Contents):
             raise FrameError(f"both carriers are named {brief(sensor_carrier)}; give each its own name")
         self.sensor_carrier = sensor_carrier
         self.target_carrier = target_carrier
+        self.keep_measurements = keep_measurements
+        self.is_relative = False  # whether the noise of some measurements is not stated
+        self._kind: dict[str, Literal["target", "sensor"]] = {}
+        self._kept: dict[Pair, KeptMeasurements] = {}
+        self._accumulator = Accumulator()
         self._long: frozenset[str] = frozenset()  # of "A" and "B", those whose millimetres were warned of
 
     # -- measurements -------------------------------------------------------------------------------------------
@@ -290,7 +347,11 @@ class Problem(Contents):
         self._long |= translations.sizes.keys()
         self.is_relative = self.is_relative or not given.has_noise
         self._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
-        kept = raw.kept() if self.keep_measurements else KeptMeasurements((), raw.covariances is not None)
+        kept = (
+            KeptMeasurements.copied(raw)
+            if self.keep_measurements
+            else KeptMeasurements((), raw.covariances is not None)
+        )
         self._kept[pair] = self._kept.get(pair, KeptMeasurements()) + kept
 
     def _check_names(self, pair: Pair, where: str) -> None:
@@ -332,6 +393,97 @@ class Problem(Contents):
         result._accumulator = Accumulator(self.gauge, dict(moments))
         result._take_knowledge(self, frames=lost_frames, scales=lost_scales)
         return result
+
+    # -- what it holds -------------------------------------------------------------------------------------------
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the targets, in order of first appearance."""
+        return tuple(name for name, kind in self._kind.items() if kind == "target")
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors, in order of first appearance."""
+        return tuple(name for name, kind in self._kind.items() if kind == "sensor")
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        """The pairs that have measurements, in order of first appearance."""
+        return tuple(self._kept)
+
+    @property
+    def number_of_measurements(self) -> int:
+        """The number of measurements of all pairs."""
+        return self._accumulator.number_of_measurements
+
+    @property
+    def has_covariances(self) -> bool:
+        """Whether any measurement has a full covariance (refinement alone uses it)."""
+        return any(kept.has_covariances for kept in self._kept.values())
+
+    @property
+    def has_measurements(self) -> bool:
+        """Whether every raw measurement was kept."""
+        return all(kept.count == self._accumulator.count(pair) for pair, kept in self._kept.items())
+
+    def require_pairs(self) -> None:
+        """Raise a CountError where the problem has no measurements."""
+        if not self._kept:
+            raise CountError("the problem is empty; add measurements with problem.add(target, sensor, A, B, ...)")
+
+    def require_raw_measurements(self, what: str) -> None:
+        """Raise a MeasurementsNotKeptError where raw measurements, which ``what`` needs, were not kept."""
+        if not self.has_measurements:
+            raise MeasurementsNotKeptError(
+                f"{what} needs the raw measurements, and they were not kept (keep_measurements=False); make the "
+                "problem with keep_measurements=True"
+            )
+
+    @property
+    def gauge(self) -> Gauge:
+        """The reference points that the moments are summed about."""
+        return self._accumulator.gauge
+
+    def moments(self, target: str, sensor: str) -> Moments:
+        """Moments of a pair, about ``gauge``."""
+        return self._accumulator.moments(self._pair(target, sensor))
+
+    def moment_stack(self, pairs: Sequence[Pair]) -> MomentStack:
+        """Moments of some pairs in their order, about ``gauge``, without a copy of what is long."""
+        return self._accumulator.stack(pairs)
+
+    def measurements(self, target: str, sensor: str) -> Measurements:
+        """Raw measurements of a pair, in the order in which they were added.
+
+        Raises
+        ------
+        MeasurementsNotKeptError
+            The problem was made with ``keep_measurements=False``.
+        """
+        pair = self._pair(target, sensor)
+        kept = self._kept[pair]
+        if kept.count != self._accumulator.count(pair):
+            raise MeasurementsNotKeptError(
+                f"the raw measurements of {pair} were not kept (keep_measurements=False); "
+                "make the problem with keep_measurements=True"
+            )
+        return kept.joined()
+
+    def batches(self, target: str, sensor: str) -> tuple[Measurements, ...]:
+        """Raw measurements of a pair as they were added, batch by batch, without a copy; only what was kept."""
+        return self._kept[self._pair(target, sensor)].batches
+
+    def stored(self, pair: Pair) -> tuple[Measurements | Section, ...]:
+        """What was kept of a pair, batch by batch, as it is stored."""
+        return self._kept[pair].stored
+
+    def _pair(self, target: str, sensor: str) -> Pair:
+        check_name(target, "the target's name")
+        check_name(sensor, "the sensor's name")
+        pair = Pair(target, sensor)
+        if pair not in self._kept:
+            raise FrameError(f"no measurements of {pair}; there are {', '.join(map(str, self.pairs))}")
+        return pair
 
     # -- joining ------------------------------------------------------------------------------------------------
 

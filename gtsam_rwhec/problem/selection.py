@@ -5,16 +5,71 @@ A frame that loses its last measurement is not in the new problem (``Problem.wit
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, NoiseError
-from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.problem.pairs import ByPair, Pair
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Accumulator
+from gtsam_rwhec.problem.corners import candidates_of
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.many_measurements import KeptMeasurements
+from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
+from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
+from gtsam_rwhec.vision.camera import Camera
+
+
+class VarianceFactors(NamedTuple):
+    """Factors of the stated variances of B's rotations and translations; 1 means that the noise is as stated."""
+
+    rotation: float
+    translation: float
+
+
+AS_STATED = VarianceFactors(1.0, 1.0)
+
+
+def problem_of_moments(
+    moments: Mapping[Pair, Moments],
+    gauge: Gauge,
+    scale: ScaleMode = "known",
+    *,
+    is_relative: bool = False,
+    sensor_carrier: str | None = None,
+    target_carrier: str | None = None,
+) -> Problem:
+    """The problem of some moments; it has no raw measurements.
+
+    Parameters
+    ----------
+    moments : dict of Pair to Moments
+        About `gauge`.
+    gauge : Gauge
+    scale : "known", "shared" or "per_target"
+    is_relative : bool
+        Whether the noise of some measurements was not stated.
+    sensor_carrier, target_carrier : str, optional
+        As for ``Problem``.
+
+    Raises
+    ------
+    FrameError
+        A name is that of a target and of a sensor.
+    """
+    problem = Problem(scale, keep_measurements=False, sensor_carrier=sensor_carrier, target_carrier=target_carrier)
+    for pair in moments:
+        problem._check_names(pair, pair.label)
+        problem._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
+        problem._kept[pair] = KeptMeasurements()
+    problem._accumulator = Accumulator(gauge, dict(moments))
+    problem.is_relative = is_relative
+    return problem
 
 
 def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
@@ -87,5 +142,70 @@ def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Meas
         raw,
         sigma=raw.sigma * np.sqrt(factors.translation / w),
         kappa=raw.kappa * w / factors.rotation,
+        covariances=covariances,
+    )
+
+
+#: Entries of two rotations that are one pose of an image.
+SAME_POSE = 1e-3
+
+
+def nearer_poses(
+    problem: Problem,
+    X: Mapping[str, gtsam.Pose3],
+    Y: Mapping[str, gtsam.Pose3],
+    cameras: Mapping[str, Camera] | None = None,
+) -> tuple[Problem, int]:
+    """The problem in which each image has the pose that is nearer to an answer's, and how many images changed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Measurements that were added as poses stay, and so do those of frames that the answer lacks.
+    X, Y : dict of str to gtsam.Pose3
+        The answer's T_targetcarrier_target and T_sensorcarrier_sensor.
+    cameras : dict of str to Camera, optional
+        Other intrinsics by sensor, by which the poses of all their images are computed; the problem's own stay as
+        they were stated.
+    """
+    if not problem.boards or not problem.has_measurements:
+        return problem, 0
+    every: dict[Pair, Measurements] = {}
+    number = 0
+    for pair in problem.pairs:
+        raw = every[pair] = problem.measurements(*pair)
+        if raw.pixels is None or raw.covariances is None or pair.target not in X or pair.sensor not in Y:
+            continue
+        camera = (cameras or {}).get(pair.sensor)
+        rows = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2)))
+        both = candidates_of(
+            camera or problem.cameras[pair.sensor],
+            problem.boards[pair.target],
+            raw.pixels[rows],
+            problem.corner_px or 0.1,
+            pair.label,
+        )
+        predicted = np.linalg.inv(Y[pair.sensor].matrix()) @ raw.A[rows] @ X[pair.target].matrix()
+        T, covariance = both.chosen(both.nearer(predicted))
+        changed = np.abs(T[:, :3, :3] - raw.B[rows, :3, :3]).max(axis=(1, 2)) > SAME_POSE
+        number += int(changed.sum())
+        if camera is not None:
+            changed[:] = True
+        if changed.any():
+            every[pair] = _with_poses(raw, rows[changed], T[changed], covariance[changed])
+    return (problem.with_measurements(every), number) if number or cameras else (problem, 0)
+
+
+def _with_poses(raw: Measurements, rows: np.ndarray, T: Array, covariance: Array) -> Measurements:
+    """Measurements with other poses and covariances in some rows."""
+    assert raw.covariances is not None
+    B, covariances = raw.B.copy(), raw.covariances.copy()
+    B[rows], covariances[rows] = T, covariance
+    spread = np.einsum("nii->ni", covariances)
+    return replace(
+        raw,
+        B=B,
+        sigma=np.sqrt(spread[:, 3:].mean(axis=1)),
+        kappa=0.5 / spread[:, :3].mean(axis=1),
         covariances=covariances,
     )

@@ -11,9 +11,9 @@ from rich.console import Console
 
 from gtsam_rwhec.calibration.verdict import Ground, Judgement
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.report.printing import print_heading, print_sentence
 from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 
 #: A sentence as it is printed, and its style.
 Styled = tuple[str, str]

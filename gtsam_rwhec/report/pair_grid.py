@@ -12,8 +12,8 @@ from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.identifiability.verdicts import Identifiability
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.solver.free_directions import Identifiability
 
 
 @dataclass(frozen=True)

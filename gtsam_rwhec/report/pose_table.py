@@ -15,8 +15,8 @@ from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.terminal_text import printable, shown
-from gtsam_rwhec.solver.residuals import Residual
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.answers import Residual
+from gtsam_rwhec.solver.solution import Solution
 
 RESIDUAL_LEGEND = (
     "rms: root mean square length of the residuals of a frame's n measurements, weighted as in the cost, in mm "

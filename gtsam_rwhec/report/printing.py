@@ -11,7 +11,7 @@ from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.files.terminal import SafeConsole
 from gtsam_rwhec.files.terminal_text import LONGEST_LINE, printable, shown
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.solution import Solution
 
 #: Tables in a file have this many columns. Sentences in a file are not wrapped.
 PLAIN_WIDTH = 160

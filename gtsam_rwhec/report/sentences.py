@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.solver.cause import Status
-from gtsam_rwhec.solver.certificate import Basis, Certificate
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.certificate import Basis, Certificate, Status
+from gtsam_rwhec.solver.solution import Solution
 
 
 def certificate_sentence(certificate: Certificate, answer: str = "this answer") -> str:

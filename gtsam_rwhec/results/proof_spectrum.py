@@ -7,22 +7,24 @@ it without eigenvalues, for all variables and with rounding enclosed; the spectr
 """
 
 from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
-
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
-from gtsam_rwhec.solver import small_dual
-from gtsam_rwhec.solver.cause import Multipliers
+from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.evidence_record import Row
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.descent import homogeneous
-from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers
-from gtsam_rwhec.solver.variables import given_answer, given_translations
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.rotations import CONSTRAINTS
+from gtsam_rwhec.solver.rotations import kkt_multipliers
+from gtsam_rwhec.solver.answers import given_answer
+from gtsam_rwhec.solver.answers import given_translations
+from gtsam_rwhec.solver.certificate import Multipliers
+from gtsam_rwhec.solver.small_dual import improve
+from gtsam_rwhec.solver.small_dual import scatter
+from gtsam_rwhec.solver.solution import Solution
 
 #: Larger matrices are not decomposed.
 MOST_ROWS = 1000
@@ -93,7 +95,7 @@ def _spectrum(part: Part, solution: Solution, certificate: Certificate) -> dict[
     x, Q = homogeneous(R), form.reduced.dense()
     multipliers = kkt_multipliers(R, (Q @ x)[:-1].reshape(-1, 9))
     if certificate.path.multipliers is Multipliers.ALL_CONSTRAINTS:
-        multipliers, _ = small_dual.improve(form.reduced, R, multipliers)
+        multipliers, _ = improve(form.reduced, R, multipliers)
     Z = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z = 0.5 * (Z + Z.T)
     Z[-1, -1] -= float(x @ Z @ x)  # the multiplier of h^2 = 1

@@ -13,7 +13,7 @@ from gtsam_rwhec.logs.pose_rows import PoseStatement
 from gtsam_rwhec.logs.records import DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.solving import solve
+from gtsam_rwhec.solver import solve
 
 #: Samples have no stamps: these are this far apart, nanoseconds, further than poses are interpolated.
 APART_NS = 10**9

@@ -10,7 +10,7 @@ from rwhec_factors.se3 import inverse
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.pairs import ByPair, Pair
+from gtsam_rwhec.problem.measurements import ByPair, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.graphs import Edge, GraphKind, bipartite_edges
 from gtsam_rwhec.simulate.motion import Motion, MotionKind, carrier_poses

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import UNIT
 from gtsam_rwhec.solver.arrow import backward_substitution, forward_substitution
 from gtsam_rwhec.solver.elimination import Elimination, Group
 
@@ -326,3 +327,35 @@ def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.
 
     sums = csr_array((np.full(k, factor), order, np.r_[begin, k]), shape=(len(rows), k)) @ values.reshape(k, -1)
     result[rows] += sums.reshape(len(rows), *values.shape[1:])
+
+
+#: This number is added to a bound; underflow can lose less.
+_TINY = 1e-290
+
+
+def cholesky_allowance(matrix: BlockMatrix, diagonal: Array) -> Array:
+    """A bound on the rounding in the factorisation of a matrix with this graph and diagonal, as a diagonal matrix."""
+    _, m, q = matrix.tails.shape
+    of_frames, of_tail = matrix.order.spread(m, q)
+    allowance: Array = np.r_[np.repeat(of_frames, m), np.full(q, of_tail)] * np.abs(diagonal) + _TINY
+    return allowance
+
+
+def proof_that_it_exceeds(matrix: BlockMatrix, margin: Array | float = 0.0) -> BlockFactor | None:
+    """The proof that a matrix, exactly as stored, minus diag(margin) is positive definite: the factor of a smaller one.
+
+    None proves nothing. A negative margin makes a weaker test.
+    """
+    return _smaller(matrix, margin).factor()
+
+
+def is_proven_to_exceed(matrix: BlockMatrix, margin: Array | float = 0.0) -> bool:
+    """Whether there is such a proof, which is not kept."""
+    return _smaller(matrix, margin).has_factor()
+
+
+def _smaller(matrix: BlockMatrix, margin: Array | float) -> BlockMatrix:
+    diagonal = matrix.diagonal
+    # The subtraction rounds by at most u times its result.
+    reach = np.abs(diagonal) + np.abs(margin)
+    return matrix.plus(-(margin + cholesky_allowance(matrix, reach) + 4.0 * UNIT * reach))

@@ -12,11 +12,16 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma, gammas
-from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
+from gtsam_rwhec.solver.block_matrix import (
+    BlockFactor,
+    BlockMatrix,
+    cholesky_allowance,
+    is_proven_to_exceed,
+    proof_that_it_exceeds,
+)
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
-from gtsam_rwhec.solver.verified import cholesky_allowance, is_proven_to_exceed, proof_that_it_exceeds
 
 #: A variable that is held has this many times its own diagonal entry added.
 HELD = 2.0**50

@@ -18,14 +18,39 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.curvature import Curvature
-from gtsam_rwhec.solver.local_blocks import scatter
-from gtsam_rwhec.solver.own_curvature import own_curvature
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.point import Evaluation
-from gtsam_rwhec.solver.rotations import CONSTRAINTS
-from gtsam_rwhec.solver.small_dual import maximise, null_multipliers
+from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, CONSTRAINTS_FLAT, project, unvec, vec
+from gtsam_rwhec.solver.small_dual import maximise, null_multipliers, scatter
+from gtsam_rwhec.solver.solve_options import SolveOptions
+
+#: What is added to the own translation's and scale's diagonal, as a part of it, where they are free.
+FREE = 1e-9
+
+
+def own_curvature(whole: PartForm, multipliers: Array) -> Array:
+    """The smallest mu (n,) with Z v = mu Q v for vectors v of one frame alone: Z is surely negative where mu is."""
+    own, inner = _own_blocks(whole)
+    M = own[:, 4:, 4:] - np.matmul(own[:, 4:, :4], np.linalg.solve(inner, own[:, :4, 4:]))
+    Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(-1, 10, 10)[:, :9, :9]
+    values, vectors = np.linalg.eigh(0.5 * (M + M.transpose(0, 2, 1)))
+    root = vectors / np.sqrt(np.maximum(values, 1e-9 * np.abs(values).max(axis=1, initial=1e-290)[:, None]))[:, None, :]
+    smallest: Array = 1.0 - np.linalg.eigvalsh(root.transpose(0, 2, 1) @ Lambda @ root)[:, -1]
+    return smallest
+
+
+def _own_blocks(whole: PartForm) -> tuple[Array, Array]:
+    """Each frame's own block of Q (n, 13, 13), and its part of translation and scale (n, 4, 4), made invertible."""
+    own = whole.full.frames
+    inner = own[:, :4, :4].copy()
+    diagonal = np.einsum("nii->ni", inner)
+    diagonal[...] = (1.0 + FREE) * diagonal + np.where(diagonal == 0.0, 1.0, 0.0)
+    return own, inner
+
 
 #: Parts of Q's diagonal that are added to Q and to Z, where the measurements leave translations and scales free.
 OF_Q, OF_Z = 1e-9, 1e-12
@@ -227,3 +252,28 @@ def helpful_frames(
     order = np.argsort(-promise)[: (GROWTH - 1) * max(k, 3)]
     result: np.ndarray = order[promise[order] > PROMISE * promise.max()]
     return result
+
+
+@dataclass(frozen=True)
+class LocalRelaxation:
+    """A solution of the relaxation of a few frames, up to the solver's accuracy."""
+
+    multipliers: Array  #: (n, 20), of all frames
+    dual: float  #: its optimum: no answer costs less
+    starts: list[Array]  #: rotations (n, 3, 3) of all frames
+
+
+def relax_locally(
+    evaluation: Evaluation, kkt: Array, form: LocalForm, options: SolveOptions, progress: Progress | None = None
+) -> LocalRelaxation:
+    """Solve the relaxation of the frames of ``form``; ``kkt`` (n, 20) are those of R'R = I at the evaluated point."""
+    Q = form.Z + scatter(np.einsum("nk,kpq->npq", form.kkt, CONSTRAINTS))
+    Q[-1, -1] += evaluation.cost  # Z has it taken off, so that Z x = 0
+    relaxation = solve_relaxation(Q, options.relaxation_tolerance, options.max_relaxation_iterations, progress)
+    multipliers = kkt.copy()
+    multipliers[form.frames] = relaxation.multipliers
+    starts = []
+    for R in round_to_rotations(relaxation):
+        followed = form.follow @ np.append(vec(R).ravel(), 1.0)
+        starts.append(project(unvec(followed[:-1].reshape(-1, 13)[:, 4:])))
+    return LocalRelaxation(multipliers, relaxation.dual, starts)

@@ -13,18 +13,15 @@ import numpy as np
 
 from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.answers import Point, answer_of
 from gtsam_rwhec.solver.bound import Bound, lower_bound
-from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
+from gtsam_rwhec.solver.certificate import Cause, Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
-from gtsam_rwhec.solver.interior_point import Relaxation
-from gtsam_rwhec.solver.point import Point
 from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_with_scale
+from gtsam_rwhec.solver.relaxation import Relaxation, round_to_rotations, solve_with_scale
 from gtsam_rwhec.solver.rotations import vec
-from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.searched_part import Found
+from gtsam_rwhec.solver.search import Found, Search
 from gtsam_rwhec.solver.small_dual import stationary_multipliers
-from gtsam_rwhec.solver.variables import answer_of
 
 #: Up to this many frames the relaxation is solved: the size of Clarabel's cone grows with the fourth power.
 MAX_FRAMES = 8

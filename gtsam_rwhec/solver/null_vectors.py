@@ -15,9 +15,9 @@ import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma
+from gtsam_rwhec.solver.answers import Action, Evaluation
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.point import Action, Evaluation
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, CONSTRAINTS_FLAT, WITH_CONSTANT
 
 #: Eigenvalues up to this many times the test's allowance for rounding count as zero.

@@ -8,22 +8,20 @@ from functools import cached_property
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.answers import Answer, Evaluation, Form, answer_at, answer_of, as_point
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.descent import SearchForm
 from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.form_rounding import rounding_of
-from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, slots_of
+from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, rounding_of, slots_of
 from gtsam_rwhec.solver.graph_form import GraphForm
 from gtsam_rwhec.solver.graph_start import graph_spectral_start
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.point import Evaluation, Form
 from gtsam_rwhec.solver.polish import is_worth_a_step, newton_step
 from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
 from gtsam_rwhec.solver.rotations import project, unvec
 from gtsam_rwhec.solver.start import spectral_start
 from gtsam_rwhec.solver.stored_form import StoredForm
-from gtsam_rwhec.solver.variables import Answer, answer_at, answer_of, as_point
 
 #: An arrow of fewer numbers is quick enough.
 SMALL_ARROW = 4_000_000

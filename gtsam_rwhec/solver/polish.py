@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.answers import Evaluation, Point
 from gtsam_rwhec.solver.curvature import Curvature
-from gtsam_rwhec.solver.point import Evaluation, Point
 from gtsam_rwhec.solver.rotations import kkt_multipliers, retract, tangent_basis, vec
 
 #: A gradient that can lower the cost by less than about this part of it is left as it is.

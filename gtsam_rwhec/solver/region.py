@@ -14,9 +14,8 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import T_A, T_B
+from gtsam_rwhec.solver.answers import Answer, Point, as_point
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.point import Point
-from gtsam_rwhec.solver.variables import Answer, as_point
 
 #: The region reaches at least this many times the extent of the data, and the scale at least by this factor.
 AT_LEAST = 100.0

@@ -11,8 +11,8 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma
+from gtsam_rwhec.solver.answers import Action, Evaluation, Point
 from gtsam_rwhec.solver.full_form import PAIRS_AT_ONCE, FullForm
-from gtsam_rwhec.solver.point import Action, Evaluation, Point
 
 #: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (looser bounds).
 Wide = np.longdouble

@@ -11,8 +11,7 @@ from rwhec_factors import se3
 from said import choice
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.simulate import Noise
 
 

@@ -7,8 +7,8 @@ import pytest
 from rwhec_factors import se3
 
 from gtsam_rwhec.first_rig.pose_origin import ARM, MOTION_CAPTURE, ODOMETRY, origin_of, rest_of, smoothness_m
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.rig import PoseNoise
-from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 
 @pytest.mark.parametrize(

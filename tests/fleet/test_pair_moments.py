@@ -10,7 +10,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.fleet.merging import CHUNK, merged
 from gtsam_rwhec.fleet.pair_moments import PairMoments
 from gtsam_rwhec.problem.moments import Gauge
-from gtsam_rwhec.problem.of_moments import problem_of_moments
+from gtsam_rwhec.problem.selection import problem_of_moments
 from gtsam_rwhec.simulate.motion import Motion, carrier_poses
 from gtsam_rwhec.simulate.noise import Noise, perturb
 from gtsam_rwhec.simulate.transforms import random_poses

@@ -14,8 +14,7 @@ from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.fleet.parquet import COLUMNS, read_parquet, rows_parquet
 from gtsam_rwhec.fleet.rows import RobotRow
-from gtsam_rwhec.solver.cause import Status
-from gtsam_rwhec.solver.certificate import Basis
+from gtsam_rwhec.solver.certificate import Basis, Status
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from gtsam_rwhec.fleet.measured_problem import measured_problem
 from gtsam_rwhec.fleet.merging import read_leaf
 from gtsam_rwhec.fleet.pair_moments import PairMoments
 from gtsam_rwhec.fleet.partial import KeptLog, KeptPair, in_single, read_kept, read_partial
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 
 
 def test_arrays_come_back() -> None:

@@ -7,8 +7,8 @@ from simulated import Simulated, distance, hand_held, pair, planar, poses
 
 from gtsam_rwhec.errors import CountError, UnderdeterminedError
 from gtsam_rwhec.handeye import METHODS, DualQuaternionPrior, solve
-from gtsam_rwhec.identifiability.free_directions import FreeKind
 from gtsam_rwhec.methods import Estimate
+from gtsam_rwhec.solver.free_directions import FreeKind
 
 HEIGHT = "translation of h along its own z axis: the motion turned about one axis only"
 #: Not turned, so that c's axes have the names of h's.

@@ -7,7 +7,7 @@ from simulated import distance, hand_held, planar
 from gtsam_rwhec import handeye
 from gtsam_rwhec.errors import CountError, OptionError, UnderdeterminedError
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
-from gtsam_rwhec.identifiability.free_directions import FreeKind
+from gtsam_rwhec.solver.free_directions import FreeKind
 
 NAMES = ["dan", "dqnlopt", "dqnloptrnd", "chvecopt", "quatvecopt", "certified"]
 

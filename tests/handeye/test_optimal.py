@@ -17,7 +17,7 @@ from gtsam_rwhec.handeye.motions import Motions, motions_of
 from gtsam_rwhec.handeye.optimal import bound_at
 from gtsam_rwhec.handeye.proof import HIDDEN
 from gtsam_rwhec.handeye.saddle import best_dual, bracket, minimum, search
-from gtsam_rwhec.identifiability.free_directions import FreeKind, FreeReason
+from gtsam_rwhec.solver.free_directions import FreeKind, FreeReason
 
 
 def cost_at(motions: Motions, X: np.ndarray, alpha: float) -> float:

@@ -11,8 +11,8 @@ from gtsam_rwhec.errors import OptionError, PoseError, PriorError
 from gtsam_rwhec.handeye import DualQuaternionPrior, cost_of, motions_of, solve
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.linear_prior import on_sphere
-from gtsam_rwhec.identifiability.free_directions import FreeKind
 from gtsam_rwhec.methods import Estimate
+from gtsam_rwhec.solver.free_directions import FreeKind
 
 FORMS = ["imaginary", "distance"]
 

@@ -16,7 +16,7 @@ from gtsam_rwhec.handeye.on_pairs import PAIR_SOLVERS
 from gtsam_rwhec.methods.chained import chained
 from gtsam_rwhec.methods.comparison import Comparison
 from gtsam_rwhec.methods.comparison_file import comparison_fields
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.comparison_report import print_comparison
 from gtsam_rwhec.simulate import Noise, general
 

@@ -7,7 +7,7 @@ import pytest
 from rwhec_factors import se3
 
 from gtsam_rwhec.odometry import JointCertificate, OdometryCalibration, OdometryNoise, OtherAnswer, Windows
-from gtsam_rwhec.solver.cause import Status
+from gtsam_rwhec.solver.certificate import Status
 
 
 def _calibration(status: Status, others: tuple[OtherAnswer, ...] = ()) -> OdometryCalibration:

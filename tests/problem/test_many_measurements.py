@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, FrameError, NoiseError, PoseError, RotationsProjectedWarning, StampError
 from gtsam_rwhec.problem.accumulation import OPENING
+from gtsam_rwhec.problem.moment_stack import PAIRS_AT_ONCE
 from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, shift_of
-from gtsam_rwhec.problem.packed_moments import PAIRS_AT_ONCE
 from gtsam_rwhec.simulate.transforms import random_poses
 
 #: All features but B's rotation.

@@ -16,9 +16,9 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments, edge_forms
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.solver.answers import Answer, as_point
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.variables import Answer, as_point
 
 NOISE = Noise(0.02, 200.0)
 

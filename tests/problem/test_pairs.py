@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 
 
 def test_a_pair_is_a_tuple_and_found_as_one() -> None:

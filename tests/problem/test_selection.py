@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, NoiseError
-from gtsam_rwhec.problem.selection import reweighted, selected
-from gtsam_rwhec.problem.variance_factors import VarianceFactors
+from gtsam_rwhec.problem.selection import VarianceFactors, reweighted, selected
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)

@@ -9,10 +9,10 @@ from refinement_problems import KAPPA, SIGMA_M, refined
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.geometry import Trajectory
+from gtsam_rwhec.geometry.carrier_motion import LocalPaths
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
-from gtsam_rwhec.trajectories import Trajectory
-from gtsam_rwhec.trajectories.local_paths import LocalPaths
 
 X = gtsam.Pose3.Expmap(np.array([0.3, 0.1, -0.4, 1.0, 0.5, 0.2])).matrix()
 Y = {

@@ -6,9 +6,9 @@ import io
 
 from rich.console import Console
 
-from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report import PairGrid
+from gtsam_rwhec.solver.free_directions import Identifiability, PairIdentifiability
 
 
 def grid(pairs: dict[tuple[str, str], bool]) -> PairGrid:

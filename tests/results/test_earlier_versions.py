@@ -15,8 +15,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Judgement
 from gtsam_rwhec.report import certificate_sentence
 from gtsam_rwhec.results.agreement import check_log, check_verdict
 from gtsam_rwhec.results.result_file import read_result
-from gtsam_rwhec.solver.cause import Cause
-from gtsam_rwhec.solver.certificate import Basis
+from gtsam_rwhec.solver.certificate import Basis, Cause
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 

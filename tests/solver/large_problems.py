@@ -7,11 +7,10 @@ from functools import cache
 from small_problems import part_of
 
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.solver.options import SolveOptions
-from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.searched_part import Found
+from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.solve_options import SolveOptions
 
 #: Forty degrees about each axis, and 30 cm: of three measurements some frames have hardly any information.
 LARGE_NOISE = Noise(0.3, 1.0)

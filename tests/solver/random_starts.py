@@ -7,8 +7,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import random_rotations, retract, tangent_basis, vec
-from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.searched_part import Found
+from gtsam_rwhec.solver.search import Found, Search
 
 
 def lowest_of_random_starts(form: ReducedForm, count: int, seed: int = 0) -> Array:

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
+from gtsam_rwhec.solver.block_matrix import BlockMatrix, cholesky_allowance, proof_that_it_exceeds, sum_into
 from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.verified import cholesky_allowance, proof_that_it_exceeds
 
 
 def random_edges(n: int, share: float, generator: np.random.Generator) -> np.ndarray:

@@ -11,13 +11,13 @@ from small_problems import GROSS_NOISE, SMALL_NOISE, bound_at, optimum, simulate
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.solver import small_dual
+from gtsam_rwhec.solver.answers import Point
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.point import Point
 from gtsam_rwhec.solver.region import half_widths
 from gtsam_rwhec.solver.relaxation import solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, vec
+from gtsam_rwhec.solver.small_dual import improve
 
 
 def badly_scaled(seed: int, scale: str) -> rw.Problem:
@@ -138,7 +138,7 @@ def test_small_duals_and_relaxations_multipliers_bound_the_optimum(name: str, se
     assert bound.lower_bound <= evaluation.upper
     gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
     kkt = kkt_multipliers(evaluation.point.rotations, gradient)
-    improved, _ = small_dual.improve(form.reduced, evaluation.point.rotations, kkt)
+    improved, _ = improve(form.reduced, evaluation.point.rotations, kkt)
     assert bound_at(form, end.R, improved)[0].lower_bound <= evaluation.upper
 
 

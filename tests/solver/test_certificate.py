@@ -6,8 +6,7 @@ from dataclasses import FrozenInstanceError, replace
 
 import pytest
 
-from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
-from gtsam_rwhec.solver.certificate import Basis, Certificate, Objective
+from gtsam_rwhec.solver.certificate import Basis, Cause, Certificate, Multipliers, Objective, SearchPath, Start, Status
 from gtsam_rwhec.solver.region import Region
 
 CERTIFIED = Certificate(

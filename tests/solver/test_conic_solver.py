@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from gtsam_rwhec.solver.conic_solver import solve_conic, stacked, unstacked
+from gtsam_rwhec.solver.relaxation import solve_conic, stacked, unstacked
 
 
 def test_the_stacked_triangle_keeps_inner_products_and_is_undone() -> None:

@@ -12,10 +12,9 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
-from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks
-from gtsam_rwhec.solver.local_blocks import scatter
-from gtsam_rwhec.solver.relaxation import solve_by_clarabel
+from gtsam_rwhec.solver.relaxation import Relaxation, solve_by_blocks, solve_by_clarabel
 from gtsam_rwhec.solver.rotations import CONSTRAINTS
+from gtsam_rwhec.solver.small_dual import scatter
 
 SIDES = {1: (1, 1), 2: (1, 1), 3: (2, 1), 4: (2, 2), 5: (3, 2)}
 

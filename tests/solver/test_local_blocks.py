@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.local_blocks import gather, gram, local_indices, scatter, traces
 from gtsam_rwhec.solver.rotations import CONSTRAINTS
+from gtsam_rwhec.solver.small_dual import gather, gram, local_indices, scatter, traces
 
 
 def symmetric(size: int, generator: np.random.Generator) -> Array:

@@ -8,8 +8,9 @@ from large_problems import loop, optimum_of_star
 from small_problems import GROSS_NOISE, flat, optimum, simulated, whole
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.bound import lower_bound
-from gtsam_rwhec.solver.cause import Cause, Multipliers
+from gtsam_rwhec.solver.certificate import Cause, Multipliers
 from gtsam_rwhec.solver.descent import descend
 from gtsam_rwhec.solver.local_dual import (
     OF_Q,
@@ -18,15 +19,14 @@ from gtsam_rwhec.solver.local_dual import (
     helpful_frames,
     improve_locally,
     local_form,
+    own_curvature,
+    relax_locally,
     rotation_rows,
 )
-from gtsam_rwhec.solver.local_relaxation import relax_locally
-from gtsam_rwhec.solver.options import SolveOptions
-from gtsam_rwhec.solver.own_curvature import own_curvature
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.point import Evaluation
 from gtsam_rwhec.solver.relaxation import solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
+from gtsam_rwhec.solver.solve_options import SolveOptions
 
 
 def form_of(form: PartForm, R: Array, frames: list[int]) -> tuple[LocalForm, Evaluation, Array]:

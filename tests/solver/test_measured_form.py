@@ -12,11 +12,12 @@ from small_problems import optimum, simulated, whole
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.solver import measured_form, plain_residuals
-from gtsam_rwhec.solver.given import Given
+from gtsam_rwhec.solver import measured_form
+from gtsam_rwhec.solver import residual_sums as plain_residuals
+from gtsam_rwhec.solver.answers import Answer
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.variables import Answer
+from gtsam_rwhec.solver.parts import Given
 
 
 def far_from_the_origin(seed: int, scale: str, offset_m: float, noise: Noise, *, with_knowledge: bool) -> rw.Problem:

@@ -12,15 +12,15 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.solver.answers import answer_of
 from gtsam_rwhec.solver.bound import lower_bound
-from gtsam_rwhec.solver.cause import Multipliers, SearchPath, Start
+from gtsam_rwhec.solver.certificate import Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import cost_of, descend
 from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale, scale_row, scale_spread, without_scale
-from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
-from gtsam_rwhec.solver.searched_part import Found
-from gtsam_rwhec.solver.variables import answer_of
+from gtsam_rwhec.solver.search import Found
+from gtsam_rwhec.solver.solve_options import SolveOptions
 
 HELD = SolveOptions(nonnegative_scale=True)
 

@@ -10,10 +10,10 @@ from small_problems import optimum
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.solver import plain_residuals
-from gtsam_rwhec.solver.exact_residuals import Coefficients, Measured, Sums, weighted_sums
+from gtsam_rwhec.solver import residual_sums as plain_residuals
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.residual_sums import Coefficients, Measured, Sums, weighted_sums
 
 
 def inputs(scale: rw.ScaleMode, *, uniform: bool, offset_m: float, sigma_m: float) -> tuple[Measured, Coefficients]:

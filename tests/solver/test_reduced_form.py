@@ -11,11 +11,11 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver.answers import answer_of, as_point
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.reduced_form import ReducedForm, generalised_inverse_factor
 from gtsam_rwhec.solver.rotations import random_rotations
-from gtsam_rwhec.solver.variables import answer_of, as_point
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 

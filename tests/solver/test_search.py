@@ -26,11 +26,9 @@ from small_problems import (
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
-from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
-from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solver.certificate import Cause, Certificate, Multipliers, SearchPath, Start, Status
 from gtsam_rwhec.solver.relaxation import solve_by_clarabel
-from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.searched_part import Found
+from gtsam_rwhec.solver.search import Found, Search
 
 
 class TestEasyProblems:

@@ -10,9 +10,9 @@ from small_problems import GROSS_NOISE, SCALES, searched, simulated, solved
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.solver.cause import Cause, Start, Status
-from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solver.certificate import Cause, Start, Status
 from gtsam_rwhec.solver.rotations import random_rotations
+from gtsam_rwhec.solver.solve_options import SolveOptions
 
 
 class TestMethods:

@@ -11,7 +11,7 @@ from random_starts import assert_never_beaten
 from small_problems import optimum, searched, solved
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
+from gtsam_rwhec.solver.certificate import Cause, Multipliers, SearchPath, Start, Status
 
 
 def pair_alone(problem: rw.Problem, target: str, sensor: str) -> rw.Problem:

@@ -13,10 +13,9 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion
 from gtsam_rwhec.solver.descent import homogeneous
-from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, random_rotations
-from gtsam_rwhec.solver.small_dual import ENOUGH, improve, null_multipliers, stationary_multipliers
+from gtsam_rwhec.solver.small_dual import ENOUGH, improve, null_multipliers, scatter, stationary_multipliers
 
 POORLY_EXCITED = Motion("planar", wobble_rad=0.01)
 

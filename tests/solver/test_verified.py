@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import UNIT, gamma
 from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.block_matrix import BlockMatrix
+from gtsam_rwhec.solver.block_matrix import BlockMatrix, cholesky_allowance, proof_that_it_exceeds
 from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.verified import cholesky_allowance, proof_that_it_exceeds
 
 
 def arrow_matrix(D: Array, C: Array, E: Array) -> BlockMatrix:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.pairs import ByPair
+from gtsam_rwhec.problem.measurements import ByPair
 from gtsam_rwhec.report.plots.drawing import (
     BLACK,
     BLUE,

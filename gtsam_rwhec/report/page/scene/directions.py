@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import SHARE, FreeDirection
 from gtsam_rwhec.report.page.scene.model import Frame, Scene
 from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.solver.free_directions import SHARE, FreeDirection
 
 #: A line has this share of the scene to each side, and its arrowheads and circles this one.
 LENGTH, HEAD = 0.16, 0.022

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Number, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.sections.weak_directions import weak_blocks
 from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10

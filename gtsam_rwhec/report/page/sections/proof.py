@@ -11,8 +11,7 @@ from gtsam_rwhec.report.page.blocks import Block, Chart, Folded, Listing, Paragr
 from gtsam_rwhec.report.page.sections.spectrum_chart import spectrum_svg
 from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.report.sentences import limits_of
-from gtsam_rwhec.solver.cause import Status
-from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solver.certificate import Certificate, Status
 
 HEADLINES: Mapping[Status, tuple[str, Tone]] = {
     Status.CERTIFIED: ("Proven: no other answer fits these measurements better, and they determine it.", "good"),

@@ -1,5 +1,0 @@
-"""What the motion determines and what it leaves free."""
-
-from gtsam_rwhec.files.optional_packages import lazy_names
-
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

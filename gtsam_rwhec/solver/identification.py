@@ -1,0 +1,241 @@
+"""What each pair determines alone: the test of the whole problem, on 15 x 15 matrices of some pairs at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.moments import T_B
+from gtsam_rwhec.solver.answers import PairPoses
+from gtsam_rwhec.solver.elimination import Elimination
+from gtsam_rwhec.solver.free_directions import (
+    FreeDirection,
+    FreeReason,
+    Identifiability,
+    LaterVerdicts,
+    PairIdentifiability,
+    free_directions_of,
+    reason_for,
+    sparse_basis,
+)
+from gtsam_rwhec.solver.information import (
+    IS_ROTATION,
+    PairInformation,
+    information,
+    order_of,
+    pair_information,
+    prior_information,
+)
+from gtsam_rwhec.solver.noise_bounds import (
+    PairNoise,
+    common_axes,
+    fitted_squares,
+    free_threshold,
+    pair_noise,
+    variance_factors,
+)
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.weak_directions import ROUNDING, Weak, unit_of, weakest
+
+
+def typical_length(part: Part) -> float:
+    """Root mean square of |t_B|, in metres: the length that counts as one radian in a sentence."""
+    square = float(part.moments.squares(T_B).sum())
+    return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
+
+
+@dataclass(frozen=True)
+class PairsAlone:
+    """The pairs of a part, what they tell, and the noise."""
+
+    pairs: tuple[Pair, ...]
+    free: tuple[str, ...]
+    ends: np.ndarray  #: (E, 2), as in the part
+    scale: ScaleMode
+    counts: np.ndarray  #: (E,)
+    fitted: Array  #: (E,): squares of noise that tilts of a free direction fit away
+    information: PairInformation
+    noise: PairNoise
+    axes: np.ndarray  #: (E,): about how many axes A turned, 0, 1 or 2
+    turned_rad: Array  #: (E,): root mean square of A's turning
+    residual_rad: Array  #: (E,): root mean square of the rotation residuals
+    length: float  #: metres that count as one radian
+
+    @staticmethod
+    def of(
+        part: Part, information: PairInformation, noise: PairNoise, singular_values: Array, J_R: Array
+    ) -> PairsAlone:
+        """The pairs of a part; ``singular_values`` (E, 3) are of the mean of R_A, and J_R (E,) the costs.
+
+        Axes by Corollary 2, tested against A's noise: the mean of R_A shortens every direction but a common axis, and
+        1 - s^2 is the mean square sine of the turning that leaves that direction. Noise alone makes it 2 q^2. The axis
+        is fitted at both ends.
+        """
+        counts = part.moments.count
+        ratio = (1.0 - singular_values**2) / (2.0 * noise.carrier[:, None])
+        threshold = free_threshold(2.0 * counts, 4.0 * noise.few, noise.spare)
+        excited = (ratio > threshold[:, None]).sum(axis=1)
+        return PairsAlone(
+            part.pairs,
+            part.free,
+            part.ends,
+            part.scale,
+            counts,
+            noise.few * fitted_squares(part),
+            information,
+            noise,
+            np.array([0, 1, 1, 2])[excited],
+            np.sqrt(np.maximum(1.0 - singular_values[:, -1] ** 2, 0.0)),
+            np.sqrt(J_R / part.moments.kappa),  # J_R is sum kappa theta^2
+            typical_length(part),
+        )
+
+    def reason(self, e: int) -> FreeReason:
+        """Why a direction of a pair is free."""
+        of_pair = int(self.axes[e]), float(self.turned_rad[e]), float(self.residual_rad[e]), int(self.counts[e])
+        return reason_for(*of_pair)
+
+    def reasons_of_frames(self) -> Mapping[str, FreeReason]:
+        """A frame has the reason of its pair that turned about most axes; of several such pairs, of the last one."""
+        n, E = len(self.free), len(self.pairs)
+        best = np.zeros(n + 1, dtype=np.int64)
+        key = self.axes.astype(np.int64) * E + np.arange(E)
+        for side in self.ends.T:
+            np.maximum.at(best, np.minimum(side, n), key)
+        return {name: self.reason(int(best[i]) % E) for i, name in enumerate(self.free)}
+
+    def verdicts(self, at: slice = slice(None)) -> dict[Pair, PairIdentifiability]:
+        """Test some pairs, each alone, in the way the whole problem is tested."""
+        info, noise = self.information, self.noise
+        spare, counts, fitted = noise.spare[at], self.counts[at], self.fitted[at]
+        squares, used = 2.0 * counts, info.used[at]
+        of_rotation = info.rotation(at)
+        turning, _ = _weakest_of_each(of_rotation, noise.rotation[at], used & IS_ROTATION)
+        of_turning = free_threshold(squares, fitted, spare)
+        settled = np.all(turning > of_turning[:, None], axis=1, keepdims=True)
+        rest, directions = _weakest_of_each(
+            info.translation(at) + ~settled[:, :, None] * of_rotation,
+            noise.translation[at] + ~settled * noise.rotation[at],
+            used & ~(IS_ROTATION & settled),
+        )
+        with_translations = np.minimum(spare, noise.spare_translation)
+        of_rest = np.where(settled[:, 0] & (self.scale == "known"), spare, with_translations)
+        other, threshold = of_rest != spare, of_turning.copy()
+        threshold[other] = free_threshold(squares[other], fitted[other], of_rest[other])
+        result = {}
+        begin = at.indices(len(self.pairs))[0]
+        for i, pair in enumerate(self.pairs[at]):
+            e = begin + i
+            free = np.less_equal(rest[i], threshold[i])
+            ends = {name: 7 * end for end, name in enumerate(pair) if self.ends[e, end] < len(self.free)}
+            if not free.any() and self.axes[e] < 2 and len(ends) == 2:
+                free[rest[i].argmin()] = True  # Corollary 4: a pair that turns about one axis leaves a direction free
+            directions_free: tuple[FreeDirection, ...] = ()
+            if free.any():
+                rows = [first + k for first in ends.values() for k in range(7)] + [14]
+                basis = sparse_basis(directions[i][rows][:, free], self.length)
+                reasons = dict.fromkeys(ends, self.reason(e))
+                directions_free = free_directions_of(tuple(ends), basis, self.length, reasons)
+            tests = [(float(rest[i].min()), float(threshold[i]))]
+            if settled[i, 0]:
+                tests.append((float(turning[i].min()), float(of_turning[i])))
+            least, up_to = min(tests, key=lambda test: test[0] / test[1])
+            result[pair] = PairIdentifiability(
+                not free.any(), directions_free, int(self.axes[e]), int(counts[i]), least, up_to
+            )
+        return result
+
+
+def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
+    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); infinite for parameters that are not used."""
+    unit = unit_of(noise, used)
+    matrix = info * unit[:, :, None] * unit[:, None, :]
+    diagonal = np.einsum("eii->ei", matrix)  # a view
+    # Unused parameters get large entries, but no larger than needed: small eigenvalues would lose digits.
+    diagonal[...] = np.where(used, diagonal, 1e3 + 2.0 * diagonal.max(axis=1, keepdims=True))
+    values, vectors = np.linalg.eigh(matrix)
+    values[values < ROUNDING * diagonal.max(axis=1, keepdims=True)] = 0.0
+    foreign = (vectors**2 * ~used[:, :, None]).sum(axis=1) > 0.5
+    return np.where(foreign, np.inf, values), vectors * unit[:, :, None]
+
+
+#: The pairs of larger parts are tested one by one where their verdicts are asked for: 80,000 take seconds.
+AT_ONCE = 2000
+
+
+def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array, order: Elimination | None = None) -> Identifiability:
+    """Test every direction of a part at an answer, and every direction of each pair alone.
+
+    J_t and J_R (E,) are the costs of the pairs at the answer ``poses``, in the physical model; the noise is estimated
+    from them. ``order`` is that of the part's frames, where it is known already.
+    """
+    return identify_with_basis(part, poses, J_t, J_R, order)[0]
+
+
+def identify_with_basis(
+    part: Part, poses: PairPoses, J_t: Array, J_R: Array, order: Elimination | None = None
+) -> tuple[Identifiability, Array]:
+    """``identify``, and the free directions with their small shares, which the records leave out.
+
+    The basis (7 n + 1, k) has a column for each record: [omega (rad), v (m), log own scale] for each of ``part.free``,
+    then the shared scale's logarithm. It spans exactly what is free.
+    """
+    pairs = pair_information(part, poses)
+    in_target, in_sensor, singular_values = common_axes(part)
+    factors = variance_factors(part, pairs, J_t, J_R)
+    noise = pair_noise(part, poses, pairs, factors, in_target, in_sensor)
+    alone = PairsAlone.of(part, pairs, noise, singular_values, J_R)
+    weak = _weakest_of_part(part, pairs, noise, order or order_of(part))
+    basis = sparse_basis(weak.directions[:, weak.free], alone.length)
+    free = free_directions_of(part.free, basis, alone.length, alone.reasons_of_frames() if basis.shape[1] else {})
+    known = Identifiability(
+        is_unique=not free,
+        free_directions=free,
+        weakest=float(weak.values[0]) if len(weak.values) else np.inf,
+        threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
+        pairs=alone.verdicts() if len(part.pairs) <= AT_ONCE else LaterVerdicts((part.pairs,), (alone,)),
+        parts=(part.names,),
+    )
+    return known, basis
+
+
+def _weakest_of_part(part: Part, pairs: PairInformation, noise: PairNoise, order: Elimination) -> Weak:
+    """Test rotations; then, if all are determined, the rest at those rotations, and else everything together."""
+    n, count = len(part.free), part.moments.count
+    is_free = part.ends < n
+    # A motion's two ends are one frame; a fixed frame leaves both to the other.
+    of_each = 2.0 * count / np.maximum(is_free.sum(axis=1), 1)
+    sums = [np.bincount(part.ends[has, side], of_each[has], minlength=n) for side, has in enumerate(is_free.T)]
+    ends = np.append(sums[0] + sums[1], float(part.number_of_measurements))
+    rotation_prior, translation_prior = prior_information(part)
+    rotations = pairs.used & IS_ROTATION
+    turning = information(part, order, [pairs.rotation], noise.rotation, rotations, rotation_prior)
+    spare = float(noise.spare.min())
+    tests = [weakest(turning, ends, spare, few=noise.few)]
+    del turning
+    if tests[0].free.any():
+        everything = information(
+            part,
+            order,
+            [pairs.rotation, pairs.translation],
+            noise.rotation + noise.translation,
+            pairs.used,
+            rotation_prior + translation_prior,
+        )
+        tests = [weakest(everything, ends, min(spare, noise.spare_translation), few=noise.few)]
+    else:
+        rest = pairs.used & ~IS_ROTATION
+        moving = information(part, order, [pairs.translation], noise.translation, rest, translation_prior)
+        tests.append(weakest(moving, ends, _spare_of_rest(part, noise), few=noise.few))
+    return min(tests, key=lambda test: test.ratio)
+
+
+def _spare_of_rest(part: Part, noise: PairNoise) -> float:
+    """The equations to spare that tell the noise of what is not a rotation: only A's noise, where sizes are known."""
+    of_carrier = float(noise.spare.min())
+    return of_carrier if part.scale == "known" else min(of_carrier, noise.spare_translation)

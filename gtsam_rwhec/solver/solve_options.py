@@ -1,0 +1,159 @@
+"""Options of the certified solver."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Literal, get_args
+
+import numpy as np
+
+from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
+from gtsam_rwhec.files.progress import Progress, check_progress
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import PoseLike, one_transform
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
+from gtsam_rwhec.problem.knowledge import checked_scale, difference
+from gtsam_rwhec.problem.problem import Problem
+
+Method = Literal["auto", "sdp", "local"]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How to solve; the defaults suit all ordinary problems.
+
+    Attributes
+    ----------
+    relative_tolerance : float
+        A gap of at most this times max(cost, 1) counts as zero: the cost is half a chi-square, so 1 is little. With
+        unit weights, at most this times the cost.
+    max_descent_iterations : int
+        Riemannian Newton steps from one start; three to ten are usual.
+    random_starts : int
+        Number of random starts that are tried before the relaxation, when the first answer is not proven; in a part
+        with more than ``max_dense_frames`` frames, after the relaxation of a few of them.
+    seed : int
+        Seed of the random starts. The same problem gives the same answer.
+    max_dense_frames : int
+        So many frames at once have the multipliers of all constraints (small dual, semidefinite relaxation), which are
+        dense. In a part with more free frames these are the frames where the multipliers of R'R = I do not suffice,
+        and those that help them most; all others are eliminated.
+    relaxation_tolerance : float
+        Relative gap at which the semidefinite solver stops; a descent follows anyway.
+    max_relaxation_iterations : int
+        Interior-point iterations.
+    nonnegative_scale : bool
+        Constrain the shared scale to at least zero (Section 4.3), for very noisy data; a relaxation solves it.
+    """
+
+    relative_tolerance: float = 1e-6
+    max_descent_iterations: int = 200
+    random_starts: int = 8
+    seed: int = 0
+    max_dense_frames: int = 120
+    relaxation_tolerance: float = 1e-9
+    max_relaxation_iterations: int = 100
+    nonnegative_scale: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.nonnegative_scale, bool):
+            raise OptionError(f"SolveOptions.nonnegative_scale={brief(self.nonnegative_scale)}; it is True or False")
+        for option in fields(self)[:-1]:
+            value = getattr(self, option.name)
+            if isinstance(option.default, float):
+                if not (is_real(value) and 0.0 < value <= sys.float_info.max):
+                    raise OptionError(f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite")
+            elif not is_whole(value, least := 0 if option.name in ("random_starts", "seed") else 1):
+                raise OptionError(
+                    f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite: a whole number from "
+                    f"{least} to {LARGEST_WHOLE}"
+                )
+
+
+def check_method(method: str) -> None:
+    """Raise an ``OptionError`` for an unknown method."""
+    if not is_one_of(method, get_args(Method)):
+        raise OptionError(f"method={brief(method)} is not one of {', '.join(map(repr, get_args(Method)))}")
+
+
+Poses = Mapping[str, PoseLike]
+Scale = float | Mapping[str, float]
+
+#: An answer's fixed frames (entries, rad and m) and scales may differ from the problem's by this much, as files round.
+ROUNDING = 1e-9
+
+
+def check_types(problem: Problem, options: SolveOptions | None, progress: Progress | None = None) -> None:
+    """Raise an ``OptionError`` for a problem, options or progress of a wrong type."""
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if options is not None and not isinstance(options, SolveOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.SolveOptions")
+    check_progress(progress)
+
+
+def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
+    """Raise an error for an answer that lacks a frame, or contradicts a fixed frame or scale of the problem."""
+    for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
+        if not isinstance(poses, Mapping):
+            raise OptionError(f"{what} is a {type(poses).__name__}; give poses by name: {{name: pose}}")
+        strange = [name for name in poses if not isinstance(name, str)]
+        if strange:
+            raise FrameError(f"{what} has the name {brief(strange[0])}; names are strings: {{name: pose}}")
+        missing = [name for name in names if name not in poses and name not in problem.fixed]
+        if missing:
+            raise FrameError(f"{what} has no pose of {missing[0]!r}; it has {_listed(poses)}")
+        unknown = [name for name in poses if name not in names]
+        if unknown:
+            raise FrameError(f"{what} has {brief(unknown[0])}, which the problem does not; it has {_listed(names)}")
+    _check_scale(problem, scale)
+    for name, T in problem.fixed.items():
+        poses, what = (X, "X") if name in problem.targets else (Y, "Y")
+        if name in poses:
+            given = one_transform(poses[name], f"{what}[{name!r}]")
+            if not np.allclose(given, T, rtol=ROUNDING, atol=ROUNDING):
+                raise PriorError(
+                    f"{what}[{name!r}] is not the pose at which {name} is fixed: {difference(given, T)}; leave it out, "
+                    "or do not fix the frame"
+                )
+
+
+def _check_scale(problem: Problem, scale: Scale) -> None:
+    """Raise a ``ScaleError`` for a scale that is no scale, or not one of this problem."""
+    if problem.scale == "known":
+        if not (is_real(scale) and scale == 1.0):
+            raise ScaleError(
+                f"the answer's scale is {brief(scale)}, but this problem has scale='known', which is 1; leave it out"
+            )
+        return
+    if not isinstance(scale, Mapping):
+        checked_scale(scale, "the answer's scale")
+        return
+    if problem.scale == "shared":
+        raise ScaleError(
+            f"the answer's scale is {brief(scale)}, but all targets share one scale; give a positive number"
+        )
+    owners = tuple(dict.fromkeys(pair.target for pair in problem.pairs))
+    for name in scale:
+        if name not in owners:
+            raise ScaleError(
+                f"the answer's scale has {brief(name)}, which has no scale; give a positive number for each of "
+                f"{_listed(owners)}"
+            )
+    for name in owners:
+        fixed = problem.fixed_scales.get(name)
+        if name in scale:
+            given = checked_scale(scale[name], f"the answer's scale of {name}")
+            if fixed is not None and abs(given - fixed) > ROUNDING * fixed:
+                raise ScaleError(f"the answer's scale of {name} is {given!r}, but it is fixed at {fixed!r}")
+        elif fixed is None:
+            raise ScaleError(f"the answer's scale lacks {name!r}; it has {_listed(scale)}")
+
+
+def _listed(names: Iterable[object]) -> str:
+    """Names for a message: the first ten."""
+    known = list(map(brief, names))
+    more = f" and {len(known) - 10} more" if len(known) > 10 else ""
+    return (", ".join(known[:10]) + more) or "none"

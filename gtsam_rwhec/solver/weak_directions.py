@@ -1,0 +1,176 @@
+"""The directions that the measurements tell least of, in units of what noise alone would create.
+
+Up to `DENSE_PARAMETERS` parameters all eigenvalues are computed. Above that the information's Cholesky factor follows
+the graph (``solver/block_matrix.py``). If the information less the highest threshold is positive definite, nothing is
+free (Sylvester's law of inertia), and a few Lanczos steps on its inverse tell the weakest direction to a per cent.
+Else Lanczos on the inverse finds all directions below the threshold, and one above.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
+from gtsam_rwhec.solver.information import Information
+from gtsam_rwhec.solver.noise_bounds import DENSE_PARAMETERS, free_threshold
+
+#: Information below this part of the largest is rounding error.
+ROUNDING = 4.0 * np.finfo(float).eps
+#: Lanczos steps at most where nothing is free, and to what part of itself the weakest direction's information is known
+#: then: enough for what is only reported.
+STEPS, NEAR = 40, 0.01
+#: So many directions are searched first where some are free, then four times as many; and their relative precision.
+FIRST, PRECISION = 6, 1e-8
+#: Up to so many parameters all eigenvalues are computed where Lanczos finds very many free directions: 0.2 GB.
+MOST_DENSE = 4000
+#: In larger problems so many free directions are told at most, the weakest ones.
+MOST_FREE = 768
+#: So many couplings are scaled at once.
+AT_ONCE = 4096
+#: What an unused parameter has in the place of its information.
+_FAR = 1e30
+
+
+@dataclass(frozen=True)
+class Weak:
+    """Directions in ascending order of information over threshold: values (k,), thresholds (k,), directions (d, k)."""
+
+    values: Array
+    thresholds: Array
+    directions: Array
+
+    @property
+    def free(self) -> np.ndarray:
+        """(k,): whether a direction is free."""
+        free: np.ndarray = self.values <= self.thresholds
+        return free
+
+    @property
+    def ratio(self) -> float:
+        """Information over threshold of the weakest direction."""
+        return float(self.values[0] / self.thresholds[0]) if len(self.values) else np.inf
+
+
+def unit_of(noise: Array, used: np.ndarray) -> Array:
+    """The factor that brings a parameter to units of its noise; 0 for an unused parameter."""
+    result: Array = np.where(used, 1.0 / np.sqrt(np.where(used, noise, 1.0)), 0.0)
+    return result
+
+
+def weakest(info: Information, ends: Array, spare: float, *, few: bool) -> Weak:
+    """The directions with the smallest information in units of noise; all free directions are among them.
+
+    The information is changed: it is in units of noise afterwards.
+
+    ``ends`` (n + 1,): how many ends of measurements each frame has, and how many measurements the shared scale.
+    """
+    used = info.used
+    unit = unit_of(info.noise, used)
+    matrix = info.matrix
+    _scale(matrix, unit)
+    if not all(np.isfinite(each).all() for each in (matrix.frames, matrix.couplings, matrix.tails, matrix.tail)):
+        raise UnderdeterminedError(
+            "what the measurements tell of the poses overflows: the translations of A and of B, or a scale, are "
+            "far beyond anything measured in metres; give lengths in metres"
+        )
+    size = int(used.sum())
+    if size == 0:
+        return Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
+    if size <= DENSE_PARAMETERS:
+        values, vectors = _all_of(matrix, used)
+    else:
+        # Each direction has at least two squares, and the threshold is the highest for the fewest squares.
+        values, vectors = _weakest_of_many(matrix, used, float(free_threshold(2.0, 0.0, spare)))
+    # By Satterthwaite, the squares that a direction sums follow from its shares of the frames' measurements. A tilt of
+    # the direction at a frame fits two of them away.
+    of_parameters = vectors**2
+    share = np.empty((len(ends), len(values)))
+    of_frames = of_parameters[:-1].reshape(len(ends) - 1, 7, len(values))
+    share[:-1], share[-1] = of_frames.sum(axis=1), of_parameters[-1]
+    squares = 1.0 / np.maximum((share**2 / ends[:, None]).sum(axis=0), 1e-300)
+    tilted = 2.0 / ends[:-1] @ of_frames[:, :6].sum(axis=1) if few else 0.0
+    thresholds = free_threshold(squares, tilted * squares, spare)
+    order = np.argsort(values / thresholds)
+    return Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
+
+
+def _scale(matrix: BlockMatrix, unit: Array) -> None:
+    """Bring a matrix to diag(unit) A diag(unit) in its place: a copy of large ones takes much memory."""
+    n = len(matrix.frames)
+    of_frames, of_tail = unit[: 7 * n].reshape(n, 7), unit[7 * n :]
+    first, second = matrix.ends
+    for begin in range(0, len(first), AT_ONCE):
+        at = slice(begin, begin + AT_ONCE)
+        matrix.couplings[at] *= of_frames[first[at], :, None]
+        matrix.couplings[at] *= of_frames[second[at], None, :]
+    for blocks in (matrix.frames, matrix.tails):
+        blocks *= of_frames[:, :, None]
+    matrix.frames[...] *= of_frames[:, None, :]
+    matrix.tails[...] *= of_tail
+    matrix.tail[...] *= of_tail[:, None] * of_tail
+
+
+def _all_of(matrix: BlockMatrix, used: np.ndarray) -> tuple[Array, Array]:
+    """All eigenvalues of the used parameters, and their vectors over all parameters."""
+    values, reduced = np.linalg.eigh(matrix.dense()[used][:, used])
+    values[values < ROUNDING * values[-1]] = 0.0
+    vectors = np.zeros((len(used), len(values)))
+    vectors[used] = reduced
+    return values, vectors
+
+
+def _weakest_of_many(matrix: BlockMatrix, used: np.ndarray, enough: float) -> tuple[Array, Array]:
+    """The smallest eigenpairs, up to one above ``enough``."""
+    unused = np.where(used, 0.0, _FAR)
+    factor = matrix.plus(unused - enough).factor()
+    if factor is not None:
+        return _told_by_few_steps(factor, used, enough)
+    shift = max(1e-6, 1e-13 * float(matrix.diagonal.max()))  # above the factorisation's rounding, far below thresholds
+    factor = matrix.plus(unused + shift).factor()
+    if factor is None:
+        raise FloatingPointError("the information matrix is not positive semidefinite: its entries overflow")
+
+    from scipy.sparse.linalg import LinearOperator, eigsh  # slow to import, and few problems need it
+
+    size, parameters = len(used), int(used.sum())
+    operator = LinearOperator((size, size), matvec=factor.solve_vector, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(size) * used
+    count = FIRST
+    while 4 * count < parameters and count <= MOST_FREE:
+        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=PRECISION)
+        values = np.maximum(1.0 / inverse - shift, 0.0)
+        if values.max() > enough or (4 * count > MOST_FREE and parameters > MOST_DENSE):
+            return values, vectors * used[:, None]
+        count *= 4
+    # Lanczos is not faster with so many free directions.
+    return _all_of(matrix, used)
+
+
+def _told_by_few_steps(factor: BlockFactor, used: np.ndarray, enough: float) -> tuple[Array, Array]:
+    """The smallest eigenvalue above ``enough`` of a matrix, and its vector, from the factor of it less ``enough``.
+
+    Lanczos with all vectors kept, up to a residual of `NEAR`. What comes out is not below the smallest eigenvalue.
+    """
+    steps = min(STEPS, int(used.sum()))
+    vector = np.random.default_rng(0).standard_normal(len(used)) * used
+    basis = np.zeros((steps + 1, len(used)))
+    basis[0] = vector / np.linalg.norm(vector)
+    triangle = np.zeros((steps + 1, steps + 1))
+    values, vectors = np.ones(1), np.ones((1, 1))
+    for k in range(steps):
+        w = factor.solve_vector(basis[k]) * used
+        triangle[k, k] = w @ basis[k]
+        for _ in range(2):  # twice is enough
+            w -= basis[: k + 1].T @ (basis[: k + 1] @ w)
+        beside = float(np.linalg.norm(w))
+        values, vectors = np.linalg.eigh(triangle[: k + 1, : k + 1])
+        # The residual of the pair: an eigenvalue is as near.
+        if beside * abs(vectors[-1, -1]) <= NEAR * values[-1]:
+            break
+        basis[k + 1] = w / beside
+        triangle[k, k + 1] = triangle[k + 1, k] = beside
+    return np.array([enough + 1.0 / values[-1]]), (vectors[:, -1] @ basis[: len(values)])[:, None]

@@ -1,5 +1,0 @@
-"""The carriers' motion over time."""
-
-from gtsam_rwhec.files.optional_packages import lazy_names
-
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -1,3 +1,0 @@
-from .time_offset import TimeOffset as TimeOffset
-from .time_offset import estimate_time_offset as estimate_time_offset
-from .trajectory import Trajectory as Trajectory
