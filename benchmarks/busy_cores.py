@@ -7,26 +7,23 @@ do so, as many other processes as there are cores are busy. The last rows are th
 """
 
 from __future__ import annotations
+
 import os
 import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
-from interleaved import Times
-from interleaved import in_words
-from interleaved import interleaved
+from interleaved import Times, in_words, interleaved
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.solve_options import Method
 
 HERE = Path(__file__).resolve()

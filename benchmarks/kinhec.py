@@ -6,7 +6,7 @@ Its package (`pip install '.[bench]'`; MIT) generates the small tier: 562 sequen
 method is given the keyframes of the protocol; ours is `rw.calibrate(problem)` alone, with no option, no weight and no
 setting by track. Part of the problem are the scale mode ("shared" for a monocular camera that tracks itself) and the
 stamps. "estimated": asynchronous sequences, of which each method is given what its own clock makes; KinHEC's is a
-cross-correlation, ours `rw.trajectories.estimate_time_offset`.
+cross-correlation, ours `rw.geometry.estimate_time_offset`.
 
 Errors are of KinHEC's X, over the sequences that we call unique; the others are listed with everybody's errors on them.
 Seeds are pooled: `--seeds 20260909,1,2,3,4`. A seed takes some minutes to generate, and is kept in --folder with the

@@ -1,24 +1,20 @@
 """What each method answers to a sequence of KinHEC, and how far it is from the truth: its baselines', and ours."""
 
 from __future__ import annotations
+
 import json
 import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
 import numpy as np
-from kinhec_sequences import CAMERA
-from kinhec_sequences import TARGET
-from kinhec_sequences import Keyframes
-from kinhec_sequences import NeutralSequence
-from kinhec_sequences import of_kinhec
-from kinhec_sequences import sequences
+from kinhec_sequences import CAMERA, TARGET, Keyframes, NeutralSequence, of_kinhec, sequences
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.trajectories import estimate_time_offset
+from gtsam_rwhec.errors import RwhecError, RwhecWarning, StampError
+from gtsam_rwhec.geometry import estimate_time_offset
 from gtsam_rwhec.solver.certificate import Status
 
 Offsets = Literal["true", "estimated"]

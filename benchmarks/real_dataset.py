@@ -8,15 +8,15 @@ is timed from the problem with its moments to the certificate, that is until ``s
 """
 
 from __future__ import annotations
+
 import time
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from interleaved import in_words
-from scs_relaxation import ScsResult
-from scs_relaxation import solve_by_scs
+from scs_relaxation import ScsResult, solve_by_scs
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of

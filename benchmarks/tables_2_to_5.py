@@ -9,21 +9,17 @@ one is missed.
 """
 
 from __future__ import annotations
+
 import argparse
 import functools
 import os
 import sys
 import time
 import warnings
+
 import numpy as np
-from paper_tables import BAR
-from paper_tables import Experiment
-from paper_tables import Runs
-from paper_tables import in_parallel
-from paper_tables import largest_difference
-from paper_tables import print_table
-from paper_tables import simulated
-from paper_tables import wide_console
+from paper_tables import BAR, Experiment, Runs, in_parallel, largest_difference, print_table, simulated, wide_console
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate.noise import NoiseModel
 from gtsam_rwhec.solver.solve_options import Method

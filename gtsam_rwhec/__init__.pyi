@@ -72,6 +72,7 @@ from .results import write_solution as write_solution
 from . import export as export
 from . import first_rig as first_rig
 from . import fleet as fleet
+from . import geometry as geometry
 from . import logs as logs
 from . import odometry as odometry
 from . import runs as runs

@@ -1,50 +1,36 @@
 """A first rig file, proposed from the content of a folder of images; TODO marks the values that a person must state."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Target
 from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.first_rig.boards_seen import BoardSeen
-from gtsam_rwhec.first_rig.boards_seen import boards_seen
-from gtsam_rwhec.first_rig.folder_contents import FolderPoses
-from gtsam_rwhec.first_rig.folder_contents import ImageFolder
-from gtsam_rwhec.first_rig.folder_contents import read_folder
-from gtsam_rwhec.first_rig.folder_contents import read_gray
-from gtsam_rwhec.first_rig.guessed_intrinsics import STATED
-from gtsam_rwhec.first_rig.guessed_intrinsics import guessed_intrinsics
+from gtsam_rwhec.first_rig.boards_seen import BoardSeen, boards_seen
+from gtsam_rwhec.first_rig.folder_contents import FolderPoses, ImageFolder, read_folder, read_gray
+from gtsam_rwhec.first_rig.guessed_intrinsics import STATED, guessed_intrinsics
 from gtsam_rwhec.first_rig.log_contents import ImageTopic
-from gtsam_rwhec.first_rig.names import camera_name
-from gtsam_rwhec.first_rig.names import free_name
-from gtsam_rwhec.first_rig.pose_origin import Rest
-from gtsam_rwhec.first_rig.pose_origin import origin_of
-from gtsam_rwhec.first_rig.pose_origin import rest_of
-from gtsam_rwhec.first_rig.pose_reading import PoseReading
-from gtsam_rwhec.first_rig.pose_reading import View
-from gtsam_rwhec.first_rig.pose_reading import best_reading
+from gtsam_rwhec.first_rig.names import camera_name, free_name
+from gtsam_rwhec.first_rig.pose_origin import Rest, origin_of, rest_of
+from gtsam_rwhec.first_rig.pose_reading import PoseReading, View, best_reading
 from gtsam_rwhec.first_rig.roles import RoleEvidence
-from gtsam_rwhec.first_rig.targets import Guess
-from gtsam_rwhec.first_rig.targets import boards_guessed
-from gtsam_rwhec.first_rig.targets import targets_seen
-from gtsam_rwhec.first_rig.targets import with_size
+from gtsam_rwhec.first_rig.targets import Guess, boards_guessed, targets_seen, with_size
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs.matched_images import pose_stamps
 from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.rig.sections import Carriers
-from gtsam_rwhec.rig.sections import PoseSource
-from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.rig.target_sections import TagTarget
-from gtsam_rwhec.rig.target_sections import TargetSection
+from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
-from gtsam_rwhec.geometry.trajectory import Trajectory
 
 #: At most this number of images of each folder, spread over all, is searched for targets, and solved for roles.
 IMAGES = 16

@@ -1,35 +1,22 @@
 """What a log says about a pair of moving frames: which carries the cameras, whether images were taken at rest."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.cameras.targets import Target
-from gtsam_rwhec.cameras.targets import family_named
-from gtsam_rwhec.detect.detector import Detection
-from gtsam_rwhec.detect.detector import Detector
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import PoseError
-from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.errors import TransformError
-from gtsam_rwhec.first_rig.log_contents import DriverTopic
-from gtsam_rwhec.first_rig.log_contents import LogContents
-from gtsam_rwhec.first_rig.pose_origin import Origin
-from gtsam_rwhec.first_rig.pose_origin import Rest
-from gtsam_rwhec.first_rig.pose_origin import origin_of
-from gtsam_rwhec.first_rig.pose_origin import rest_of
-from gtsam_rwhec.first_rig.roles import RoleEvidence
-from gtsam_rwhec.first_rig.roles import Seen
-from gtsam_rwhec.first_rig.roles import evidence_of_roles
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import TfBuffer
-from gtsam_rwhec.rig.sections import PoseSource
-from gtsam_rwhec.rig.sections import Sensor
+from gtsam_rwhec.cameras.targets import Tag, Target, family_named
+from gtsam_rwhec.detect.detector import Detection, Detector
+from gtsam_rwhec.errors import CameraError, LogError, PoseError, StampError, TransformError
+from gtsam_rwhec.first_rig.log_contents import DriverTopic, LogContents
+from gtsam_rwhec.first_rig.pose_origin import Origin, Rest, origin_of, rest_of
+from gtsam_rwhec.first_rig.roles import RoleEvidence, Seen, evidence_of_roles
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.logs import Log, TfBuffer
+from gtsam_rwhec.rig.sections import PoseSource, Sensor
 
 #: Seconds. Between poses further apart in time nothing is interpolated.
 MAX_GAP_S = 0.5

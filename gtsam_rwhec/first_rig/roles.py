@@ -9,27 +9,25 @@ two apart; the frames' names in the log do, or a person.
 """
 
 from __future__ import annotations
+
 import math
 from collections import defaultdict
-from collections.abc import Iterable
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.calibration.trial_fits import TrialFit
-from gtsam_rwhec.calibration.trial_fits import fitted
-from gtsam_rwhec.cameras.board_turns import choose_turns
-from gtsam_rwhec.cameras.board_turns import turns_about_z
+
+from gtsam_rwhec.calibration.trial_fits import TrialFit, fitted
+from gtsam_rwhec.cameras.board_turns import choose_turns, turns_about_z
 from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target
 from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
 
 #: A sensor's target counts with at least this number of images.
 LEAST_IMAGES = 6

@@ -20,7 +20,7 @@ from gtsam_rwhec.fitting.fit_options import CornerOptions
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.stated_intrinsics import CENTRE_PX
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 
 #: Corners whose median error is above this, pixels, do not belong to the poses.
 FARTHEST_PX = 30.0

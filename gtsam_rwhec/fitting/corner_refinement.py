@@ -48,10 +48,10 @@ from gtsam_rwhec.fitting.stated_intrinsics import (
 )
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solving.certified_solution import solve
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.solution import Solution
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3

@@ -13,8 +13,8 @@ from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
-from gtsam_rwhec.problem.pairs import ByPair
-from gtsam_rwhec.trajectories.trajectory import Trajectory
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.measurements import ByPair
 
 NoiseSource = Literal["auto", "given", "estimate"]
 NoiseGroups = Literal["all", "sensor", "pair"]

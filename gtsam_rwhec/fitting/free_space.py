@@ -1,25 +1,18 @@
 """Free directions at a refined answer, as columns over the refinement's unknowns."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
+
 import numpy as np
-from gtsam_rwhec.fitting.pair_data import FactorsByPair
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import Variables
-from gtsam_rwhec.fitting.unknowns import slots_of
+
+from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables, slots_of
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.answers import PairPoses, costs_of_pairs, given_answer
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.solver.identification import identify_with_basis, typical_length
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.answers import PairPoses
-from gtsam_rwhec.solver.answers import costs_of_pairs
-from gtsam_rwhec.solver.answers import given_answer
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeKind
-from gtsam_rwhec.solver.free_directions import FreeReason
-from gtsam_rwhec.solver.identification import identify_with_basis
-from gtsam_rwhec.solver.identification import typical_length
 
 #: A carrier stands still when its velocity's mean square is at most this many times the part that noise explains.
 MOVED = 4.0

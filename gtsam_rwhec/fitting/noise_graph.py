@@ -33,9 +33,9 @@ from gtsam_rwhec.fitting.refined import PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements, scale_of
 from gtsam_rwhec.fitting.unknowns import State, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.solution import Solution
 
 #: A factor has at most about this many numbers of effects that belong to single instants: 10 instants of one track.
 COLUMNS = 70

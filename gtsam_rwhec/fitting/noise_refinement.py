@@ -24,10 +24,10 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solver.solution import Solution
 
 #: The Jacobian of all measurements may have this many numbers: 160 MB.
 MOST_NUMBERS = 20_000_000

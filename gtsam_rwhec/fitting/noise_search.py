@@ -20,8 +20,8 @@ from gtsam_rwhec.fitting.noise_rows import Instants, Rows, prior_terms
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.unknowns import State, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.free_directions import FreeDirection
 
 #: Components and unknowns are estimated in turn at most this many times.
 ROUNDS = 4

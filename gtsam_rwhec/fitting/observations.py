@@ -25,10 +25,10 @@ from gtsam_rwhec.geometry.poses import (
     one_transform,
     rows_to_transforms,
 )
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.corners import check_in_image
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: A target is flat when its corners are no farther from a plane than this share of its size.
 FLAT = 1e-6

@@ -1,26 +1,23 @@
 """A pair's raw measurements with the noise of B and of A, and the carriers' motion about their stamps."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Literal
+
 import numpy as np
 from rwhec_factors import se3
-from rwhec_factors.batch import BatchResiduals
-from rwhec_factors.batch import Linearization
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import NoiseGroups
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from rwhec_factors.batch import BatchResiduals, Linearization
+
+from gtsam_rwhec.errors import CountError, NoiseError, OptionError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, NoiseGroups, RefineOptions
+from gtsam_rwhec.geometry.carrier_motion import SAME_POSE, LocalPaths
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.measurements import checked_covariances
-from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.geometry.carrier_motion import SAME_POSE
-from gtsam_rwhec.geometry.carrier_motion import LocalPaths
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.measurements import Pair, checked_covariances
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import VarianceFactors
+
 
 @dataclass(frozen=True)
 class PairData:

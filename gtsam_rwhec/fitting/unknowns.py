@@ -1,18 +1,21 @@
 """The unknowns of a refinement as records, and their names as users and files write them."""
 
 from __future__ import annotations
-from collections.abc import Iterable
-from collections.abc import Mapping
+
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
+
 
 class UnknownKind(Enum):
     """The kind of an unknown; the value is its word in files and names."""

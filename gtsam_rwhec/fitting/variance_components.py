@@ -8,28 +8,30 @@ than they are.
 """
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import field
+
+from dataclasses import dataclass, field
+
 import numpy as np
 from rwhec_factors.batch import Linearization
+
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.fitting.fit_options import NoiseGroups
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.pair_data import COMPONENTS
-from gtsam_rwhec.fitting.pair_data import FactorsByPair
-from gtsam_rwhec.fitting.pair_data import Group
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pair_data import group_label
-from gtsam_rwhec.fitting.pair_data import group_of
-from gtsam_rwhec.fitting.pair_data import measurement_covariance
-from gtsam_rwhec.fitting.pair_data import residual_covariance
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.pair_data import (
+    COMPONENTS,
+    FactorsByPair,
+    Group,
+    PairData,
+    group_label,
+    group_of,
+    measurement_covariance,
+    residual_covariance,
+)
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.selection import VarianceFactors
+from gtsam_rwhec.solver.parts import Part
 
 #: A variance factor is at least this part of the noise as given (or of 1 m and 1 rad, where none was given).
 SMALLEST = 1e-20

@@ -26,16 +26,16 @@ from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.pose_graph import optimise
 from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.geometry.poses import Array, to_pose3
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
+from gtsam_rwhec.solver.answers import Answer, answer_of, rotations_as_variables, scales_of
 from gtsam_rwhec.solver.descent import descend
 from gtsam_rwhec.solver.mirror import mirrored
-from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.search import MIRROR_COST, Search
+from gtsam_rwhec.solver.solve_options import SolveOptions
 from gtsam_rwhec.solver.start import unconstrained_start
-from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
 
 #: So many Newton steps lead from a start to its optimum; three to ten are usual.
 MAX_DESCENT_STEPS = 50

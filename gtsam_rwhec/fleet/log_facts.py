@@ -1,26 +1,26 @@
 """What a partial result says of its log, beside measurements: where it is from, what was removed, what was found."""
 
 from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Iterable
-from collections.abc import Mapping
-from collections.abc import Sequence
-from typing import Any
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
+
 import numpy as np
-from pydantic import BaseModel
-from pydantic import ConfigDict
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+from pydantic import BaseModel, ConfigDict
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.results.log_history import CleaningReport
-from gtsam_rwhec.results.log_history import DetectionReport
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.log_history import OutlierCount
-from gtsam_rwhec.results.log_history import TimeOffsetFields
-from gtsam_rwhec.results.log_history import TrackCount
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.log_history import (
+    CleaningReport,
+    DetectionReport,
+    LogFields,
+    OutlierCount,
+    TimeOffsetFields,
+    TrackCount,
+)
 
 #: How the measurements of a log were weighted: as the rig file states the noise, by covariances from corners, or alike.
 Weighting = Literal["stated", "covariances", "none"]

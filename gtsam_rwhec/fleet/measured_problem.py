@@ -1,29 +1,25 @@
 """The problem of a unit from the measurements that its partial results keep: what ``--refine`` calibrates from."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+
 import numpy as np
+
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fleet.log_facts import Weighting
-from gtsam_rwhec.fleet.map_log import measurements_file
-from gtsam_rwhec.fleet.map_log import partial_file
-from gtsam_rwhec.fleet.merging import Merged
-from gtsam_rwhec.fleet.merging import sensor_name
-from gtsam_rwhec.fleet.partial import KeptLog
-from gtsam_rwhec.fleet.partial import checksum
-from gtsam_rwhec.fleet.partial import read_kept
+from gtsam_rwhec.fleet.map_log import measurements_file, partial_file
+from gtsam_rwhec.fleet.merging import Merged, sensor_name
+from gtsam_rwhec.fleet.partial import KeptLog, checksum, read_kept
 from gtsam_rwhec.fleet.receipts import below
 from gtsam_rwhec.fleet.stores import read_bytes
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.measurements import GivenMeasurements
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.problem.measurements import Pair
 
 #: Pixels: the standard deviation of a corner where the rig file states none, as for one log.
 CORNER_PX = 0.1

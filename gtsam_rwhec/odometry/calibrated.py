@@ -1,19 +1,19 @@
 """The result of a calibration of sensors that know only their own motion, and its words: the verdict first."""
 
 from __future__ import annotations
+
 from collections import Counter
-from dataclasses import dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
+
 import numpy as np
+
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.found import Influence
-from gtsam_rwhec.odometry.found import JointCertificate
-from gtsam_rwhec.odometry.found import OtherAnswer
-from gtsam_rwhec.odometry.found import Windows
+from gtsam_rwhec.odometry.found import Influence, JointCertificate, OtherAnswer, Windows
 from gtsam_rwhec.odometry.tracks import OdometryNoise
 from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection
+
 
 @dataclass(frozen=True)
 class OdometryCalibration:

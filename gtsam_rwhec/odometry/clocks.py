@@ -1,15 +1,18 @@
 """The first guess of each sensor's time offset to the reference, from their turning."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.time_offset import estimate_time_offset
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.odometry.options import OdometryOptions
 from gtsam_rwhec.odometry.tracks import OdometryTrack
-from gtsam_rwhec.trajectories.time_offset import estimate_time_offset
-from gtsam_rwhec.geometry.trajectory import Trajectory
 
 #: The search takes so many seconds of two tracks, from the middle of what they share, at most.
 MOST_S = 180.0

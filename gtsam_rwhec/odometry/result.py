@@ -1,37 +1,29 @@
 """The record of a calibration from its answer: the frame that was asked for, covariance, dependence, findings."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.calibrated import OdometryCalibration
 from gtsam_rwhec.odometry.clocks import Clock
-from gtsam_rwhec.odometry.findings import contradictions_of
-from gtsam_rwhec.odometry.findings import findings_of
-from gtsam_rwhec.odometry.findings import remarks_of
-from gtsam_rwhec.odometry.findings import residual_sizes
-from gtsam_rwhec.odometry.found import Influence
-from gtsam_rwhec.odometry.found import Windows
-from gtsam_rwhec.odometry.freedom import REACHES
-from gtsam_rwhec.odometry.freedom import seven_each
+from gtsam_rwhec.odometry.findings import contradictions_of, findings_of, remarks_of, residual_sizes
+from gtsam_rwhec.odometry.found import Influence, Windows
+from gtsam_rwhec.odometry.freedom import REACHES, seven_each
 from gtsam_rwhec.odometry.other_answers import other_answers
 from gtsam_rwhec.odometry.plausible import inverted_in_words
-from gtsam_rwhec.odometry.solved_windows import Answer
-from gtsam_rwhec.odometry.solved_windows import Task
-from gtsam_rwhec.odometry.tracks import OdometryNoise
-from gtsam_rwhec.odometry.tracks import OdometryTrack
-from gtsam_rwhec.odometry.unknowns import OFFSET
-from gtsam_rwhec.odometry.unknowns import SCALE
+from gtsam_rwhec.odometry.solved_windows import Answer, Task
+from gtsam_rwhec.odometry.tracks import OdometryNoise, OdometryTrack
+from gtsam_rwhec.odometry.unknowns import OFFSET, SCALE
 from gtsam_rwhec.odometry.window_choice import axes_turned
 from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.certificate import Status
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeReason
-from gtsam_rwhec.solver.free_directions import free_directions_of
-from gtsam_rwhec.solver.free_directions import reason_for
-from gtsam_rwhec.solver.free_directions import sparse_basis
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_directions_of, reason_for, sparse_basis
+
 
 def calibration_of(
     answer: Answer,

@@ -1,22 +1,20 @@
 """Corners of a target in a sensor's images, as users give them to ``Problem.add_corners``, and the checks of them."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
-from typing import TypeAlias
+from typing import Any, TypeAlias
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.errors import CameraError, CountError, NoiseError, TargetError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.geometry.real_numbers import real_array
+from gtsam_rwhec.geometry.real_numbers import is_real, real_array
 
 #: Corners of an image, fewer of which determine no pose.
 FEWEST = 4
@@ -315,7 +313,7 @@ class Candidates:
 
     def by_carriers(self, A: Array) -> np.ndarray:
         """The candidates (N,) that agree with the carriers' poses A (N, 4, 4) over all images."""
-        from gtsam_rwhec.vision.ambiguity import choose_over_time
+        from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
 
         order = SECOND_NS * np.arange(len(A))  # neighbours are compared whatever time is between them: A is known
         return choose_over_time(order, self.T, self.squared_px, self.covariance, self.corner_px, A).which
@@ -336,7 +334,7 @@ def candidates_of(camera: Camera, board: Array, pixels: Array, corner_px: float,
     TargetError
         The corners do not belong to the board.
     """
-    from gtsam_rwhec.vision.pose import plane_poses
+    from gtsam_rwhec.cameras.target_poses import plane_poses
 
     known = np.asarray(np.isfinite(pixels).all(axis=2))
     found = plane_poses(

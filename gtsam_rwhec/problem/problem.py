@@ -1,46 +1,33 @@
 """The problem as the user states it: measurements by pair, and the knowledge of frames and scales."""
 
 from __future__ import annotations
+
 import copy
-from collections.abc import Mapping
-from collections.abc import Sequence
-from typing import Literal
-from numpy.typing import ArrayLike
-from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import PosesLike
-from gtsam_rwhec.geometry.poses import QuaternionOrder
-from gtsam_rwhec.geometry.poses import as_transforms
-from gtsam_rwhec.problem.accumulation import Accumulator
-from gtsam_rwhec.problem.accumulation import Batch
-from gtsam_rwhec.problem.corners import EachImage
-from gtsam_rwhec.problem.corners import check_camera
-from gtsam_rwhec.problem.corners import check_corner_px
-from gtsam_rwhec.problem.corners import check_in_image
-from gtsam_rwhec.problem.corners import seen_corners
-from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.knowledge import check_name
-from gtsam_rwhec.problem.long_translations import LongTranslations
-from gtsam_rwhec.problem.long_translations import warn_of_millimetres
-from gtsam_rwhec.problem.many_measurements import GivenMany
-from gtsam_rwhec.problem.measurements import GivenMeasurements
-from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.problem.moments import BLOCK
-from gtsam_rwhec.problem.moments import Moments
 import warnings
-from gtsam_rwhec.errors import RotationsProjectedWarning
-from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE
-from gtsam_rwhec.problem.corners import candidates_of
-from gtsam_rwhec.problem.knowledge import Knowledge
-from gtsam_rwhec.problem.many_measurements import KeptMeasurements
-from gtsam_rwhec.problem.many_measurements import Section
-from gtsam_rwhec.problem.measurements import Pair
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+from numpy.typing import ArrayLike
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
+from gtsam_rwhec.problem.accumulation import Accumulator, Batch
+from gtsam_rwhec.problem.corners import (
+    EachImage,
+    candidates_of,
+    check_camera,
+    check_corner_px,
+    check_in_image,
+    seen_corners,
+)
+from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
+from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
+from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section
+from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
-from gtsam_rwhec.problem.moments import Gauge
+from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 
 #: What the names of a pair are.
 SIDES: tuple[Literal["target"], Literal["sensor"]] = ("target", "sensor")

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator
@@ -22,7 +23,6 @@ from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
 from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.vision.camera import Camera
 
 
 class VarianceFactors(NamedTuple):

@@ -1,34 +1,34 @@
 """The report of a certified solution, for a terminal or a file."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+
 from rich.console import Console
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.report.advice import Advice
-from gtsam_rwhec.report.advice import print_advice
+
+from gtsam_rwhec.calibration.verdict import Finding, Judgement, Verdict
+from gtsam_rwhec.report.advice import Advice, print_advice
 from gtsam_rwhec.report.pair_grid import PairGrid
-from gtsam_rwhec.report.pose_table import POSE_LEGEND
-from gtsam_rwhec.report.pose_table import sensor_table
-from gtsam_rwhec.report.pose_table import target_table
-from gtsam_rwhec.report.printing import NO_NOISE
-from gtsam_rwhec.report.printing import STYLES
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import print_verdict
-from gtsam_rwhec.report.printing import report_console
-from gtsam_rwhec.report.sentences import certificate_sentence
-from gtsam_rwhec.report.sentences import part_sentences
-from gtsam_rwhec.report.sentences import scale_sentence
-from gtsam_rwhec.report.sentences import time_sentence
-from gtsam_rwhec.report.sentences import weights_sentence
-from gtsam_rwhec.report.short_report import LINES
-from gtsam_rwhec.report.short_report import PoseTables
-from gtsam_rwhec.report.short_report import ShortReport
+from gtsam_rwhec.report.pose_table import POSE_LEGEND, sensor_table, target_table
+from gtsam_rwhec.report.printing import (
+    NO_NOISE,
+    STYLES,
+    print_heading,
+    print_sentence,
+    print_tables,
+    print_verdict,
+    report_console,
+)
+from gtsam_rwhec.report.sentences import (
+    certificate_sentence,
+    part_sentences,
+    scale_sentence,
+    time_sentence,
+    weights_sentence,
+)
+from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport
 from gtsam_rwhec.results.result_judgement import judge
 from gtsam_rwhec.solver.solution import Solution
 

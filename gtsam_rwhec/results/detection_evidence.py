@@ -13,7 +13,8 @@ from pydantic import ConfigDict, Field
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.fitting.pair_data import local_paths
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.evidence_record import EvidenceRecord
 from gtsam_rwhec.results.image_errors import (
@@ -27,7 +28,6 @@ from gtsam_rwhec.results.image_errors import (
     worst_views,
 )
 from gtsam_rwhec.results.linear_model import MeasuredRows
-from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Time is divided into so many pieces: a figure has no more pixels.
 PIECES = 400

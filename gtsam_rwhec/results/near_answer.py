@@ -5,52 +5,35 @@ the estimate and its covariance. Directions that a short log leaves free are fre
 """
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+
 import gtsam
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.fitting.component_posterior import FEWEST
-from gtsam_rwhec.fitting.component_posterior import SAMPLES
-from gtsam_rwhec.fitting.component_posterior import mixture_of
-from gtsam_rwhec.fitting.fit_options import NoiseOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+
+from gtsam_rwhec.errors import CountError, RwhecWarning
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.component_posterior import FEWEST, SAMPLES, mixture_of
+from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.free_space import free_space_of
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.noise_refinement import SPARE_EQUATIONS
-from gtsam_rwhec.fitting.noise_refinement import agreeing
+from gtsam_rwhec.fitting.noise_refinement import SPARE_EQUATIONS, agreeing
 from gtsam_rwhec.fitting.noise_rows import Instants
-from gtsam_rwhec.fitting.noise_search import INSTANTS
-from gtsam_rwhec.fitting.noise_search import Settled
-from gtsam_rwhec.fitting.noise_search import Task
-from gtsam_rwhec.fitting.noise_search import moved
-from gtsam_rwhec.fitting.noise_search import thinned
-from gtsam_rwhec.fitting.noise_summary import FEWER_SAMPLES
-from gtsam_rwhec.fitting.noise_summary import is_drift_untried
-from gtsam_rwhec.fitting.noise_summary import settled
-from gtsam_rwhec.fitting.noise_summary import widening
+from gtsam_rwhec.fitting.noise_search import INSTANTS, Settled, Task, moved, thinned
+from gtsam_rwhec.fitting.noise_summary import FEWER_SAMPLES, is_drift_untried, settled, widening
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.refinement_from_poses import data_of
-from gtsam_rwhec.fitting.refinement_from_poses import scale_of
-from gtsam_rwhec.fitting.refinement_from_poses import sensors_with_offset
+from gtsam_rwhec.fitting.refinement_from_poses import data_of, scale_of, sensors_with_offset
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.parts import parts_of
 
 #: A measurement that is farther off than this many times the median, as seen from either end, is a gross error.
 GROSS = 10.0

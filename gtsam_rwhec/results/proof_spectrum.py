@@ -7,23 +7,19 @@ it without eigenvalues, for all variables and with rounding enclosed; the spectr
 """
 
 from __future__ import annotations
+
 import numpy as np
 from pydantic import Field
+
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
-from gtsam_rwhec.results.evidence_record import Row
-from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
+from gtsam_rwhec.solver.answers import given_answer, given_translations
+from gtsam_rwhec.solver.certificate import Certificate, Multipliers
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.rotations import CONSTRAINTS
-from gtsam_rwhec.solver.rotations import kkt_multipliers
-from gtsam_rwhec.solver.answers import given_answer
-from gtsam_rwhec.solver.answers import given_translations
-from gtsam_rwhec.solver.certificate import Multipliers
-from gtsam_rwhec.solver.small_dual import improve
-from gtsam_rwhec.solver.small_dual import scatter
+from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers
+from gtsam_rwhec.solver.small_dual import improve, scatter
 from gtsam_rwhec.solver.solution import Solution
 
 #: Larger matrices are not decomposed.

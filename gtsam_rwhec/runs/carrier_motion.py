@@ -1,26 +1,22 @@
 """The motion of the carriers in a log: A = T_sensorcarrier_targetcarrier over time."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.errors import TransformError
-from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
+
+from gtsam_rwhec.errors import LogError, StampError, TransformError
+from gtsam_rwhec.fitting.fit_options import About, CarrierNoise
 from gtsam_rwhec.fitting.free_space import MOVED
+from gtsam_rwhec.geometry.carrier_motion import WINDOW_S, SmoothPath
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import PoseRecord
-from gtsam_rwhec.logs import TfBuffer
-from gtsam_rwhec.logs import Topic
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.geometry.carrier_motion import WINDOW_S
-from gtsam_rwhec.geometry.carrier_motion import SmoothPath
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
+from gtsam_rwhec.rig import Rig
 
 #: Seconds. If stamps go back by more than this in the order of the log, a clock was set during the recording.
 BACKWARDS_S = 1.0

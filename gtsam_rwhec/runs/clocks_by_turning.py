@@ -6,21 +6,21 @@ way, and agree at no offset; their offset is found along the inverse path, so th
 """
 
 from __future__ import annotations
-from collections.abc import Mapping
-from collections.abc import Sequence
+
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.trajectories.time_offset import TimeOffset
-from gtsam_rwhec.trajectories.time_offset import estimate_time_offset
+from gtsam_rwhec.geometry.time_offset import TimeOffset, estimate_time_offset
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 
 #: Rotations of one target by one sensor: stamps (M,), B (M, 4, 4).
 Detections = tuple[np.ndarray, Array]

@@ -1,8 +1,11 @@
 """Cleaning of odometries that are calibrated with one another: their steps, and why some are not used."""
 
 from __future__ import annotations
+
 import numpy as np
 from rwhec_factors import se3
+
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.odometry import OdometryTrack
 from gtsam_rwhec.odometry.gates import gated
@@ -11,7 +14,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 from gtsam_rwhec.runs.odometry_solving import options_of
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
-from gtsam_rwhec.geometry.trajectory import Trajectory
+
 
 def odometry_steps(log: Log, rig: Rig, reference: OdometryTrack, sensor: str) -> MeasuredPairs:
     """The motions of a sensor from each of its poses to the next, with the gates' reasons, beside the reference's.

@@ -1,9 +1,12 @@
 """Cleaning of an odometry beside carriers whose motion is known: its clock, and its motions as measured pairs."""
 
 from __future__ import annotations
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.odometry import OdometryTrack
 from gtsam_rwhec.rig import Rig
@@ -12,7 +15,6 @@ from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
 from gtsam_rwhec.runs.odometry_windows import odometry_windows
-from gtsam_rwhec.geometry.trajectory import Trajectory
 
 #: Seconds. Clocks are compared over pieces of this length, within which an odometry has hardly drifted.
 PIECE_S = 30.0

@@ -1,16 +1,17 @@
 """Motions of an odometry and of the carriers, A Y = Y B, over windows of time that are chosen for information."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry import OdometryNoise
-from gtsam_rwhec.odometry import OdometryTrack
-from gtsam_rwhec.results.removed_measurements import RemovalReason
-from gtsam_rwhec.rig import Cleaning
-from gtsam_rwhec.rig import OdometrySource
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.odometry import OdometryNoise, OdometryTrack
+from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.rig import Cleaning, OdometrySource
 
 #: Seconds. Windows have one of these lengths.
 LENGTHS_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)

@@ -1,29 +1,31 @@
 """Pictures of a solved log: frames, residuals over time, corners in images, cameras, standard deviations."""
 
 from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.report.plots import PlottedMeasurement
-from gtsam_rwhec.report.plots import plot_coverage
-from gtsam_rwhec.report.plots import plot_deviations
-from gtsam_rwhec.report.plots import plot_frames
-from gtsam_rwhec.report.plots import plot_intrinsics
-from gtsam_rwhec.report.plots import plot_residuals
+from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.report.plots import (
+    PlottedMeasurement,
+    plot_coverage,
+    plot_deviations,
+    plot_frames,
+    plot_intrinsics,
+    plot_residuals,
+)
 from gtsam_rwhec.runs.corner_answer import with_intrinsics
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.plotted_corners import plotted_corners
-from gtsam_rwhec.runs.plotted_corners import plotted_intrinsics
-from gtsam_rwhec.runs.plotted_corners import seen_views
+from gtsam_rwhec.runs.plotted_corners import plotted_corners, plotted_intrinsics, seen_views
 from gtsam_rwhec.runs.solution_frames import frames_of
 from gtsam_rwhec.runs.solving_stage import Solved
-from gtsam_rwhec.problem.measurements import Pair
 
 #: The pictures' files have these names.
 FRAMES, RESIDUALS, COVERAGE, DEVIATIONS = "frames.png", "residuals.png", "coverage.png", "deviations.png"

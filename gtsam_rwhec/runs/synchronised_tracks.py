@@ -4,12 +4,13 @@ Most measurements at standstill are removed, and all measurements in fast motion
 """
 
 from __future__ import annotations
+
 import numpy as np
+
 from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.removed_measurements import Kept
-from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
 
 #: Seconds. Poses further apart than this are not interpolated: an arm at 1 m/s moves 20 cm in this time.
 MAX_GAP_S = 0.2

@@ -8,8 +8,8 @@ from rwhec_factors import se3
 from turning_tracks import NOISE, X, Y, carrier, path, track
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate import perturb
 from gtsam_rwhec.geometry import Trajectory, estimate_time_offset
+from gtsam_rwhec.simulate import perturb
 
 
 @pytest.mark.parametrize("offset", [-0.31, 0.0, 0.035, 0.8])

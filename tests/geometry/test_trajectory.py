@@ -1,18 +1,17 @@
 """Interpolation on SE(3), gaps, clocks, speeds; thinning and odometry's gates."""
 
 from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.runs import synchronise
-from gtsam_rwhec.runs import thin
-from gtsam_rwhec.runs import without_fast
 from gtsam_rwhec.geometry import Trajectory
+from gtsam_rwhec.runs import synchronise, thin, without_fast
 
 TWIST = np.array([0.4, -0.2, 0.7, 0.3, 0.1, -0.5])
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from turning_tracks import Y, carrier, track
 
-from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.geometry.carrier_motion import SmoothPath
 from gtsam_rwhec.geometry.time_offset import Turns, aligned
+from gtsam_rwhec.simulate.transforms import random_poses
 
 
 def test_the_best_rotation_of_vectors() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.geometry import Trajectory
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
-from gtsam_rwhec.geometry import Trajectory
 
 X, Y = random_poses(2, 1.0, np.random.default_rng(0))
 NOISE = Noise(0.005, 0.5 / np.radians(0.5) ** 2)

@@ -1,28 +1,32 @@
 """Corners in a problem: every form that users have gives the same measurements; what is wrong is refused in words."""
 
 from __future__ import annotations
+
 import dataclasses
 import warnings
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import PoseError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.errors import UnitsWarning
-from gtsam_rwhec.errors import WeightsWarning
-from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.problem.selection import nearer_poses
+from gtsam_rwhec.errors import (
+    CameraError,
+    CountError,
+    FrameError,
+    MeasurementsNotKeptError,
+    NoiseError,
+    PoseError,
+    RwhecError,
+    TargetError,
+    UnitsWarning,
+    WeightsWarning,
+)
+from gtsam_rwhec.problem.selection import nearer_poses, selected
 from gtsam_rwhec.solver.solution import contradicted_by
 
 Array = NDArray[np.float64]

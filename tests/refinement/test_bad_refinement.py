@@ -1,16 +1,16 @@
 """Errors of refine: each names the place, the value and the remedy."""
 
 from __future__ import annotations
+
 import copy
 import pickle
 from collections.abc import Callable
 from typing import Any
+
 import numpy as np
 import pytest
-from refinement_problems import KAPPA
-from refinement_problems import SIGMA_M
-from refinement_problems import refined
-from refinement_problems import rig
+from refinement_problems import KAPPA, SIGMA_M, refined, rig
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.geometry import Trajectory

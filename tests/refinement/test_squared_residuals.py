@@ -1,18 +1,16 @@
 """Squared residuals against the certified cost, the chi-square distribution, and full covariances."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
 from scipy.stats import chi2
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.weighted_fit import Measured
-from gtsam_rwhec.fitting.weighted_fit import WeightedFit
-from gtsam_rwhec.fitting.weighted_fit import weighted_fit
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import general
+from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit, weighted_fit
 from gtsam_rwhec.problem.selection import VarianceFactors
+from gtsam_rwhec.simulate import Noise, Simulation, general
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)
 ONE = VarianceFactors(1.0, 1.0)

@@ -1,22 +1,19 @@
 """Poses by vote, and the fit that needs no positive scale."""
 
 from __future__ import annotations
+
 from dataclasses import replace
 from typing import Any
+
 import numpy as np
 import pytest
 from outlier_problems import corrupted
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.fitting.weighted_fit import Measured
-from gtsam_rwhec.fitting.weighted_fit import WeightedFit
-from gtsam_rwhec.fitting.weighted_fit import by_vote
-from gtsam_rwhec.fitting.weighted_fit import weighted_fit
-from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
-from gtsam_rwhec.problem.selection import VarianceFactors
+from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit, by_vote, weighted_fit
+from gtsam_rwhec.problem.selection import VarianceFactors, selected
+from gtsam_rwhec.simulate import Noise, general, perturb
 
 NOISE = Noise(sigma_m=0.01, kappa=2000.0)
 ONE = VarianceFactors(1.0, 1.0)

@@ -1,19 +1,18 @@
 """Fits on the way of the outlier rejection: from the optimum of the inverse equation to the physical optimum."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.weighted_fit import Measured
-from gtsam_rwhec.fitting.weighted_fit import WeightedFit
-from gtsam_rwhec.fitting.weighted_fit import at_physical_optimum
-from gtsam_rwhec.fitting.weighted_fit import weighted_fit
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit, at_physical_optimum, weighted_fit
 from gtsam_rwhec.problem.selection import AS_STATED
+from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver.parts import parts_of
 
 NOISE = Noise(sigma_m=0.01, kappa=200.0)
 

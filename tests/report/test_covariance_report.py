@@ -1,29 +1,32 @@
 """What a person reads about a refined calibration: on terminals of any width, in files, where something is free."""
 
 from __future__ import annotations
+
 import dataclasses
 import io
 import math
 import re
 import warnings
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 from rich.console import Console
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.refined import PairNoise
-from gtsam_rwhec.report import print_refined
-from gtsam_rwhec.report.covariance_report import deviation_cells
-from gtsam_rwhec.report.covariance_report import legend
-from gtsam_rwhec.report.covariance_report import noise_table
-from gtsam_rwhec.report.covariance_report import outlier_sentence
-from gtsam_rwhec.report.covariance_report import refined_sentences
-from gtsam_rwhec.report.covariance_report import scale_and_offset_sentences
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.report import print_refined
+from gtsam_rwhec.report.covariance_report import (
+    deviation_cells,
+    legend,
+    noise_table,
+    outlier_sentence,
+    refined_sentences,
+    scale_and_offset_sentences,
+)
+from gtsam_rwhec.simulate import Motion, Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=0.5 / np.radians(0.5) ** 2)
 HEADINGS = ["x m", "y m", "z m", "roll°", "pitch°", "yaw°", "±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°"]

@@ -1,18 +1,18 @@
 """``rw.refine`` from the corners of a problem: what ``refine_corners`` finds, in the form of every refinement."""
 
 from __future__ import annotations
+
 from functools import cache
+
 import numpy as np
 import pytest
 from problems_of_corners import problem_of
 from rwhec_factors import se3
-from simulated_cells import Cell
-from simulated_cells import cell
+from simulated_cells import Cell, cell
 from simulated_clocks import moving
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.fitting.corner_residuals import stacks_of
 from gtsam_rwhec.geometry.trajectory import Trajectory
 

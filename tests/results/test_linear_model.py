@@ -1,19 +1,20 @@
 """The linear model of evidence: against differences, its own sums, and a true refit without a measurement."""
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from refinement_problems import rig
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.results.contribution import contribution_of
-from gtsam_rwhec.results.linear_model import LinearModel
-from gtsam_rwhec.results.linear_model import MeasuredRows
-from gtsam_rwhec.results.linear_model import inverse_of
-from gtsam_rwhec.results.linear_model import measured_rows
-from gtsam_rwhec.results.residual_evidence import residuals_of
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.contribution import contribution_of
+from gtsam_rwhec.results.linear_model import LinearModel, MeasuredRows, inverse_of, measured_rows
+from gtsam_rwhec.results.residual_evidence import residuals_of
+
 
 @pytest.fixture(scope="module")
 def calibrated() -> tuple[rw.Calibration, dict[Pair, MeasuredRows]]:

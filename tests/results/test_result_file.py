@@ -1,6 +1,7 @@
 """Result files: the same solution comes back, and damaged files are refused with the place of the damage."""
 
 from __future__ import annotations
+
 import dataclasses
 import inspect
 import json
@@ -9,28 +10,21 @@ import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import HealthCheck
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from places import DEMO
-from places import GOLDEN
+from places import DEMO, GOLDEN
 from pydantic import BaseModel
-from strategies import changed_trees
-from strategies import damaged
+from strategies import changed_trees, damaged
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import ResultVersionError
-from gtsam_rwhec.results.result_file import parse_result
-from gtsam_rwhec.results.result_file import read_solution
-from gtsam_rwhec.results.result_file import write_solution
-from gtsam_rwhec.results.schema import FORMAT_VERSION
-from gtsam_rwhec.results.schema import ResultFile
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
+from gtsam_rwhec.errors import FileFormatError, ResultVersionError
+from gtsam_rwhec.results.result_file import parse_result, read_solution, write_solution
+from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.certificate import Cause
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)

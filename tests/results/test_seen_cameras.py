@@ -1,21 +1,26 @@
 """Corners in cameras: the share of the image that has them, how far off they are, and the worst images."""
 
 from __future__ import annotations
+
 import json
+
 import numpy as np
 import pytest
 from problems_of_corners import problem_of
 from refined_corners import two_cameras
+
 import gtsam_rwhec as rw
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.detection_evidence import seen_in_problem
 from gtsam_rwhec.results.evidence import evidence_json
-from gtsam_rwhec.results.image_errors import SeenView
-from gtsam_rwhec.results.image_errors import board_of
-from gtsam_rwhec.results.image_errors import cells_with_corners
-from gtsam_rwhec.results.image_errors import rated_views
-from gtsam_rwhec.results.image_errors import seen_cameras
-from gtsam_rwhec.results.image_errors import worst_views
-from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.image_errors import (
+    SeenView,
+    board_of,
+    cells_with_corners,
+    rated_views,
+    seen_cameras,
+    worst_views,
+)
 
 OFF_PX = 3.0
 

@@ -1,17 +1,23 @@
 """Detections over time and what was removed: counts are those of the measurements, in few rows of few pieces."""
 
 from __future__ import annotations
+
 from collections import Counter
 from typing import NamedTuple
+
 import numpy as np
-from gtsam_rwhec.results.detection_evidence import MOST_LISTED
-from gtsam_rwhec.results.detection_evidence import MOST_ROWS
-from gtsam_rwhec.results.detection_evidence import PIECES
-from gtsam_rwhec.results.detection_evidence import counts_of
-from gtsam_rwhec.results.detection_evidence import removed_list
-from gtsam_rwhec.results.detection_evidence import span_of
-from gtsam_rwhec.results.detection_evidence import tracks_of
+
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.detection_evidence import (
+    MOST_LISTED,
+    MOST_ROWS,
+    PIECES,
+    counts_of,
+    removed_list,
+    span_of,
+    tracks_of,
+)
+
 
 class Marks(NamedTuple):
     stamps_ns: np.ndarray | None

@@ -1,10 +1,13 @@
 """Time offsets by whole rotations, along the carriers' path or its inverse."""
 
 from __future__ import annotations
+
 import numpy as np
 import synthetic_logs as made
-from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
+
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
+
 
 def test_an_offset_along_the_inverse_path_is_taken_only_where_it_fits_far_better() -> None:
     """A path that is right gives its own offset, also where detections are so noisy that the other one is tried."""

@@ -1,24 +1,25 @@
 """A hand with cameras that see tags, and sensors on it that know only their own motion: one calibration of all."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 import pytest
 import synthetic_logs as made
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.runs import clean_log
-from gtsam_rwhec.runs import detect_log
-from gtsam_rwhec.runs import read_solved
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.runs import clean_log, detect_log, read_solved
 from gtsam_rwhec.runs.measured_pairs import read_pairs
 from gtsam_rwhec.runs.solving_stage import Solved
 from gtsam_rwhec.simulate import frame_distance
-from gtsam_rwhec.problem.measurements import Pair
 
 SECONDS = 10.0
 #: T_hand_sensor, and of the second the measured over the true length.
