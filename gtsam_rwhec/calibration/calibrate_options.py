@@ -1,36 +1,29 @@
 """The options of ``calibrate``, each of which overrules a choice, and the record that its stages write."""
 
 from __future__ import annotations
+
 import warnings
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from dataclasses import field
-from dataclasses import replace
-from typing import Literal
-from typing import get_args
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import NotCertifiedWarning
-from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import OutliersWarning
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import WeightsWarning
+from gtsam_rwhec.errors import (
+    NotCertifiedWarning,
+    NotUniqueWarning,
+    OptionError,
+    OutliersWarning,
+    RwhecWarning,
+    WeightsWarning,
+)
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import CornerOptions
-from gtsam_rwhec.fitting.fit_options import Drift
-from gtsam_rwhec.fitting.fit_options import NoiseGroups
-from gtsam_rwhec.geometry.real_numbers import is_one_of
-from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, CornerOptions, Drift, NoiseGroups
+from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
 NoiseChoice = Literal["auto", "given", "estimate"]

@@ -6,36 +6,28 @@ is not known: they stood still, or the poses are stations, and what lies between
 """
 
 from __future__ import annotations
+
 import math
-from dataclasses import dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
+
 import numpy as np
-from scipy.special import chdtri
-from scipy.special import stdtrit
-from gtsam_rwhec.calibration.calibrate_options import Run
-from gtsam_rwhec.calibration.calibrate_options import offsets_of
-from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN
-from gtsam_rwhec.calibration.noise_choice import NoiseFound
-from gtsam_rwhec.calibration.noise_choice import refined_under_its_noise
-from gtsam_rwhec.calibration.outliers import Inliers
-from gtsam_rwhec.calibration.outliers import say_outliers
-from gtsam_rwhec.calibration.outliers import without_outliers
+from scipy.special import chdtri, stdtrit
+
+from gtsam_rwhec.calibration.calibrate_options import Run, offsets_of
+from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN, NoiseFound, refined_under_its_noise
+from gtsam_rwhec.calibration.outliers import Inliers, say_outliers, without_outliers
 from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import CountError, OptionError
 from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pair_data import local_paths
+from gtsam_rwhec.fitting.pair_data import PairData, local_paths
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.geometry.carrier_motion import WINDOW_S, LocalPaths
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.geometry.carrier_motion import WINDOW_S
-from gtsam_rwhec.geometry.carrier_motion import LocalPaths
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution
 
 #: An offset that would be known less well than this, s, is not estimated: a camera's frames are about as far apart.

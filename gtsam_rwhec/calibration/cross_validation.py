@@ -6,37 +6,27 @@ measurements: B = Y^-1 A X.
 """
 
 from __future__ import annotations
+
 import warnings
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
-from typing import NamedTuple
-from typing import get_args
+from typing import Literal, NamedTuple, get_args
+
 import numpy as np
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import OutlierError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import check_progress
-from gtsam_rwhec.files.progress import silent
+
+from gtsam_rwhec.errors import CountError, OptionError, OutlierError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.carrier_motion import LocalPaths
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import is_one_of
-from gtsam_rwhec.geometry.real_numbers import is_whole
-from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
+from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.trajectories.local_paths import LocalPaths
-from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.certified_solution import solve
 from gtsam_rwhec.solver.solution import Solution
 from gtsam_rwhec.solver.solve_options import SolveOptions

@@ -38,8 +38,8 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement import as_stated, beyond_independent_errors, observed
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection, TriedModel
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.problem.nearer_poses import nearer_poses
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import nearer_poses
 
 #: At most so many images are looked at, and of a pair at least so many.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8

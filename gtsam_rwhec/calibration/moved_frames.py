@@ -7,21 +7,20 @@ are left out as outliers, and agree with one another in the axes of the frame th
 """
 
 from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
+
 import numpy as np
 from rwhec_factors import se3
 from scipy.spatial import cKDTree
-from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI
-from gtsam_rwhec.calibration.trial_fits import Sample
-from gtsam_rwhec.calibration.trial_fits import Spread
-from gtsam_rwhec.calibration.trial_fits import TrialFit
-from gtsam_rwhec.calibration.trial_fits import fitted
+
+from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Spread, TrialFit, fitted
 from gtsam_rwhec.fitting.noise_rows import stations
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
 
 #: Two groups lie apart by this many times their own spread. (2,000 simulations each of white noise, random walks, walks
 #: with noise, Student's t with 2 degrees of freedom and smooth errors, 20 to 160 measurements: 1 of 30,000 was.)

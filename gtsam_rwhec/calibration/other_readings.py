@@ -18,7 +18,7 @@ from rwhec_factors.se3 import expmap, inverse, pose, so3_logmap
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import of_rows, to_rotations
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 
 Rows = tuple[Array, Array]
 

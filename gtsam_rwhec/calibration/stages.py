@@ -5,58 +5,35 @@ step that cannot be taken is a choice that says so; only input that cannot be us
 """
 
 from __future__ import annotations
+
 import math
-from collections.abc import Iterable
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
 import numpy as np
 from rwhec_factors.se3 import inverse
 from scipy.spatial.transform import Rotation
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
-from gtsam_rwhec.calibration.calibrate_options import Run
+
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.clock_offsets import Answer
-from gtsam_rwhec.calibration.clock_offsets import answer
-from gtsam_rwhec.calibration.clock_offsets import check_offsets
-from gtsam_rwhec.calibration.clock_offsets import late_in_place_of_shifted
-from gtsam_rwhec.calibration.from_corners import answered_by_corners
-from gtsam_rwhec.calibration.from_corners import check_observations
-from gtsam_rwhec.calibration.from_corners import with_better_poses
-from gtsam_rwhec.calibration.misreadings import Reading
-from gtsam_rwhec.calibration.misreadings import are_too_few_to_tell
-from gtsam_rwhec.calibration.misreadings import reading_of
+from gtsam_rwhec.calibration.clock_offsets import Answer, answer, check_offsets, late_in_place_of_shifted
+from gtsam_rwhec.calibration.from_corners import answered_by_corners, check_observations, with_better_poses
+from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, reading_of
 from gtsam_rwhec.calibration.other_readings import Mistake
-from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS
-from gtsam_rwhec.calibration.outliers import outliers_of
-from gtsam_rwhec.calibration.outliers import share_that_agrees_plausibly
-from gtsam_rwhec.calibration.outliers import spare_equations
-from gtsam_rwhec.calibration.point_uncertainty import Carriers
-from gtsam_rwhec.calibration.point_uncertainty import views_of
-from gtsam_rwhec.calibration.sizes import TargetSize
-from gtsam_rwhec.calibration.sizes import doubted_lengths
-from gtsam_rwhec.calibration.sizes import undetectable
-from gtsam_rwhec.calibration.stated_knowledge import doubt_one_pose
-from gtsam_rwhec.calibration.stated_knowledge import doubt_stated_poses
-from gtsam_rwhec.calibration.stated_knowledge import doubt_stated_sizes
+from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
+from gtsam_rwhec.calibration.point_uncertainty import Carriers, views_of
+from gtsam_rwhec.calibration.sizes import TargetSize, doubted_lengths, undetectable
+from gtsam_rwhec.calibration.stated_knowledge import doubt_one_pose, doubt_stated_poses, doubt_stated_sizes
 from gtsam_rwhec.calibration.trial_fits import implausible
-from gtsam_rwhec.calibration.verdict import READING
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import findings_of
-from gtsam_rwhec.calibration.verdict import proof_of
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import check_progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.calibration.verdict import READING, Finding, Ground, Judgement, findings_of, proof_of
+from gtsam_rwhec.errors import OptionError, ScaleError
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import FreeDirection
-from gtsam_rwhec.identifiability.free_directions import FreeReason
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.solver.solution import Solution
 
 #: Standard deviations about the axis with the second most turning: below this the carriers turned too little.

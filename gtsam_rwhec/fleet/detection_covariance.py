@@ -6,18 +6,20 @@ weights W; its covariance is H^-1 (sum J' W C W J) H^-1 with H = sum J' W J and 
 """
 
 from __future__ import annotations
+
 from dataclasses import replace
+
 import numpy as np
 from rwhec_factors.batch import BatchResiduals
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.measurements import Pair
+
 
 def with_covariances_of_detections(found: Calibration, problem: Problem, covariances: dict[Pair, Array]) -> Calibration:
     """The calibration with the covariance that its measurements' own covariances give.

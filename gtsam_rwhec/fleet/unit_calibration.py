@@ -1,32 +1,30 @@
 """The calibration of a unit: from merged moments by default, from the measurements of its logs on request."""
 
 from __future__ import annotations
-from collections.abc import Mapping
-from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import replace
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
+
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.stages import calibrate
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.fleet.consistency import check_logs
 from gtsam_rwhec.fleet.detection_covariance import with_covariances_of_detections
 from gtsam_rwhec.fleet.log_agreement import disagreeing_logs
-from gtsam_rwhec.fleet.log_facts import findings_of_logs
-from gtsam_rwhec.fleet.log_facts import merged_fields
+from gtsam_rwhec.fleet.log_facts import findings_of_logs, merged_fields
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.fleet.merging import Merged
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.log_history import TimeOffsetFields
-from gtsam_rwhec.results.result_file import calibration_json
-from gtsam_rwhec.results.result_judgement import judge
-from gtsam_rwhec.results.result_judgement import short_of_measurements
-from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.problem.selection import problem_of_moments
+from gtsam_rwhec.results.log_history import LogFields, TimeOffsetFields
+from gtsam_rwhec.results.result_file import calibration_json
+from gtsam_rwhec.results.result_judgement import judge, short_of_measurements
+from gtsam_rwhec.rig import Rig
+
 
 @dataclass(frozen=True, eq=False)
 class UnitCalibration:

@@ -1,26 +1,19 @@
 """The report of ``calibrate``: a screen of it, or all: verdict, what to do, points, choices, poses and details."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
+
 from rich.console import Console
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.report.advice import Advice
-from gtsam_rwhec.report.advice import print_advice
-from gtsam_rwhec.report.covariance_report import label
-from gtsam_rwhec.report.covariance_report import print_refined_body
-from gtsam_rwhec.report.covariance_report import wrong_sentence
-from gtsam_rwhec.report.printing import STYLES
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import report_console
-from gtsam_rwhec.report.short_poses import refined_poses
-from gtsam_rwhec.report.short_poses import scales_and_clocks
-from gtsam_rwhec.report.short_report import LINES
-from gtsam_rwhec.report.short_report import ShortReport
-from gtsam_rwhec.report.solution_report import print_solution_body
-from gtsam_rwhec.report.solution_report import solved_poses
+from gtsam_rwhec.report.advice import Advice, print_advice
+from gtsam_rwhec.report.covariance_report import label, print_refined_body, wrong_sentence
+from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, report_console
+from gtsam_rwhec.report.short_poses import refined_poses, scales_and_clocks
+from gtsam_rwhec.report.short_report import LINES, ShortReport
+from gtsam_rwhec.report.solution_report import print_solution_body, solved_poses
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_judgement import contradicted_names
 from gtsam_rwhec.solver.free_directions import FreeDirection

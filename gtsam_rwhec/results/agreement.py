@@ -6,28 +6,22 @@ Every function raises `ValueError` with the JSON path, what was found, and what 
 """
 
 from __future__ import annotations
+
 import json
 import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
-from gtsam_rwhec.calibration.outliers import HALF
-from gtsam_rwhec.calibration.outliers import NEARLY_HALF
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import shown
+
+from gtsam_rwhec.calibration.outliers import HALF, NEARLY_HALF
+from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
+from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import SIZE
 from gtsam_rwhec.results.json_tree import POSED
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.log_history import contradictions
-from gtsam_rwhec.results.schema import RefinedFields
-from gtsam_rwhec.results.schema import SolutionFields
-from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.certificate import Cause
-from gtsam_rwhec.solver.certificate import Status
+from gtsam_rwhec.results.log_history import LogFields, contradictions
+from gtsam_rwhec.results.schema import RefinedFields, SolutionFields
+from gtsam_rwhec.solver.certificate import Cause, Certificate, Status
 from gtsam_rwhec.solver.solution import Solution
 
 #: Largest share by which sums of the same doubles in another order may differ.

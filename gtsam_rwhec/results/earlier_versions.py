@@ -8,24 +8,18 @@ versions 4 and 5 lack what ``calibrate`` found, and all lack what a refinement f
 """
 
 from __future__ import annotations
+
 import json
 from dataclasses import asdict
-from typing import Annotated
-from typing import Any
-from pydantic import AfterValidator
-from pydantic import BaseModel
-from pydantic import ConfigDict
-from pydantic import ValidationError
-from pydantic import model_validator
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
+
 from gtsam_rwhec.calibration.outliers import HALF
-from gtsam_rwhec.results.json_tree import from_json
-from gtsam_rwhec.results.json_tree import in_words
-from gtsam_rwhec.results.log_history import OutlierCount
-from gtsam_rwhec.results.log_history import contradictions
-from gtsam_rwhec.solver.certificate import Cause
-from gtsam_rwhec.solver.certificate import SearchPath
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeKind
+from gtsam_rwhec.results.json_tree import from_json, in_words
+from gtsam_rwhec.results.log_history import OutlierCount, contradictions
+from gtsam_rwhec.solver.certificate import Cause, SearchPath
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind
 
 FIRST_VERSION = 1
 FIRST_WITH_VERDICT = 4

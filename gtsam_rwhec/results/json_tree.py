@@ -6,21 +6,20 @@ does not become a pair again. Pydantic cannot write gtsam.Pose3, arrays and slic
 """
 
 from __future__ import annotations
+
 import json
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import fields
-from dataclasses import is_dataclass
-from typing import Any
-from typing import NoReturn
+from dataclasses import fields, is_dataclass
+from typing import Any, NoReturn
+
 import gtsam
 import numpy as np
 from pydantic import ValidationError
+
 from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import printable
-from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.files.terminal_text import brief, printable, shown
 from gtsam_rwhec.results.schema import PointFields
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.free_directions import FreeDirection

@@ -10,18 +10,20 @@ measurements share are not in it: what is computed from it says so.
 """
 
 from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import PairNoise
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
 
 #: Directions with less than this share of the largest information, in units of their own, count as free.
 FREE = 1e-12

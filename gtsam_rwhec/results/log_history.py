@@ -4,16 +4,14 @@ The logs that stages write hold these records, and so does the result file.
 """
 
 from __future__ import annotations
+
 from collections.abc import Iterable
-from typing import Annotated
-from typing import TypeAlias
-from pydantic import BaseModel
-from pydantic import ConfigDict
-from pydantic import Field
-from gtsam_rwhec.calibration.outliers import NEARLY_HALF
-from gtsam_rwhec.calibration.outliers import contradicted_frames
-from gtsam_rwhec.calibration.sizes import is_size_doubted
-from gtsam_rwhec.calibration.sizes import is_size_uncertain
+from typing import Annotated, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from gtsam_rwhec.calibration.outliers import NEARLY_HALF, contradicted_frames
+from gtsam_rwhec.calibration.sizes import is_size_doubted, is_size_uncertain
 from gtsam_rwhec.problem.measurements import Pair
 
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.

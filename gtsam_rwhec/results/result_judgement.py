@@ -1,22 +1,17 @@
 """The judgement of a calibration by the facts that its result file holds."""
 
 from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Mapping
-from collections.abc import Sequence
-from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME
-from gtsam_rwhec.calibration.outliers import LeftOut
-from gtsam_rwhec.calibration.outliers import contradicted_frames
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import findings_of
-from gtsam_rwhec.calibration.verdict import proof_of
+from collections.abc import Mapping, Sequence
+
+from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, LeftOut, contradicted_frames
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.results.log_history import FrameOutliers
-from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.log_history import FrameOutliers, LogFields
 from gtsam_rwhec.solver.solution import Solution
+
 
 def contradicted_names(refined: RefinedPoses | None, log: LogFields | None = None) -> frozenset[str]:
     """The sensors and targets whose own measurements contradict the answer, half of them or nearly: not to be used."""

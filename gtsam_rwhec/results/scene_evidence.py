@@ -1,39 +1,39 @@
 """The rig in space: the carriers' path, a typical pose, cameras' views, boards, and from where they were seen."""
 
 from __future__ import annotations
+
 import re
-from collections.abc import Mapping
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any
-from typing import Literal
+from typing import Any, Literal
+
 import cv2
 import gtsam
 import numpy as np
 from pydantic import Field
 from rwhec_factors import se3
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import AprilGrid
-from gtsam_rwhec.cameras.targets import Bundle
-from gtsam_rwhec.cameras.targets import Charuco
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.cameras.targets import TagGrid
-from gtsam_rwhec.cameras.targets import Target
-from gtsam_rwhec.cameras.targets import grid
-from gtsam_rwhec.cameras.targets import square
-from gtsam_rwhec.detect.tags import dictionary
-from gtsam_rwhec.detect.tags import modules
-from gtsam_rwhec.fitting.reprojection_record import WARPS
-from gtsam_rwhec.fitting.reprojection_record import BoardShape
+from gtsam_rwhec.cameras.targets import (
+    AprilGrid,
+    Bundle,
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    Tag,
+    TagGrid,
+    Target,
+    grid,
+    square,
+)
+from gtsam_rwhec.detect.tags import dictionary, modules
+from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
-from gtsam_rwhec.results.evidence_record import Rows
-from gtsam_rwhec.results.linear_model import MeasuredRows
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.results.evidence_record import EvidenceRecord, Rows
+from gtsam_rwhec.results.linear_model import MeasuredRows
 
 #: The path is thinned to this many poses.
 MOST_POSES = 400

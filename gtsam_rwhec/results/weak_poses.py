@@ -13,21 +13,23 @@ measurements like those that there are is beside it, for comparison.
 """
 
 from __future__ import annotations
+
 import math
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
+
 import numpy as np
 from pydantic import Field
 from rwhec_factors import se3
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.evidence_record import EvidenceRecord
 from gtsam_rwhec.results.linear_model import MeasuredRows
-from gtsam_rwhec.problem.measurements import Pair
 
 Triple = tuple[float, float, float]
 Kind = Literal["translation", "rotation"]

@@ -6,34 +6,30 @@ they look misread, or leave directions free: then the corners have no start. The
 """
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import numpy as np
+
 from gtsam_rwhec.calibration.from_corners import CornersFound
 from gtsam_rwhec.calibration.misreadings import Misreading
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.calibration.verdict import Finding
+from gtsam_rwhec.calibration.verdict import Choice, Finding
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_evidence import IntrinsicsEvidence
-from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
-from gtsam_rwhec.cameras.unknown_intrinsics import Lens
-from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import RwhecWarning
+from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS, Lens, estimated_intrinsics
+from gtsam_rwhec.errors import RwhecError, RwhecWarning
 from gtsam_rwhec.fitting.observations import solved_with_chosen_poses
 from gtsam_rwhec.runs.clocks_by_turning import late_clocks
-from gtsam_rwhec.runs.corner_answer import corner_answer
-from gtsam_rwhec.runs.corner_answer import with_intrinsics
+from gtsam_rwhec.runs.corner_answer import corner_answer, with_intrinsics
 from gtsam_rwhec.runs.doubted_intrinsics import finding_against
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.log_findings import is_of_the_poses
-from gtsam_rwhec.runs.settled_poses import SettledPoses
-from gtsam_rwhec.runs.settled_poses import settled_poses
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import SynchronisedPairs
+from gtsam_rwhec.runs.settled_poses import SettledPoses, settled_poses
+from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
 from gtsam_rwhec.solver.certified_solution import solve
+
 
 @dataclass(frozen=True, eq=False)
 class FirstAnswer:

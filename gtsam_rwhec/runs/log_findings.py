@@ -1,25 +1,23 @@
 """What is found against a log beside what ``calibrate`` finds, and the lines of the rig file to change."""
 
 from __future__ import annotations
-from collections.abc import Iterable
-from collections.abc import Mapping
-from collections.abc import Sequence
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+
 import numpy as np
-from gtsam_rwhec.calibration.misreadings import Misreading
-from gtsam_rwhec.calibration.misreadings import Reading
-from gtsam_rwhec.calibration.moved_frames import Measured
-from gtsam_rwhec.calibration.moved_frames import moved_with_outliers
+
+from gtsam_rwhec.calibration.misreadings import Misreading, Reading
+from gtsam_rwhec.calibration.moved_frames import Measured, moved_with_outliers
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.problem.measurements import Pair
 
 #: A point that is known to this share of its distance only (with 95 %) is known to nothing.
 LARGEST_SHARE = 0.25

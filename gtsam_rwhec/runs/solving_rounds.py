@@ -1,39 +1,34 @@
 """Solving in rounds: outliers, then time offsets, again and again until both stay the same; the targets' sizes."""
 
 from __future__ import annotations
+
 import math
 import re
 import warnings
-from collections.abc import Collection
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.misreadings import Misreading
-from gtsam_rwhec.calibration.misreadings import exchange_of
-from gtsam_rwhec.calibration.misreadings import reading_of
+from gtsam_rwhec.calibration.misreadings import Misreading, exchange_of, reading_of
 from gtsam_rwhec.calibration.stages import calibrate
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.errors import RwhecError, RwhecWarning, ScaleError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.measured_pairs import problem_of
-from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, problem_of
 from gtsam_rwhec.solver.certified_solution import solve
 
 Pairs = dict[Pair, MeasuredPairs]

@@ -1,16 +1,16 @@
 """Measurements that look wrong where every measurement counts."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
-from refinement_problems import copied
-from refinement_problems import rig
+from refinement_problems import copied, rig
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.outliers import GrossErrors
-from gtsam_rwhec.calibration.outliers import gross_errors
-from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.calibration.outliers import GrossErrors, gross_errors
+from gtsam_rwhec.problem.measurements import Measurements, Pair
+
 
 @pytest.mark.parametrize("share", [0.05, 0.3])
 def test_they_are_counted(share: float) -> None:

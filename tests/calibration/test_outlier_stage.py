@@ -1,22 +1,22 @@
 """Measurements that contradict the others: which are left out, and what is said of their frames."""
 
 from __future__ import annotations
+
 import warnings
+
 import numpy as np
 import pytest
-from refinement_problems import KAPPA
-from refinement_problems import SIGMA_M
-from refinement_problems import copied
-from refinement_problems import rig
+from refinement_problems import KAPPA, SIGMA_M, copied, rig
 from rwhec_factors import se3
 from said import choice
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.outliers import spare_equations
 from gtsam_rwhec.calibration.trial_fits import implausible
-from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.free_directions import FreeReason
+
 
 def with_outliers(problem: rw.Problem, share: float, of: tuple[str, ...] = ()) -> rw.Problem:
     rng = np.random.default_rng(1)

@@ -1,22 +1,19 @@
 """What a subcommand passes over it refuses: every option, on every way that the subcommand can go."""
 
 from __future__ import annotations
+
 import shlex
-from collections.abc import Collection
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
-from typing import get_args
+from typing import Any, get_args
+
 import pytest
 import typer
-from places import CELL
-from places import DEMO
+from places import CELL, DEMO
 from typer.testing import CliRunner
-from gtsam_rwhec.calibration.calibrate_options import NoiseChoice
-from gtsam_rwhec.calibration.calibrate_options import RobustChoice
-from gtsam_rwhec.cli import calibrate
-from gtsam_rwhec.cli import convert
-from gtsam_rwhec.cli import options
+
+from gtsam_rwhec.calibration.calibrate_options import NoiseChoice, RobustChoice
+from gtsam_rwhec.cli import calibrate, convert, options
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.roads import command_of
 from gtsam_rwhec.logs.image_folder import Columns
