@@ -35,7 +35,7 @@ from rich.table import Table
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general, perturb
-from gtsam_rwhec.simulate.transforms import rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
 
 FloatArray = NDArray[np.float64]
 CONFIDENCE = 0.95

@@ -13,7 +13,7 @@ from rwhec_factors.se3 import inverse, pose
 from simulated_arms import ARM, BENT_RAD, FloatArray, moved_by, white
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate.transforms import rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
 
 RATE_HZ = 30.0
 BOARD, CAMERA = "board", "camera"

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate.transforms import random_directions, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import random_directions, random_poses, rotations_of_vectors
 
 Array = NDArray[np.float64]
 #: Row 1: of all free problems, and of the free problems with one number of measurements.

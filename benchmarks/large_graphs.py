@@ -34,10 +34,8 @@ from rwhec_factors.se3 import inverse, pose
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.simulate.graphs import bipartite_edges
-from gtsam_rwhec.simulate.motion import Motion, carrier_poses
-from gtsam_rwhec.simulate.noise import Noise, perturb
-from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import Noise, perturb, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_rigs import Motion, bipartite_edges, carrier_poses
 
 MEASUREMENTS = 10
 #: Of a small rig, as in many_frames.py.

@@ -43,7 +43,7 @@ from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.methods.local_on_manifold import LomOptions, LomWeights, local_on_manifold
 from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate.transforms import random_directions, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import random_directions, random_poses, rotations_of_vectors
 
 Start = Literal["close", "random"]
 Reading = Literal["stated", "inferred"]

@@ -24,7 +24,7 @@ from rwhec_factors.se3 import inverse, pose
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecWarning
 from gtsam_rwhec.simulate import Noise, perturb
-from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import random_poses, rotations_of_vectors
 
 Array = NDArray[np.float64]
 Masks = dict[tuple[str, str], NDArray[np.bool_]]

@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from gtsam_rwhec.simulate import CalibrationErrors, Noise, Simulation, cameras, sphere
-from gtsam_rwhec.simulate.noise import NoiseModel
+from gtsam_rwhec.simulate.simulated_noise import NoiseModel
 
 PAPER_RUNS = 100
 BAR = 4.0

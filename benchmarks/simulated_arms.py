@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors.se3 import pose
 
-from gtsam_rwhec.simulate.transforms import rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
 
 FloatArray = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from simulated_arms import ARM, BENT_RAD, FloatArray, moved_by, white
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecError, RwhecWarning
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 STATIONS, PERIOD_NS = 40, 2_000_000_000
 ROTATION_RAD, TRANSLATION_M = float(np.radians(0.3)), 0.003

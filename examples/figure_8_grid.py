@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key
 
 
 def main() -> None:

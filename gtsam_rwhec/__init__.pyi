@@ -70,7 +70,6 @@ from .results import write_solution as write_solution
 
 # From a log of images to a calibration, at once or step by step.
 from . import export as export
-from . import first_rig as first_rig
 from . import fleet as fleet
 from . import geometry as geometry
 from . import logs as logs

@@ -145,6 +145,12 @@ def _serve() -> None:
     import rosbags.highlevel
     import rosbags.typesys  # noqa: F401
 
+    import gtsam_rwhec.detect.images
+    import gtsam_rwhec.logs.image_folder
+    import gtsam_rwhec.logs.mcap_writer
+    import gtsam_rwhec.logs.ros_bags
+    import gtsam_rwhec.logs.tf_buffer  # noqa: F401
+
     for line in sys.stdin:
         how, path, options = json.loads(line)
         source, sink = os.pipe()

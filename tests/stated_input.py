@@ -9,7 +9,7 @@ import numpy as np
 from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 GENERATOR = np.random.default_rng(5)
 X_TRUE, Y_TRUE = random_poses(2, 1.0, GENERATOR)

@@ -17,7 +17,7 @@ import rwhec_factors
 from places import REPOSITORY
 
 import gtsam_rwhec
-from gtsam_rwhec.logs.written_schemas import json_schema
+from gtsam_rwhec.logs.mcap_writer import json_schema
 
 PAGES = [
     path

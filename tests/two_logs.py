@@ -8,9 +8,8 @@ import gtsam
 import numpy as np
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate.motion import Motion, carrier_poses
-from gtsam_rwhec.simulate.noise import Noise, perturb
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import Noise, perturb, random_poses
+from gtsam_rwhec.simulate.simulated_rigs import Motion, carrier_poses
 
 NOISE = Noise(sigma_m=0.001, kappa=0.5 / np.radians(0.1) ** 2)
 #: A camera that was knocked: some 20 joint deviations.

@@ -13,23 +13,16 @@ import typer
 from typer.core import TyperGroup
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.calibrate import calibrate
-from gtsam_rwhec.cli.clean import clean
-from gtsam_rwhec.cli.compare import compare
-from gtsam_rwhec.cli.convert import convert
-from gtsam_rwhec.cli.demo import demo
-from gtsam_rwhec.cli.detect import detect
-from gtsam_rwhec.cli.diff import diff
-from gtsam_rwhec.cli.exit_status import HELP, ExitStatus
-from gtsam_rwhec.cli.export import export
-from gtsam_rwhec.cli.failures import failures_in_words
-from gtsam_rwhec.cli.fetch import utias
-from gtsam_rwhec.cli.fleet import run
-from gtsam_rwhec.cli.fleet_watch import watch
-from gtsam_rwhec.cli.init import init
-from gtsam_rwhec.cli.report import report
-from gtsam_rwhec.cli.solve import solve
-from gtsam_rwhec.cli.verify import verify
+from gtsam_rwhec.cli.calibrate_command import calibrate
+from gtsam_rwhec.cli.compare_methods import compare
+from gtsam_rwhec.cli.compare_results import diff, verify
+from gtsam_rwhec.cli.convert_command import convert
+from gtsam_rwhec.cli.demo_and_data import demo, utias
+from gtsam_rwhec.cli.failures import HELP, ExitStatus, failures_in_words
+from gtsam_rwhec.cli.fleet_commands import run, watch
+from gtsam_rwhec.cli.init_command import init
+from gtsam_rwhec.cli.report_command import report
+from gtsam_rwhec.cli.stage_commands import clean, detect, export, solve
 from gtsam_rwhec.files.terminal_text import printable, say
 
 #: Typer has a click of its own, whose classes have no public names: this is the base of all usage errors.

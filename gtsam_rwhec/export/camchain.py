@@ -1,16 +1,18 @@
 """The cameras as a Kalibr camchain."""
 
 from __future__ import annotations
-
 import numpy as np
 from rwhec_factors.se3 import inverse
-
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, row, sorted_out
+from gtsam_rwhec.export.camera_words import NOT_KNOWN
+from gtsam_rwhec.export.camera_words import lacks
+from gtsam_rwhec.export.camera_words import origin
+from gtsam_rwhec.export.camera_words import row
+from gtsam_rwhec.export.camera_words import sorted_out
 from gtsam_rwhec.export.overlaps import overlaps
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 _HEAD = """\
 # Cameras in the form of a Kalibr camchain. The frame {carrier}, which carries them, takes the place of the IMU:

@@ -1,13 +1,11 @@
 """What files for other programs say of a camera: where its intrinsics are from, and why a format cannot have it."""
 
 from __future__ import annotations
-
 from collections.abc import Iterable
-
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 #: A remark in a file has at most this many characters.
 LONGEST_COMMENT = 2_000

@@ -16,8 +16,8 @@ from gtsam_rwhec.export.python_snippet import python_poses
 from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_tree import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
-from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.files.whole_files import write_atomically
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 #: These functions give the text of each file, by its name.
 FILES: dict[str, Callable[[RigFrames], str]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gtsam_rwhec.export.written_poses import number
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 _HEAD = """\
 # Calibrated frames: T_PARENT_CHILD is the pose of the frame CHILD in the frame PARENT, in metres.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from gtsam_rwhec.export.written_poses import number, quaternion_xyzw
-from gtsam_rwhec.rig.calibrated_frames import CalibratedFrame, RigFrames
+from gtsam_rwhec.rig.rig_frames import CalibratedFrame, RigFrames
 
 _HEAD = '''\
 """Calibrated frames as static transforms, one tf2_ros static_transform_publisher each.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gtsam_rwhec.export.written_poses import number, quaternion_xyzw
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 _HEAD = """\
 # Calibrated frames in the form of a tf2_msgs/TFMessage: the pose of child_frame_id in header.frame_id, as metres and a

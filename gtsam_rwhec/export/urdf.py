@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number
-from gtsam_rwhec.rig.calibrated_frames import CalibratedFrame, RigFrames
+from gtsam_rwhec.rig.rig_frames import CalibratedFrame, RigFrames
 
 _XACRO = """\
 <?xml version="1.0"?>

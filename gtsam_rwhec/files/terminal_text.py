@@ -7,6 +7,7 @@ unprintable characters as in Python (``\x1b``), and says how long the text was w
 
 from __future__ import annotations
 
+import re
 import reprlib
 import sys
 
@@ -77,3 +78,14 @@ _CONTAINERS = (dict, list, tuple, set, frozenset)
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 10
 _REPR.maxstring = _REPR.maxother = LONGEST_NAME
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """A sorting key that compares numbers inside names as numbers."""
+    parts = [part for part in re.split(r"(\d+)", name) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts], name
+
+
+def rounded(value: float, digits: int = 2) -> str:
+    """A number with so many digits, and without an exponent from 0.0001 up to a million."""
+    return f"{float(f'{value:.{digits}g}'):g}"

@@ -19,15 +19,15 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 
 from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
-from gtsam_rwhec.files.atomic_write import atomic_stream
 from gtsam_rwhec.files.budgets import Spending
+from gtsam_rwhec.files.whole_files import atomic_stream
 from gtsam_rwhec.fleet.byte_count import count_bytes, counted_bytes
 from gtsam_rwhec.fleet.mcap_copy import McapCopy
 from gtsam_rwhec.fleet.stores import Options, local_path, read_ranges, size_of
 from gtsam_rwhec.fleet.without_secrets import shown
 from gtsam_rwhec.logs.mcap_index import Extra, read_index
 from gtsam_rwhec.logs.mcap_records import FAULTS, RECORD, Descriptions, parsed, records_in
-from gtsam_rwhec.logs.message_kinds import TF_TOPICS, Topic
+from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
 #: Bytes. A file on disk that is smaller is read where it is, whatever is in it.
 SMALL = 64 << 20

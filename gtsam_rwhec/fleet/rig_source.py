@@ -11,13 +11,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from gtsam_rwhec.errors import FileFormatError, RigError, StoreError, UnfinishedRigWarning
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.files.yaml_lines import parse_yaml
 from gtsam_rwhec.fleet.manifest import joined
 from gtsam_rwhec.fleet.stores import read_bytes
 from gtsam_rwhec.fleet.without_secrets import shown
 from gtsam_rwhec.rig import Rig, parse_rig
-from gtsam_rwhec.rig.intrinsics_section import ESTIMATE
+from gtsam_rwhec.rig.sections import ESTIMATE
 
 #: A rig file, or a file that it names, has at most this many bytes.
 MOST_BYTES = 4_000_000

@@ -18,8 +18,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from gtsam_rwhec.errors import FileFormatError, StoreError
-from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.whole_files import checked_path, write_atomically
 from gtsam_rwhec.fleet.byte_count import count_bytes
 from gtsam_rwhec.fleet.extras import imported
 from gtsam_rwhec.fleet.store_requests import requested

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.receipts import below
 from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.fleet.stores import write_once

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.files.terminal_text import rounded, shown
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.watch_events import AlarmEvent, day_text
 from gtsam_rwhec.fleet.watch_words import remarks, verdict
 from gtsam_rwhec.fleet.watching import DAY_NS, RobotChart, Watched

@@ -8,7 +8,7 @@ from .image_folder import write_image_folder as write_image_folder
 from .mcap_reader import Log as Log
 from .mcap_reader import open_log as open_log
 from .mcap_writer import LogWriter as LogWriter
-from .message_kinds import Topic as Topic
+from .records import Topic as Topic
 
 # What its messages are read as.
 from .records import DetectionRecord as DetectionRecord
@@ -19,4 +19,4 @@ from .records import PoseRecord as PoseRecord
 from .records import PoseSeries as PoseSeries
 from .records import Record as Record
 from .ros_bags import convert_ros_bag as convert_ros_bag
-from .transforms import TfBuffer as TfBuffer
+from .tf_buffer import TfBuffer as TfBuffer

@@ -20,11 +20,10 @@ import numpy as np
 
 from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, MessageError
 from gtsam_rwhec.files.budgets import MIB, LogBudget
-from gtsam_rwhec.files.paths import checked_path
-from gtsam_rwhec.logs.decoders import Decoder, decoder_for
+from gtsam_rwhec.files.whole_files import checked_path
+from gtsam_rwhec.logs.foxglove_messages import Decoder, decoder_for
 from gtsam_rwhec.logs.mcap_blocks import Block, McapFile, Messages
-from gtsam_rwhec.logs.message_kinds import Topic
-from gtsam_rwhec.logs.records import Array, PoseRecord, PoseSeries, Record
+from gtsam_rwhec.logs.records import Array, PoseRecord, PoseSeries, Record, Topic
 
 OnBad = Literal["warn", "raise"]
 #: At most this number of messages is decoded together.

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs.checked_poses import LARGEST_M, transforms
-from gtsam_rwhec.logs.records import Array
+from gtsam_rwhec.logs.records import LARGEST_M, Array, transforms
 
 #: What a pose's numbers are: 16 of a matrix, row by row; a position and a quaternion (x, y, z, w or in an order that
 #: the file does not say); a position and three angles, or OpenCV's rotation vector.

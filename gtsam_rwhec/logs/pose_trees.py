@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gtsam_rwhec.errors import FileFormatError, LogError
-from gtsam_rwhec.files.opencv_storage import parse_storage
-from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile
+from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_storage
 from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
 
 _POSITION = ("position", "translation", "t", "tvec", "xyz", "pos", "trans", "translationvector")

@@ -18,8 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.errors import FileFormatError, FrameError
-from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.files.whole_files import read_whole, write_atomically
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.odometry.calibrated import OdometryCalibration

@@ -1,29 +1,29 @@
 # Rig files, read and written.
 # A calibrated rig, for export and for plots.
-from .calibrated_frames import CalibratedFrame as CalibratedFrame
-from .calibrated_frames import CameraLink as CameraLink
-from .calibrated_frames import RigFrames as RigFrames
-from .refined_frames import frames_of_refined as frames_of_refined
+from .rig_frames import CalibratedFrame as CalibratedFrame
+from .rig_frames import CameraLink as CameraLink
+from .rig_frames import RigFrames as RigFrames
+from .rig_frames import frames_of_refined as frames_of_refined
 from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
 from .rig_file import read_rig as read_rig
-from .json_schema import SCHEMA_FILE as SCHEMA_FILE
-from .json_schema import rig_file_schema as rig_file_schema
-from .json_schema import schema_text as schema_text
-from .json_schema import editor_line as editor_line
-from .reference import reference_text as reference_text
-from .unfinished import TodoLine as TodoLine
-from .unfinished import todo_lines as todo_lines
+from .rig_reference import SCHEMA_FILE as SCHEMA_FILE
+from .rig_reference import rig_file_schema as rig_file_schema
+from .rig_reference import schema_text as schema_text
+from .rig_reference import editor_line as editor_line
+from .rig_reference import reference_text as reference_text
+from .rig_file import TodoLine as TodoLine
+from .rig_file import todo_lines as todo_lines
 
 # The sections of a rig file.
-from .intrinsics_section import Intrinsics as Intrinsics
-from .given_section import GivenDirection as GivenDirection
-from .given_section import GivenDistance as GivenDistance
-from .given_section import GivenGround as GivenGround
-from .given_section import GivenSection as GivenSection
-from .odometry_section import OdometryNoiseSection as OdometryNoiseSection
-from .odometry_section import OdometrySensor as OdometrySensor
-from .odometry_section import OdometrySource as OdometrySource
+from .sections import Intrinsics as Intrinsics
+from .odometry_sections import GivenDirection as GivenDirection
+from .odometry_sections import GivenDistance as GivenDistance
+from .odometry_sections import GivenGround as GivenGround
+from .odometry_sections import GivenSection as GivenSection
+from .odometry_sections import OdometryNoiseSection as OdometryNoiseSection
+from .odometry_sections import OdometrySensor as OdometrySensor
+from .odometry_sections import OdometrySource as OdometrySource
 from .sections import Carriers as Carriers
 from .sections import Cleaning as Cleaning
 from .sections import DetectionNoise as DetectionNoise
@@ -37,4 +37,11 @@ from .target_sections import CharucoTarget as CharucoTarget
 from .target_sections import CheckerboardTarget as CheckerboardTarget
 from .target_sections import TagGridTarget as TagGridTarget
 from .target_sections import TagTarget as TagTarget
-from .written_rig import rig_text as rig_text
+from .rig_file import rig_text as rig_text
+
+# The first rig file of a log, or of a folder of images.
+from .folder_contents import is_folder_without_logs as is_folder_without_logs
+from .folder_proposal import propose_folder_rig as propose_folder_rig
+from .log_proposal import propose_rig as propose_rig
+from .rig_file import TEMPLATES as TEMPLATES
+from .rig_file import template_text as template_text

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import re
+import textwrap
 import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -12,12 +17,12 @@ from pydantic_core import ErrorDetails
 
 from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
-from gtsam_rwhec.rig import given_section, intrinsics_section, odometry_section, sections, target_sections
-from gtsam_rwhec.rig.field_types import in_yaml, unit_of
-from gtsam_rwhec.rig.kalibr_targets import with_kalibr_targets
+from gtsam_rwhec.rig import odometry_sections, sections, target_sections
+from gtsam_rwhec.rig.odometry_sections import GivenSection
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
-from gtsam_rwhec.rig.section import keys_of
-from gtsam_rwhec.rig.unfinished import todo_lines
+from gtsam_rwhec.rig.section_types import in_yaml, keys_of, unit_of
+from gtsam_rwhec.rig.sections import ESTIMATE, Intrinsics
+from gtsam_rwhec.rig.target_sections import with_kalibr_targets
 
 #: A message names at most this many faults.
 MOST_FAULTS = 20
@@ -38,16 +43,16 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("carriers",): sections.Carriers,
     ("carriers", "poses"): sections.PoseSource,
     ("carriers", "noise"): sections.PoseNoise,
-    ("sensors", "*", "intrinsics"): intrinsics_section.Intrinsics,
+    ("sensors", "*", "intrinsics"): sections.Intrinsics,
     ("sensors", "*", "link"): sections.Link,
-    ("sensors", "*", "odometry"): odometry_section.OdometrySource,
-    ("sensors", "*", "odometry", "noise"): odometry_section.OdometryNoiseSection,
+    ("sensors", "*", "odometry"): odometry_sections.OdometrySource,
+    ("sensors", "*", "odometry", "noise"): odometry_sections.OdometryNoiseSection,
     ("noise",): sections.DetectionNoise,
     ("cleaning",): sections.Cleaning,
-    ("given",): given_section.GivenSection,
-    ("given", "ground"): given_section.GivenGround,
-    ("given", "directions", "*"): given_section.GivenDirection,
-    ("given", "distances", "*"): given_section.GivenDistance,
+    ("given",): odometry_sections.GivenSection,
+    ("given", "ground"): odometry_sections.GivenGround,
+    ("given", "directions", "*"): odometry_sections.GivenDirection,
+    ("given", "distances", "*"): odometry_sections.GivenDistance,
 }
 #: These words say what to do about a fault, by pydantic's name for its kind.
 _KINDS = {
@@ -211,9 +216,170 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
     if len(path) == 2 and path[0] == "sensors":
         sensor = data["sensors"][path[1]]
         has_odometry = isinstance(sensor, dict) and "odometry" in sensor
-        return odometry_section.OdometrySensor if has_odometry else sections.Sensor
+        return odometry_sections.OdometrySensor if has_odometry else sections.Sensor
     lists = path[:1] == ("given",)
     general = tuple(
         "*" if (i == 1 and path[0] == "sensors") or (i == 2 and lists) else key for i, key in enumerate(path)
     )
     return _SECTIONS.get(general)
+
+
+#: The mark in a comment.
+TODO = "TODO"
+#: A comment with the mark: # begins a comment at the start of a line or after a blank.
+_COMMENT = re.compile(rf"(?:^|\s)#(?P<comment>.*\b{TODO}\b.*)$")
+#: The key of a line.
+_KEY = re.compile(r"\s*(?P<key>[^\s#:][^:]*):(?:\s|$)")
+
+
+@dataclass(frozen=True)
+class TodoLine:
+    """A line that a person must complete; ``str()`` says which, and what is to be done.
+
+    Attributes
+    ----------
+    number : int
+        From 1 on. A comment on lines of its own belongs to the line after it.
+    key : str
+        The line's key; empty where it has none.
+    words : str
+        The comment from the mark on.
+    """
+
+    number: int
+    key: str
+    words: str
+
+    def __str__(self) -> str:
+        return f"line {self.number}{f', {self.key}' if self.key else ''}: {self.words}"
+
+
+def todo_lines(text: str) -> tuple[TodoLine, ...]:
+    """The lines of a rig file's text that are marked TODO. Comments at its head are about the whole file."""
+    found = []
+    waiting: list[str] = []
+    is_head = True
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = line.strip()
+        if bare.startswith("#"):
+            words = bare.lstrip("# ")
+            if not is_head and (waiting or TODO in words.split()):
+                waiting.append(words)
+            continue
+        if not bare:
+            continue
+        is_head = False
+        match = _COMMENT.search(line)
+        said = [*waiting, match["comment"]] if match else waiting
+        waiting = []
+        if said:
+            key = _KEY.match(line)
+            words = " ".join(" ".join(said).split())
+            found.append(TodoLine(number, key["key"] if key else "", words[words.index(TODO) :]))
+    return tuple(found)
+
+
+#: Every YAML reader reads these strings as strings without quotes.
+_PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)$)[/]?[A-Za-z][A-Za-z0-9_/.]*", re.IGNORECASE)
+#: Comments begin in this column if the text before them is shorter.
+_COLUMN = 30
+#: A line has at most this many characters; longer comments stand on lines of their own.
+_WIDTH = 120
+#: These sections are written key by key, each on its line. All others are written in one line.
+_BLOCKS = ("carriers", "sensors", "targets", "detection", "cleaning", "given")
+#: This section is not written: nothing is given.
+NONE = GivenSection()
+#: Each line gets this comment.
+_REMARKS: dict[KeyPath, str] = {
+    ("carriers",): "the frames that carry the sensors and the targets",
+    ("carriers", "max_gap_s"): "s; between poses further apart in time nothing is interpolated",
+    ("carriers", "noise"): "standard deviations of the carriers' poses",
+    ("targets",): "lengths in metres, as measured on the print",
+    ("sizes",): "of the targets: known, check or estimate",
+    ("noise",): "of the detections: estimate, {rotation_deg, translation_mm} or {corner_px}",
+    ("reference",): "the sensor that carries the others: poses are in its frame",
+    ("given",): "what a person measured",
+    ("cleaning", "max_rotation_deg_s"): "measurements in faster motion are removed; null: none is",
+}
+
+
+def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
+    """The YAML text of a rig file, with comments. `parse_rig` reads it back equal.
+
+    Parameters
+    ----------
+    rig : Rig
+        Its folder is not written: relative paths start from the folder of the new file.
+    remarks : mapping of key path to str, optional
+        Comments that replace the usual ones, by the path of the line: ``("targets", "tag_0")``.
+    """
+    said = {**_REMARKS, **(remarks or {})}
+    lines = []
+    for path, text in _lines(_sections(rig)):
+        remark = said.get(path)
+        if remark is None and path[:1] == ("sensors",) and path[2:] == ("time_offset",):
+            remark = "s: the sensor's stamp t is the carriers' t + offset; or the word estimate"
+        line = f"{text:<{_COLUMN}}  # {remark}" if remark else text
+        if remark and len(line) > _WIDTH:
+            indent = " " * (len(text) - len(text.lstrip()))
+            lines += textwrap.wrap(remark, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+            line = text
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def _sections(rig: RigFile) -> Iterator[tuple[str, Any]]:
+    """The sections by their keys, without what follows from the others."""
+    for name, field in RigFile.model_fields.items():
+        follows = name == "carriers" and rig.reference is not None
+        if not follows and not (name == "targets" and not rig.targets) and not (name == "given" and rig.given == NONE):
+            yield field.alias or name, getattr(rig, name)
+
+
+def _lines(items: Iterable[tuple[str, Any]], path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
+    """Each line with its path. Values that are not given are left out, except in ``cleaning``."""
+    indent = "  " * len(path)
+    for key, value in items:
+        here = (*path, key)
+        if (value is None and path != ("cleaning",)) or (here == ("detection",) and not value):
+            continue
+        if (not path and key in _BLOCKS) or path == ("sensors",):
+            yield here, f"{indent}{key}:"
+            yield from _lines(value.items() if isinstance(value, dict) else value, here)
+        else:
+            yield here, f"{indent}{key}: {_value(value)}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Intrinsics) and value.estimate == "any":
+        return ESTIMATE
+    if isinstance(value, BaseModel):  # in one line, without what is not given
+        return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value if item is not None) + "}"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return _scalar(value)
+
+
+def _scalar(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, float):
+        mantissa, e, exponent = repr(value).partition("e")
+        # With a decimal point: YAML 1.1 takes 1e-05 for text.
+        return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}" if e else mantissa
+    if isinstance(value, str) and not _PLAIN.fullmatch(value):
+        return json.dumps(value, ensure_ascii=False)
+    return str(value)
+
+
+TemplateName = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "odometry"]
+#: Names of the templates.
+TEMPLATES: tuple[TemplateName, ...] = get_args(TemplateName)
+_FOLDER = Path(__file__).with_name("template_files")
+
+
+def template_text(name: TemplateName) -> str:
+    """The text of a template; TODO marks what is different in every cell."""
+    return (_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")

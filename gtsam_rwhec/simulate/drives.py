@@ -11,7 +11,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.simulate.noise import Seed
+from gtsam_rwhec.simulate.simulated_noise import Seed
 
 DriveShape = Literal["3d", "planar", "straight"]
 

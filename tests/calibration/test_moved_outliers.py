@@ -1,17 +1,17 @@
 """Outliers that agree with one another name the frame that moved; others, and the frames beside it, are not named."""
 
 from __future__ import annotations
-
 import numpy as np
 import pytest
-from rwhec_factors.se3 import expmap, inverse
-
+from rwhec_factors.se3 import expmap
+from rwhec_factors.se3 import inverse
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.moved_frames import Measured, moved_with_outliers
+from gtsam_rwhec.calibration.moved_frames import Measured
+from gtsam_rwhec.calibration.moved_frames import moved_with_outliers
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 #: A step of 3 degrees and 2 cm; noise of 0.02 degrees and 0.2 mm; the measurement before which the frame moves.
 STEP = expmap(np.array([[0.03, -0.02, 0.04, 0.012, -0.015, 0.008]]))[0]

@@ -1,15 +1,14 @@
 """The verdict says how carriers turned where that is why poses are not known: one axis, a plane, too little."""
 
 from __future__ import annotations
-
 import numpy as np
 import pytest
-from rwhec_factors.se3 import expmap, inverse
-
+from rwhec_factors.se3 import expmap
+from rwhec_factors.se3 import inverse
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.stages import turning_of
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 COUNT = 24
 NOISE = np.repeat([2e-4, 1e-4], 3)

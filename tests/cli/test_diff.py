@@ -1,19 +1,18 @@
 """``gtsam-rwhec diff``: exit statuses, the verdict first, and names that cannot steer a terminal."""
 
 from __future__ import annotations
-
 from pathlib import Path
-
 import gtsam
 import numpy as np
 import pytest
-from two_logs import calibrated, log_of
+from two_logs import calibrated
+from two_logs import log_of
 from typer.testing import CliRunner
-
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli import diff, verify
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.compare_results import diff
+from gtsam_rwhec.cli.compare_results import verify
+from gtsam_rwhec.cli.failures import ExitStatus
 
 BAD_NAME = "\x1b[31mleft<script>"
 

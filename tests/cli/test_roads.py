@@ -1,24 +1,27 @@
 """What a subcommand passes over it refuses: every option, on every way that the subcommand can go."""
 
 from __future__ import annotations
-
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
-
+from typing import Any
+from typing import get_args
 import pytest
 import typer
-from places import CELL, DEMO
+from places import CELL
+from places import DEMO
 from typer.testing import CliRunner
-
-from gtsam_rwhec.calibration.calibrate_options import NoiseChoice, RobustChoice
-from gtsam_rwhec.cli import calibrate, convert, options
+from gtsam_rwhec.calibration.calibrate_options import NoiseChoice
+from gtsam_rwhec.calibration.calibrate_options import RobustChoice
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.cli.roads import command_of
 from gtsam_rwhec.logs.image_folder import Columns
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.solver import solve_options as solver_options
+from gtsam_rwhec.cli import calibrate_command
+from gtsam_rwhec.cli import shared_options
+from gtsam_rwhec.cli.convert_command import convert
+from gtsam_rwhec.cli.shared_options import command_of
 
 COMMANDS: Mapping[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 LOG = ("calibrate", CELL / "robot_cell.mcap", "--rig", CELL / "rig.yaml", "-o", "out")
@@ -44,12 +47,12 @@ VALUES = {
 
 # What is typed, what the way refuses, and what it takes.
 ROADS = {
-    "log": (LOG, calibrate.NOT_FOR_A_LOG, calibrate.OF_LOG),
-    "folder": (FOLDER, calibrate.NOT_WITH_ALL, calibrate.OF_FOLDER | calibrate.OF_CHOICES),
+    "log": (LOG, calibrate_command.NOT_FOR_A_LOG, calibrate_command.OF_LOG),
+    "folder": (FOLDER, calibrate_command.NOT_WITH_ALL, calibrate_command.OF_FOLDER | calibrate_command.OF_CHOICES),
     "certified": (
         (*FOLDER, "--certified-only"),
-        calibrate.NOT_CERTIFIED_ONLY,
-        calibrate.OF_FOLDER | calibrate.OF_SOLVE,
+        calibrate_command.NOT_CERTIFIED_ONLY,
+        calibrate_command.OF_FOLDER | calibrate_command.OF_SOLVE,
     ),
     "bag": (BAG, convert.NOT_FOR_A_BAG, {"source", "output", "poses", "rig"}),
     "described": ((*BAG, "--rig", "rig.yaml"), convert.NOT_WITH_A_RIG, {"source", "output", "rig"}),
@@ -99,10 +102,10 @@ def test_every_option_is_either_taken_or_refused(road: str) -> None:
 
 def test_choices_are_those_of_the_library() -> None:
     """The command writes them again, so that its help need not import the library."""
-    assert set(get_args(options.Scale)) == set(get_args(ScaleMode))
-    assert set(get_args(calibrate.Method)) == set(get_args(solver_options.Method))
-    assert set(get_args(calibrate.Noise)) == set(get_args(NoiseChoice))
-    assert set(get_args(calibrate.Robust)) == set(get_args(RobustChoice))
+    assert set(get_args(shared_options.Scale)) == set(get_args(ScaleMode))
+    assert set(get_args(calibrate_command.Method)) == set(get_args(solver_options.Method))
+    assert set(get_args(calibrate_command.Noise)) == set(get_args(NoiseChoice))
+    assert set(get_args(calibrate_command.Robust)) == set(get_args(RobustChoice))
     assert set(get_args(convert.Columns)) == set(get_args(Columns))
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.datasets.download import UTIAS_URL, fetch_utias, utias_files
+from gtsam_rwhec.datasets import UTIAS_URL, fetch_utias, utias_files
 from gtsam_rwhec.errors import FetchError
 
 

@@ -12,7 +12,7 @@ import pytest
 from places import REPOSITORY
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.atomic_write import atomic_stream, write_atomically
+from gtsam_rwhec.files.whole_files import atomic_stream, write_atomically
 
 
 def test_writes_and_replaces_with_ordinary_permissions(tmp_path: Path) -> None:
@@ -74,4 +74,4 @@ def test_nothing_else_in_the_package_writes_files() -> None:
         for path in (REPOSITORY / package).rglob("*.py")
         if writing.search(path.read_text(encoding="utf-8"))
     }
-    assert found == {"gtsam_rwhec/files/atomic_write.py"}
+    assert found == {"gtsam_rwhec/files/whole_files.py"}

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.opencv_storage import parse_storage
+from gtsam_rwhec.files.yaml_lines import parse_storage
 
 
 def written(path: Path) -> str:

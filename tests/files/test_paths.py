@@ -8,7 +8,7 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.whole_files import checked_path
 
 
 def test_a_path() -> None:

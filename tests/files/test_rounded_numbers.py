@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.files.terminal_text import rounded
 
 
 @pytest.mark.parametrize(

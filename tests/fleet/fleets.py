@@ -20,7 +20,7 @@ from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs.written_schemas import json_schema
+from gtsam_rwhec.logs.mcap_writer import json_schema
 
 #: 2026-11-01 02:00 UTC; each log is a night later.
 BEGIN_NS = 1_793_498_400_000_000_000

@@ -16,7 +16,7 @@ from mutations import numbers_in_bytes
 from seed_messages import ROS2, encoded
 
 from gtsam_rwhec.files.budgets import Spending
-from gtsam_rwhec.logs import ros2_schemas
+from gtsam_rwhec.logs.ros2_messages import ros2_decoder
 
 NAMES = sorted(ROS2)
 DEFINITIONS = [definition(name) for name in NAMES]
@@ -38,7 +38,7 @@ def read(data: bytes) -> None:
         own, _, rest = rest.partition(b"\0")
         text = own.decode(errors="replace")
     take = Spending(Path("a.mcap"), len(data)).take_parts
-    decode = ros2_schemas.decoder(NAMES[number % len(NAMES)], text, take)
+    decode = ros2_decoder(NAMES[number % len(NAMES)], text, take)
     length = len(rest) // count
     messages = [memoryview(rest)[i * length : (i + 1) * length] for i in range(count)]
     for each in decode("/topic", messages, list(range(count))):

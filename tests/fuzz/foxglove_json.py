@@ -13,7 +13,7 @@ from mutations import json_tree
 from seed_messages import FOXGLOVE
 
 from gtsam_rwhec.files.budgets import Spending
-from gtsam_rwhec.logs import foxglove_schemas
+from gtsam_rwhec.logs.foxglove_messages import JSON, foxglove_decoder, parse_json
 
 NAMES = sorted(FOXGLOVE)
 
@@ -23,8 +23,8 @@ def read(data: bytes) -> None:
     if not data:
         return
     take = Spending(Path("a.mcap"), len(data)).take_parts
-    parse = partial(foxglove_schemas.parse_json, take=take)
-    decode = foxglove_schemas.decoder(NAMES[data[0] % len(NAMES)], parse, foxglove_schemas.JSON, take)
+    parse = partial(parse_json, take=take)
+    decode = foxglove_decoder(NAMES[data[0] % len(NAMES)], parse, JSON, take)
     messages = data[1:].split(b"\0")
     found = decode("/topic", messages, list(range(len(messages))))
     assert len(found) == len(messages)

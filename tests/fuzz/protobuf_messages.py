@@ -13,7 +13,7 @@ from mutations import numbers_in_bytes
 from seed_messages import protobuf_message
 
 from gtsam_rwhec.files.budgets import Spending
-from gtsam_rwhec.logs import decoders
+from gtsam_rwhec.logs import foxglove_messages as decoders
 
 NAMES = ("foxglove.FrameTransform", "foxglove.FrameTransforms", "foxglove.PoseInFrame", "foxglove.RawImage")
 

@@ -9,7 +9,7 @@ from harness import Harness, scratch
 from mutations import words_and_lines
 from rig_texts import FULL, MINIMAL
 
-from gtsam_rwhec.rig import rig_file, written_rig
+from gtsam_rwhec.rig import rig_file
 
 FOLDER = scratch()
 CELL = Path(__file__).resolve().parents[2] / "data" / "cell"
@@ -20,7 +20,7 @@ def read(data: bytes) -> None:
     path = FOLDER / "rig.yaml"
     path.write_bytes(data)
     rig = rig_file.read_rig(path)
-    again = rig_file.parse_rig(written_rig.rig_text(rig), str(path), FOLDER)
+    again = rig_file.parse_rig(rig_file.rig_text(rig), str(path), FOLDER)
     assert again == rig, "what is written reads back as another rig"
 
 

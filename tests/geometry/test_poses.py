@@ -18,7 +18,7 @@ from gtsam_rwhec.geometry.poses import (
     one_transform,
     rows_to_transforms,
 )
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 TRANSFORMS = random_poses(5, 2.0, np.random.default_rng(1))
 

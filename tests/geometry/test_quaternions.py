@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations, right, to_rotations
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 
 def product(q: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -19,15 +19,8 @@ from strategies import changed_trees, damaged
 
 from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.budgets import Spending
-from gtsam_rwhec.logs import (
-    DetectionRecord,
-    IntrinsicsRecord,
-    LogWriter,
-    PairRecord,
-    PoseRecord,
-    foxglove_schemas,
-    open_log,
-)
+from gtsam_rwhec.logs import DetectionRecord, IntrinsicsRecord, LogWriter, PairRecord, PoseRecord, open_log
+from gtsam_rwhec.logs.foxglove_messages import JSON, foxglove_decoder, parse_json
 
 T0 = 1_700_000_000_000_000_001
 T = se3.expmap(np.random.default_rng(0).normal(size=(4, 6)))
@@ -107,9 +100,7 @@ def test_any_message_gives_records_or_a_sentence(own_messages: list[tuple[str, b
     schema, message = data.draw(st.sampled_from(own_messages))
     content = data.draw(damaged([message]) | changed_trees(json.loads(message)).map(lambda t: json.dumps(t).encode()))
     take = Spending(Path("a.mcap"), len(content)).take_parts
-    read_one = foxglove_schemas.decoder(
-        schema, partial(foxglove_schemas.parse_json, take=take), foxglove_schemas.JSON, take
-    )
+    read_one = foxglove_decoder(schema, partial(parse_json, take=take), JSON, take)
     (found,) = read_one("/topic", [content], [0])
     assert all(record.topic == "/topic" for record in found) if not isinstance(found, str) else 0 < len(found) < 5000
 

@@ -17,7 +17,7 @@ from strategies import damaged, tables
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files import yaml_lines
 from gtsam_rwhec.logs import pose_trees
-from gtsam_rwhec.logs.pose_files import read_poses
+from gtsam_rwhec.logs.image_folder import read_poses
 from gtsam_rwhec.logs.pose_rows import PoseStatement
 
 RNG = np.random.default_rng(3)

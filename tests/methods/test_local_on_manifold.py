@@ -22,7 +22,7 @@ from gtsam_rwhec.methods.local_on_manifold import (
     standard_deviations,
 )
 from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, sphere
-from gtsam_rwhec.simulate.transforms import random_directions, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import random_directions, random_poses, rotations_of_vectors
 
 X, Y, SCALE = FrameKeys(0, 1), FrameKeys(2, 3), 4
 

@@ -16,7 +16,7 @@ from strategies import damaged, tables
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, NoiseError, UnitsWarning
-from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.problem.csv_folder import CsvWarning, read_pose_rows
 
 GOOD = "1,0,0,0,0.5,-0.25,2e0"

@@ -14,7 +14,7 @@ from rwhec_factors.se3 import inverse, pose
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, MeasurementsNotKeptError, RotationsProjectedWarning, UnitsWarning
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver import Start
 
 GENERATOR = np.random.default_rng(0)

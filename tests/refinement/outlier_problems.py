@@ -9,7 +9,7 @@ from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, Simulation, perturb
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 Pair = tuple[str, str]
 Kind = Literal["random", "structured"]

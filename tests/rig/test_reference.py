@@ -7,8 +7,7 @@ import re
 from places import REPOSITORY
 
 from gtsam_rwhec.rig import reference_text
-from gtsam_rwhec.rig.json_schema import rig_file_schema
-from gtsam_rwhec.rig.reference import target_sections
+from gtsam_rwhec.rig.rig_reference import rig_file_schema, target_sections
 
 
 def test_the_page_is_up_to_date() -> None:

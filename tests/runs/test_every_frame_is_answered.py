@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.cli.exit_status import exit_status
+from gtsam_rwhec.cli.failures import exit_status
 from gtsam_rwhec.simulate import frame_distance
 
 FILES = set(rw.export.FILES)

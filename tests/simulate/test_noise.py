@@ -15,8 +15,7 @@ from scipy.stats import kstest, norm, vonmises
 from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, langevin_rotations, perturb
-from gtsam_rwhec.simulate.noise import Section, released_rotations, released_translations
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import Section, random_poses, released_rotations, released_translations
 
 Draw = Callable[[int, float, int], Array]
 

@@ -14,8 +14,13 @@ from gtsam_rwhec import solve
 from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, Simulation, cameras, sphere
-from gtsam_rwhec.simulate.camera_on_sphere import sphere_trajectory
-from gtsam_rwhec.simulate.fixed_cameras import CAMERA_POSITIONS_IN_I_M, T_BASE_I, fixed_camera_poses, hand_trajectory
+from gtsam_rwhec.simulate.paper_scenes import (
+    CAMERA_POSITIONS_IN_I_M,
+    T_BASE_I,
+    fixed_camera_poses,
+    hand_trajectory,
+    sphere_trajectory,
+)
 
 
 def largest_residual(simulation: Simulation) -> float:

@@ -13,8 +13,7 @@ from scipy.stats import chi2
 from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Motion, Noise, Simulation, carrier_poses, general
-from gtsam_rwhec.simulate.graphs import Edge, bipartite_edges
-from gtsam_rwhec.simulate.motion import MotionKind
+from gtsam_rwhec.simulate.simulated_rigs import Edge, MotionKind, bipartite_edges
 
 Pair = tuple[str, str]
 

@@ -17,7 +17,7 @@ from rwhec_factors.se3 import pose
 from gtsam_rwhec.errors import FrameError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Simulation, frame_distance, general
-from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.simulated_noise import random_poses, rotations_of_vectors
 
 
 @dataclass

@@ -10,7 +10,7 @@ from rwhec_factors.se3 import inverse
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecWarning
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, perturb
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 NOISE = Noise(0.01, 1250.0)  # 1 cm, 0.02 rad
 MOCAP = Noise(0.001, 2e4)  # 1 mm, 0.005 rad

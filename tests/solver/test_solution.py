@@ -13,7 +13,7 @@ from solved_problems import MODES, NOISE, matrices, simulated
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecWarning, WeightsWarning
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 
 @pytest.mark.parametrize("mode", MODES)

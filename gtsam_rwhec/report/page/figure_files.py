@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.report.page.blocks import Chart, Drawing, Page, every
 from gtsam_rwhec.report.page.figures import SvgFigure
 

@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.report.page.blocks import Link, Number, Page, Piece, Words, every
 
 

@@ -20,7 +20,7 @@ from gtsam_rwhec.report.plots.drawing import (
     say,
     shortened,
 )
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

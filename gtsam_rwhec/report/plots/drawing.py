@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

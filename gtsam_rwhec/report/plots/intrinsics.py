@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import fdtrc
 
-from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.plots.coverage import ARROW_SHARE, MEAN_CELLS, cells_of
 from gtsam_rwhec.report.plots.drawing import BLUE, GREY, picture, round_down, say, shortened

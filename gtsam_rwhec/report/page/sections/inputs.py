@@ -13,7 +13,7 @@ from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.report.page.blocks import Block, CopyText, Folded, Paragraph, Section, Table
 from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER
-from gtsam_rwhec.rig.calibrated_frames import RigFrames
+from gtsam_rwhec.rig.rig_frames import RigFrames
 
 #: The kind of each text, before the name of its file.
 KINDS = {"static_tf.launch.py": "ROS 2 launch file", "rig.urdf.xacro": "URDF", "tf.yaml": "YAML", "poses.py": "Python"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS, MARK
 from gtsam_rwhec.report.page.blocks import Block, Paragraph, Table, Words
 from gtsam_rwhec.report.page.shown_result import ShownResult

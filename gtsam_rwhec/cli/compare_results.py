@@ -1,0 +1,170 @@
+"""``gtsam-rwhec diff``: what changed from one calibration to the next."""
+
+from __future__ import annotations
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+import typer
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.failures import check_output
+from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.cli.calibrate_command import is_log
+from gtsam_rwhec.cli.calibrate_command import other_than_csv
+from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.cli.report_command import read_of
+from gtsam_rwhec.cli.shared_options import FOLDER_OF_CSV
+from gtsam_rwhec.cli.shared_options import RigOption
+from gtsam_rwhec.cli.shared_options import SensorsOption
+from gtsam_rwhec.cli.shared_options import TargetsOption
+from gtsam_rwhec.cli.shared_options import WorkersOption
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.terminal_text import say
+from gtsam_rwhec.files.terminal_text import shown_path
+
+#: As ``rw.results.LEVEL``, which help must not bring in.
+LEVEL = 0.01
+RESULT_HELP = "result.json, or the folder that calibrate wrote."
+LevelOption = Annotated[
+    float, typer.Option(help="How often it may say that something changed where nothing did: 0.01 is once in 100.")
+]
+
+
+PageOption = Annotated[
+    Path | None, typer.Option("--output", "-o", help="An HTML file for the same as a page, which needs no network.")
+]
+
+
+def write_page_to(
+    found: rw.results.Difference | rw.results.Verification, output: Path | None, compared: tuple[Path, Path]
+) -> None:
+    """Write the page, if one is asked for, and say so."""
+    if output is not None:
+        rw.report.write_changes(found, output, compared)
+        say(f"Written to {shown_path(output)}.", to_errors=True)
+
+
+def diff(
+    old: Annotated[Path, typer.Argument(help=f"The old calibration: {RESULT_HELP}")],
+    new: Annotated[Path, typer.Argument(help=f"The new calibration: {RESULT_HELP}")],
+    level: LevelOption = LEVEL,
+    frame: Annotated[
+        list[str] | None,
+        typer.Option(help="Test only this frame, most sharply; repeat the option for several.", show_default="all"),
+    ] = None,
+    clocks_may_change: Annotated[
+        bool, typer.Option("--clocks-may-change", help="Do not test the time offsets of sensors.")
+    ] = False,
+    other_arm: Annotated[
+        bool, typer.Option("--other-arm", help="The carriers' poses of NEW come from another arm or tracker.")
+    ] = False,
+    output: PageOption = None,
+) -> ExitStatus:
+    """What moved from an old calibration to a new one, and whether by more than chance; exit status 1 if so."""
+    check_output(output, *(file for each in (old, new) for file in read_of(each)))
+    found = rw.results.difference(
+        rw.results.read_calibration(old),
+        rw.results.read_calibration(new),
+        level=level,
+        frames=frame or (),
+        clocks_may_change=clocks_may_change,
+        same_arm=not other_arm,
+        same_measurements=have_same_inputs(old, new),
+    )
+    rw.report.print_difference(found)
+    write_page_to(found, output, (old, new))
+    if found.test is None and not found.is_same:
+        return ExitStatus.BAD_INPUT
+    return ExitStatus.CHANGED if found.has_changed else ExitStatus.DONE
+
+
+def have_same_inputs(old: Path, new: Path) -> bool:
+    """Whether the evidence beside two results names input files with the same checksums."""
+    first, second = map(old_checksums, (old, new))
+    return bool(first) and first == second
+
+
+def old_checksums(result: Path) -> set[str]:
+    """Of the input files of a calibration; empty where nothing readable beside its result says them."""
+    evidence = rw.results.evidence_path(rw.results.result_path(result))
+    if not evidence.exists():
+        return set()
+    try:
+        inputs = rw.results.read_evidence(evidence).inputs
+    except FileFormatError:  # of another version: the numbers themselves are compared all the same
+        return set()
+    return set() if inputs is None else {file.sha256 for file in inputs.files}
+
+
+#: The files of a folder by which it is known again; images are not read for it.
+LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".csv")
+#: What is said of a log that the old calibration was made from.
+SAME_LOG = "The old calibration was made from this very log, so that it agrees says nothing: give a log recorded later."
+
+
+def verify(
+    result: Annotated[Path, typer.Argument(help=f"The old calibration: {RESULT_HELP}")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="The new measurements: MCAP log, folder of images or samples as for calibrate, or for a calibration "
+            f"of CSV files a {FOLDER_OF_CSV}."
+        ),
+    ],
+    rig: RigOption = None,
+    level: LevelOption = LEVEL,
+    targets_may_move: Annotated[
+        bool,
+        typer.Option("--targets-may-move", help="Targets may stand elsewhere than before: test the sensors alone."),
+    ] = False,
+    targets: TargetsOption = "tag",
+    sensors: SensorsOption = "cam",
+    workers: WorkersOption = None,
+    output: PageOption = None,
+) -> ExitStatus:
+    """Whether an old calibration still holds on a new log, without calibrating anew: the check before a shift.
+
+    Exit status 0: it holds. 1: it no longer does. 3: nothing contradicts it, but a sensor of it was not seen.
+    """
+    check_output(output, source, *read_of(result), *([] if rig is None else [rig]))
+    old = rw.results.read_calibration(result) if result.suffix.lower() != ".mcap" else None
+    with StageDisplay() as stage:
+        if old is not None and old.log is None:
+            problem = _problem(source, old.solution.scale_mode, targets, sensors)
+            stage("testing the old poses")
+            found = rw.results.verify(old, problem, level=level, targets_may_move=targets_may_move, progress=stage)
+        else:
+            found = rw.runs.verify_log(
+                result,
+                source,
+                None if rig is None else rw.rig.read_rig(rig),
+                level=level,
+                targets_may_move=targets_may_move,
+                workers=workers,
+                progress=stage,
+            )
+    if is_of_old_log(result, source):
+        found = replace(found, remarks=(SAME_LOG, *found.remarks))
+    rw.report.print_verification(found)
+    write_page_to(found, output, (result, source))
+    if not found.holds:
+        return ExitStatus.CHANGED
+    return ExitStatus.NOT_UNIQUE if found.unchecked_sensors else ExitStatus.DONE
+
+
+def is_of_old_log(result: Path, source: Path) -> bool:
+    """Whether all files of the new log are files that the old calibration was made from, by their checksums."""
+    if not (old := old_checksums(result)):
+        return False
+    files = [path for path in source.glob("*") if path.suffix in LOG_SUFFIXES] if source.is_dir() else [source]
+    return bool(files) and {file.sha256 for file in rw.results.input_files(files)} <= old
+
+
+def _problem(source: Path, scale: rw.ScaleMode, targets: str, sensors: str) -> rw.Problem:
+    """The new measurements of a calibration that is of no log."""
+    if is_log(source):
+        raise typer.BadParameter("the old calibration is of CSV files, not of a log: give a folder of CSV files")
+    if rw.logs.is_samples_file(source):
+        return rw.runs.samples_problem(source).problem
+    if (words := other_than_csv(source)) is not None:
+        raise typer.BadParameter(words)
+    return rw.read_csv(source, scale, None, None, targets, sensors)

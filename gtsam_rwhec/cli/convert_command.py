@@ -1,0 +1,99 @@
+"""``gtsam-rwhec convert``: make an MCAP log of the files of other programs."""
+
+from __future__ import annotations
+from pathlib import Path
+from typing import Annotated
+from typing import Literal
+import typer
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.terminal_text import say
+from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.cli.shared_options import McapOption
+from gtsam_rwhec.cli.shared_options import refuse
+
+Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
+
+
+NOT_FOR_A_BAG = {
+    "only for a folder of images with --poses. Add --poses FILE, or leave the option out.": frozenset(
+        {"columns", "parent", "child", "camera"}
+    )
+}
+NOT_WITH_A_RIG = {
+    "not with --rig, whose file states it. Leave one of them out.": frozenset(
+        {"poses", "columns", "parent", "child", "camera"}
+    )
+}
+
+
+def convert(
+    context: typer.Context,
+    source: Annotated[
+        Path,
+        typer.Argument(help="ROS 1 bag, folder of a ROS 2 db3 bag, folder of images, or samples of a hand-eye tool."),
+    ],
+    output: McapOption,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="For folders of images: rig file that names them, their poses and their cameras."),
+    ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="For a folder of images: file of poses. Each line has an image name or a stamp, and seven numbers."
+        ),
+    ] = None,
+    columns: Annotated[Columns, typer.Option(help="With --poses: the order of the seven numbers.")] = (
+        "tx ty tz qx qy qz qw"
+    ),
+    parent: Annotated[str, typer.Option(help="With --poses: the fixed frame, in which the poses are given.")] = "base",
+    child: Annotated[str, typer.Option(help="With --poses: the moving frame, whose poses are given.")] = "hand",
+    camera: Annotated[str, typer.Option(help="With --poses: name of the camera.")] = "camera",
+) -> ExitStatus:
+    """Make an MCAP log of a ROS bag, or of a folder of images and a file of poses."""
+    with StageDisplay() as stage:
+        stage(f"converting {source}")
+        if rig is not None:
+            refuse(context, NOT_WITH_A_RIG)
+            described = rw.rig.read_rig(rig)
+            if rw.runs.is_file_of_samples(source, described):
+                reading = rw.runs.write_samples_log(source, described, output)
+                say(
+                    f"{reading}.\nWritten to {shown_path(output)}.\n"
+                    f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
+                )
+                return ExitStatus.DONE
+            if not rw.runs.is_folder_of_images(source, described):
+                raise LogError(
+                    f"{source}: --rig is for a folder of images with poses beside them, and a rig file with "
+                    "carriers.poses: {frames: [parent, child]}. Leave --rig out for a bag"
+                )
+            images, number = rw.runs.write_folder_log(source, described, output, progress=stage)
+            say(
+                f"Written to {shown_path(output)}: {images} images and {number} poses.\n"
+                f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
+            )
+            return ExitStatus.DONE
+        if poses is not None:
+            images, number = rw.logs.write_image_folder(
+                source, poses, output, columns=columns, parent=parent, child=child, camera=camera
+            )
+            said = f"{images} images and {number} poses"
+        else:
+            refuse(context, NOT_FOR_A_BAG)
+            if rw.logs.is_samples_file(source):
+                raise LogError(
+                    f"{source}: samples of a hand-eye tool become a log with --rig FILE, whose carriers have poses: "
+                    "{frames: [base, hand]}. Without one, gtsam-rwhec calibrate reads them as they are"
+                )
+            if rw.logs.is_image_folder(source):
+                raise LogError(
+                    f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE; or "
+                    "describe the folder in a rig file: --rig FILE"
+                )
+            said = f"{rw.logs.convert_ros_bag(source, output)} messages"
+    say(f"Written to {shown_path(output)}: {said}.\nNext: gtsam-rwhec init {shown_path(output)} -o rig.yaml")
+    return ExitStatus.DONE

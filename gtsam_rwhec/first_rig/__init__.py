@@ -1,5 +1,0 @@
-"""A first rig file, proposed from the content of a log."""
-
-from gtsam_rwhec.files.optional_packages import lazy_names
-
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -1,0 +1,404 @@
+"""Whether the cameras are on the moving frame or beside it: both are solved for, and the residuals compared.
+
+With poses T_base_hand, a camera on the hand that sees targets beside the robot has A = T_hand_base; a camera beside the
+robot that sees targets on the hand has A = T_base_hand. Only one of them explains what the camera saw, where the motion
+is rich enough. Scales are free, because sizes of targets are guesses here.
+
+Poses that are given as T_hand_base look the same as exchanged roles: A is then inverted too. No measurement tells these
+two apart; the frames' names in the log do, or a person.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.calibration.trial_fits import TrialFit, fitted
+from gtsam_rwhec.errors import CameraError, LogError, PoseError, StampError, TransformError
+from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import Log, TfBuffer
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.rig.log_contents import DriverTopic, LogContents
+from gtsam_rwhec.rig.sections import PoseNoise, PoseSource, Sensor
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
+from gtsam_rwhec.cameras.board_turns import choose_turns, turns_about_z
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.detections import Detection
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Tag, Target, family_named
+
+#: A sensor's target counts with at least this number of images.
+LEAST_IMAGES = 6
+#: At most this number of pairs of a sensor and a target, those with the most images, are solved for.
+MOST_PAIRS = 12
+#: The product of the residuals' ratios, rotations and translations, must be at least this: one role fits far better.
+FAR_BETTER = 9.0
+#: And what fits better must explain the rotations to this (rad), and the translations (m).
+EXPLAINED_RAD, EXPLAINED_M = math.radians(3.0), 0.05
+#: Corners have about this standard deviation where nobody has measured it, pixels.
+CORNER_PX = 0.3
+#: Images have stamps this far apart where they have none, nanoseconds.
+STEP_NS = 10**9
+
+Role = Literal["child", "parent"]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A target in one image of a sensor, with the carriers' pose then."""
+
+    sensor: str
+    target: Target
+    detection: Detection
+    T: Array  #: (4, 4), T_parent_child of the poses
+
+
+@dataclass(frozen=True, eq=False)
+class RoleEvidence:
+    """What solving for both roles says.
+
+    Attributes
+    ----------
+    child, parent : TrialFit or None
+        The robust fit if the sensors are on the child of the poses, or on their parent; None without an answer.
+    images : int
+        The number of measurements.
+    """
+
+    child: TrialFit | None
+    parent: TrialFit | None
+    images: int
+
+    @property
+    def role(self) -> Role | None:
+        """Which of the poses' frames carries the sensors; None if the data cannot tell."""
+        if self.child is None or self.parent is None:
+            return None
+        better, worse = sorted((self.child, self.parent), key=_product)
+        explains = better.residual.rotation_rad < EXPLAINED_RAD and _translation_m(better) < EXPLAINED_M
+        tells = explains and _product(worse) > FAR_BETTER * _product(better)
+        return None if not tells else "child" if better is self.child else "parent"
+
+    def explains_far_better(self, other: RoleEvidence) -> bool:
+        """Whether one role explains these measurements, and far better than either does the other's."""
+        if self.role is None:
+            return False
+        fits = [fit for fit in (other.child, other.parent) if fit is not None]
+        mine = min(_product(fit) for fit in (self.child, self.parent) if fit is not None)
+        return all(_product(fit) > FAR_BETTER * mine for fit in fits)
+
+    def is_better_than(self, other: RoleEvidence) -> bool:
+        """Whether the better of both roles has smaller residuals than that of other measurements' roles."""
+        mine, theirs = (
+            min((_product(fit) for fit in (one.child, one.parent) if fit is not None), default=math.inf)
+            for one in (self, other)
+        )
+        return mine < theirs
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """True lengths over guessed ones, by target, as the fit of the role says; empty where the data cannot tell."""
+        fit = {"child": self.child, "parent": self.parent, None: None}[self.role]
+        if fit is None or not isinstance(fit.scale, dict):
+            return {}
+        return {name: 1.0 / scale for name, scale in fit.scale.items() if scale > 0.0}
+
+    def in_words(self, parent: str, child: str) -> str:
+        """The figures of both, in one phrase."""
+        return (
+            f"solved both ways over {self.images} measurements, the median residual is {_figures(self.child)} with the "
+            f"cameras on {child}, and {_figures(self.parent)} with them on {parent}"
+        )
+
+
+def evidence_of_roles(seen: Iterable[Seen]) -> RoleEvidence:
+    """Solve for both roles, with free scales."""
+    tracks: dict[Pair, list[Seen]] = defaultdict(list)
+    for one in seen:
+        if one.detection.rejection is None and np.isfinite(one.T).all():
+            tracks[Pair(one.target.name, one.sensor)].append(one)
+    chosen = sorted((pair for pair in tracks if len(tracks[pair]) >= LEAST_IMAGES), key=lambda p: -len(tracks[p]))
+    chosen = chosen[:MOST_PAIRS]
+    images = sum(len(tracks[pair]) for pair in chosen)
+    fits = []
+    for on_child in (True, False):
+        sample = {pair: _track(tracks[pair], on_child) for pair in chosen}
+        fits.append(fitted(Problem("per_target"), sample) if chosen else None)
+    return RoleEvidence(fits[0], fits[1], images)
+
+
+def _product(fit: TrialFit) -> float:
+    """Of both residuals, the translations in true lengths."""
+    return max(fit.residual.rotation_rad, 1e-6) * max(_translation_m(fit), 1e-9)
+
+
+def _translation_m(fit: TrialFit) -> float:
+    """The residual in true lengths, metres."""
+    return fit.residual.translation_m / abs(fit.one_scale)
+
+
+def _figures(fit: TrialFit | None) -> str:
+    if fit is None:
+        return "none, for want of an answer,"
+    mm = 1e3 * _translation_m(fit)
+    return f"{rounded(math.degrees(fit.residual.rotation_rad), 2)} deg and {rounded(mm, 2)} mm"
+
+
+def _track(seen: Sequence[Seen], on_child: bool) -> tuple[Array, Array]:
+    """A = T_sensorcarrier_targetcarrier and B = T_sensor_target, of its candidates and turns the one that fits A."""
+    poses = np.array([one.T for one in seen])
+    A = se3.inverse(poses) if on_child else poses
+    T, squared, covariance = (
+        np.array([getattr(one.detection, name) for one in seen]) for name in ("T", "squared_px", "covariance")
+    )
+    board = seen[0].target
+    if isinstance(board, (Checkerboard, CircleGrid)) and board.ways > 1:
+        which = choose_turns(T, covariance, squared, CORNER_PX, A, board.ways).which
+        T = T.copy()
+        T[..., :3, :3] = np.nan_to_num(T[..., :3, :3], nan=0.0) @ turns_about_z(board.ways)[which][:, None]
+    stamps = STEP_NS * np.arange(1, len(seen) + 1)
+    best = choose_over_time(stamps, T, squared, covariance, CORNER_PX, A).which
+    return A, T[np.arange(len(T)), best]
+
+
+#: Seconds. Between poses further apart in time nothing is interpolated.
+MAX_GAP_S = 0.5
+#: A driver's poses have this covariance where nobody states it: 0.6 degrees and 10 mm.
+OF_DRIVER = 1e-4 * np.eye(6)
+
+
+@dataclass(frozen=True, eq=False)
+class LogEvidence:
+    """What a log says about its carriers.
+
+    Attributes
+    ----------
+    roles : RoleEvidence
+        What solving with the cameras on either frame says.
+    rest : dict of str to Rest
+        By topic of images, whether they were taken at rest; empty where the poses do not tell.
+    origin : Origin
+        Where the poses come from.
+    """
+
+    roles: RoleEvidence
+    rest: dict[str, Rest]
+    origin: Origin
+
+
+def evidence_of_log(
+    log: Log, contents: LogContents, source: PoseSource, sensors: Mapping[str, Sensor], targets: list[Target]
+) -> LogEvidence:
+    """Solve for roles, and look at the path, of the poses that `source` names."""
+    parent, child = source.parent_and_child
+    path = _path(log, contents, source)
+    schema = next((topic.schema for topic in contents.topics if topic.name == source.topic), "")
+    origin = origin_of([source.topic or "", parent, child], schema, path)
+    if path is None:
+        return LogEvidence(evidence_of_roles([]), {}, origin)
+    rest = {
+        topic.topic: rest_of(np.unique(np.array(topic.stamps_ns, dtype=np.int64)), path)
+        for topic in contents.images.values()
+        if len(topic.stamps_ns) > 1
+    }
+    return LogEvidence(evidence_of_roles(_seen(contents, path, sensors, targets)), rest, origin)
+
+
+def _path(log: Log, contents: LogContents, source: PoseSource) -> Trajectory | None:
+    """T_parent_child over time; None where the log's poses do not give it."""
+    parent, child = source.parent_and_child
+    try:
+        if source.topic is not None:
+            series = log.poses(source.topic)
+            last = np.append(np.diff(series.stamps_ns) != 0, True)
+            return Trajectory.of(series.stamps_ns[last], series.T[last], f"topic {source.topic}")
+        buffer = TfBuffer(log.records([t.name for t in contents.topics if t.is_tf and not t.unreadable]))
+        stamps = buffer.stamps(parent, child)
+        T, gap_s = buffer.at(parent, child, stamps)
+        known = np.isfinite(gap_s)
+        return Trajectory.of(stamps[known], T[known], f"tf {parent} to {child}")
+    except (LogError, TransformError, StampError, PoseError):
+        return None  # calibration says what is wrong with them
+
+
+def _seen(
+    contents: LogContents, path: Trajectory, sensors: Mapping[str, Sensor], targets: list[Target]
+) -> Iterator[Seen]:
+    by_name = {target.name: target for target in targets}
+    for name, sensor in sensors.items():
+        if sensor.images is not None:
+            topic = contents.images[sensor.images]
+            camera = _camera(contents, sensor)
+            if camera is None or not topic.pictures:
+                continue
+            found = Detector(camera, targets)(topic.pictures)
+            at = path.at(np.array(topic.places, dtype=np.int64))
+            for T, gap_s, of_image in zip(*at, found, strict=True):
+                if gap_s < MAX_GAP_S:
+                    yield from (Seen(name, by_name[d.target], d, T) for d in of_image.detections)
+        elif sensor.detections is not None:
+            yield from _of_driver(name, contents.drivers[sensor.detections], path, targets)
+
+
+def _of_driver(sensor: str, driver: DriverTopic, path: Trajectory, targets: list[Target]) -> Iterator[Seen]:
+    tags = {(target.family, target.id): target for target in targets if isinstance(target, Tag)}
+    for record in driver.kept:
+        target = tags.get((family_named(record.family) or "tag36h11", int(record.id)))
+        if target is None or record.T_camera_tag is None:
+            continue
+        T, gap_s = path.at(np.array([record.stamp_ns]))
+        if gap_s[0] < MAX_GAP_S:
+            poses = np.stack([record.T_camera_tag, np.full((4, 4), np.nan)])
+            detection = Detection(
+                target.name, np.zeros((4, 2)), np.arange(4), poses, np.array([0.0, np.nan]), np.zeros(2),
+                np.stack([OF_DRIVER, OF_DRIVER]), np.nan, np.nan,
+            )  # fmt: skip
+            yield Seen(sensor, target, detection, T[0])
+
+
+def _camera(contents: LogContents, sensor: Sensor) -> Camera | None:
+    """The camera of the topic of intrinsics; None without one."""
+    record = contents.cameras.get((sensor.intrinsics and sensor.intrinsics.topic) or "")
+    if record is None:
+        return None
+    try:
+        return Camera.of(record.width, record.height, record.model, record.K, record.D, f"topic {record.topic}")
+    except CameraError:
+        return None
+
+
+#: An arm's repeatability is ten times smaller; its absolute errors are of this size.
+ARM = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
+#: Motion capture with markers 20 cm apart.
+MOTION_CAPTURE = PoseNoise(rotation_deg=0.1, translation_mm=0.5)
+#: Visual or visual-inertial odometry over a room; it drifts besides.
+ODOMETRY = PoseNoise(rotation_deg=0.3, translation_mm=5.0)
+#: Words in names of frames and topics, by where poses come from; the first that fits counts.
+WORDS: tuple[tuple[str, PoseNoise, frozenset[str]], ...] = (
+    ("motion capture", MOTION_CAPTURE, frozenset({
+        "vicon", "optitrack", "mocap", "qualisys", "natnet", "phasespace", "vrpn", "motive", "rigidbody", "lighthouse",
+    })),
+    ("visual-inertial odometry or SLAM", ODOMETRY, frozenset({
+        "vio", "odom", "odometry", "slam", "vins", "orb", "msckf", "openvins", "rovio", "basalt", "kimera", "svo",
+        "map", "t265", "visual",
+    })),
+    ("a robot's arm", ARM, frozenset({
+        "hand", "tool0", "tool", "flange", "tcp", "ee", "eef", "gripper", "wrist", "link", "wrist3", "link6", "link7",
+        "link8", "endeffector", "arm", "robot", "panda", "ur5", "ur10", "ur5e", "ur10e", "iiwa", "kuka", "abb", "fanuc",
+    })),
+)  # fmt: skip
+#: Differences over this many poses see noise, and hardly motion: the third difference of white noise of standard
+#: deviation s has standard deviation sqrt(20) s (1 + 9 + 9 + 1).
+THIRD_DIFFERENCE = np.sqrt(20.0)
+#: A path says how smooth it is with at least this number of poses, at this rate.
+LEAST_POSES, LEAST_HZ = 50, 15.0
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where poses come from, as a guess.
+
+    Attributes
+    ----------
+    noise : PoseNoise or None
+        A guess of their noise; None where nothing says what they come from.
+    words : str
+        The guess with its reasons.
+    """
+
+    noise: PoseNoise | None
+    words: str
+
+
+def origin_of(names: Iterable[str], schema: str = "", path: Trajectory | None = None) -> Origin:
+    """Guess where poses come from.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Frames and topics; files and folders.
+    schema : str
+        The messages' schema, if they are of a log.
+    path : Trajectory, optional
+        The poses.
+    """
+    names = [name for name in names if name]
+    seen = f"; {of_path}" if (of_path := _path_words(path)) else ""
+    if "odometry" in schema.lower():
+        return Origin(ODOMETRY, f"visual-inertial odometry or SLAM, by the messages' type {schema}{seen}")
+    for what, noise, words in WORDS:
+        for name in names:
+            hits = words & set(re.split(r"[^a-z0-9]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower()))
+            if hits:
+                return Origin(noise, f"{what}, by the name {name}{seen}")
+    return Origin(None, f"no name tells where the poses come from{seen}")
+
+
+def smoothness_m(path: Trajectory) -> float:
+    """The white noise that positions have at most, metres: that of third differences, which see little motion."""
+    third = np.diff(path.T[:, :3, 3], n=3, axis=0)
+    return float(np.median(np.abs(third)) / 0.6745 / THIRD_DIFFERENCE)
+
+
+def _path_words(path: Trajectory | None) -> str:
+    """The path's rate, and its smoothness where the rate lets it be seen."""
+    if path is None or len(path.stamps_ns) < LEAST_POSES:
+        return ""
+    rate_hz = 1e9 / float(np.median(np.diff(path.stamps_ns)))
+    said = f"{rounded(rate_hz, 2)} poses a second"
+    moving = np.linalg.norm(np.diff(path.T[:, :3, 3], axis=0), axis=1).max() > 0.0
+    if rate_hz < LEAST_HZ or not moving:
+        return said
+    return f"{said}, smooth to {rounded(1e3 * smoothness_m(path), 2)} mm"
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Whether images were taken at rest, with the reason."""
+
+    at_rest: bool
+    words: str
+
+
+#: Metres a second and radians a second: a carrier that is slower than both stands still.
+REST_M_S, REST_RAD_S = 0.003, np.radians(0.5)
+#: Nanoseconds on each side of an image's stamp, over which speeds are measured.
+SIDE_NS = 50_000_000
+#: Poses that are further apart than this (s), and at the images' stamps to this (ns), are those of stations.
+STATIONS_S, SAME_NS = 0.5, 10_000_000
+#: At most this number of images are compared with all poses.
+MOST_COMPARED = 200
+#: This share of the images must be at rest, or in motion, for all of them to count as such.
+MOST = 0.8
+
+
+def rest_of(image_ns: np.ndarray, path: Trajectory) -> Rest:
+    """Whether the carrier stood still at the images' stamps (n,).
+
+    Poses that are at the images' stamps only, seconds apart, are those of stations: stop and shoot.
+    """
+    inside = image_ns[(image_ns - SIDE_NS >= path.stamps_ns[0]) & (image_ns + SIDE_NS <= path.stamps_ns[-1])]
+    apart_s = 1e-9 * float(np.median(np.diff(path.stamps_ns))) if len(path.stamps_ns) > 1 else np.inf
+    nearest = np.abs(path.stamps_ns[:, None] - image_ns[:MOST_COMPARED]).min(axis=0)
+    if apart_s > STATIONS_S and np.median(nearest) < SAME_NS:
+        return Rest(True, f"poses are {rounded(apart_s, 2)} s apart: the robot stopped for each image")
+    if not len(inside):
+        return Rest(False, "no image is within the poses' time")
+    before, after = path.at(inside - SIDE_NS)[0], path.at(inside + SIDE_NS)[0]
+    step = se3.inverse(before) @ after
+    seconds = 2e-9 * SIDE_NS
+    slow = np.linalg.norm(step[:, :3, 3], axis=1) / seconds < REST_M_S
+    slow &= np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1) / seconds < REST_RAD_S
+    share = float(slow.mean())
+    said = f"the carrier stood still at {int(slow.sum())} of {len(slow)} images"
+    return Rest(share >= MOST, said)

@@ -1,0 +1,241 @@
+"""The content of a folder for a rig file: folders of images, poses beside them, and files of intrinsics.
+
+What a file is, is found out by reading it: a file of poses is one whose poses fit the images, a file of intrinsics one
+that has a camera of the images' size.
+"""
+
+from __future__ import annotations
+import math
+import os
+import warnings
+from collections.abc import Iterable
+from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import numpy as np
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_files import read_cameras
+from gtsam_rwhec.detect.images import Gray
+from gtsam_rwhec.detect.images import decode_gray
+from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import ImageRecord
+from gtsam_rwhec.logs.image_folder import FORMATS
+from gtsam_rwhec.logs.image_folder import LARGEST_IMAGE
+from gtsam_rwhec.logs.pose_rows import NamedPoses
+from gtsam_rwhec.logs.pose_rows import PoseStatement
+from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.logs.image_folder import TABLES
+from gtsam_rwhec.logs.image_folder import TREES
+from gtsam_rwhec.logs.image_folder import image_stamps
+from gtsam_rwhec.logs.image_folder import match
+from gtsam_rwhec.logs.image_folder import pose_stamps
+from gtsam_rwhec.logs.image_folder import read_poses
+
+#: Folders are looked at to this depth.
+DEPTH = 4
+#: A folder of images has at least this number.
+LEAST_IMAGES = 2
+#: Files of intrinsics have these endings.
+INTRINSICS = (".yaml", ".yml", ".xml", ".json", ".txt")
+#: At most this number of files in a folder are tried as poses, and as intrinsics: others are of single images.
+MOST_TRIED = 12
+#: What files may not say, in the order in which it is tried.
+STATEMENTS = (
+    PoseStatement(),
+    PoseStatement(length="mm"),
+    PoseStatement(euler="ZYX", angles="degrees"),
+    PoseStatement(euler="ZYX", angles="degrees", length="mm"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FolderPoses:
+    """The poses for a folder of images.
+
+    Attributes
+    ----------
+    path : str
+        From the folder that was looked at.
+    stated : PoseStatement
+        What the file does not say, and reading needs: a guess.
+    T : (n, 4, 4) array
+        The pose of each image; nan where there is none.
+    stamps_ns : (n,) integers or None
+        The images' stamps, if their names are stamps.
+    all : NamedPoses
+        All poses of the file.
+    """
+
+    path: str
+    stated: PoseStatement
+    T: Array
+    stamps_ns: np.ndarray | None
+    all: NamedPoses
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFolder:
+    """A folder of images: one camera's.
+
+    Attributes
+    ----------
+    path : str
+        From the folder that was looked at; ``.`` for itself.
+    files : tuple of Path
+        In natural order.
+    size : (int, int)
+        Width and height, pixels, of the first image that can be read.
+    poses : FolderPoses or None
+    intrinsics : str
+        The file of intrinsics, from the folder that was looked at; empty if there is none.
+    camera_name : str
+        The camera's name in that file; empty where it has one alone.
+    camera : Camera or None
+        Its intrinsics.
+    """
+
+    path: str
+    files: tuple[Path, ...]
+    size: tuple[int, int]
+    poses: FolderPoses | None
+    intrinsics: str
+    camera_name: str
+    camera: Camera | None
+
+
+def is_folder_without_logs(path: Path) -> bool:
+    """Whether a path is a folder with neither logs nor files of bags in it."""
+    return path.is_dir() and not any(file.suffix.lower() in (".mcap", ".db3", ".bag") for file in path.iterdir())
+
+
+def read_folder(folder: Path) -> list[ImageFolder]:
+    """The folders of images in a folder, with their poses and intrinsics, in natural order."""
+    found = []
+    places = sorted(_image_folders(folder), key=lambda place: natural_key(str(place)))
+    for place in places:
+        files = sorted(_files(place, FORMATS), key=lambda file: natural_key(file.name))
+        size = next((gray.shape[::-1] for file in files[:5] if (gray := read_gray(file)) is not None), None)
+        if size is None:
+            continue
+        width, height = int(size[0]), int(size[1])
+        intrinsics, name, camera = _intrinsics(folder, place, (width, height), places)
+        poses = _poses(folder, place, files, places)
+        found.append(
+            ImageFolder(_inside(folder, place), tuple(files), (width, height), poses, intrinsics, name, camera)
+        )
+    return found
+
+
+def read_gray(file: Path) -> Gray | None:
+    """The pixels of an image; None if it cannot be read."""
+    try:
+        data = read_whole(file, LARGEST_IMAGE, "An image was")
+        return decode_gray(ImageRecord(0, 0, "", "", FORMATS[file.suffix.lower()], data, None, None, None))
+    except (FileFormatError, ImageError):
+        return None
+
+
+def _image_folders(folder: Path) -> Iterator[Path]:
+    for place, below, names in os.walk(folder):
+        depth = len(Path(place).relative_to(folder).parts)
+        below[:] = [] if depth >= DEPTH else [name for name in below if not name.startswith(".")]
+        images = [name for name in names if Path(name).suffix.lower() in FORMATS]
+        if len(images) >= LEAST_IMAGES and "depth" not in Path(place).name.lower():
+            yield Path(place)
+
+
+def _files(place: Path, endings: Iterable[str]) -> list[Path]:
+    wanted = tuple(endings)
+    return [file for file in place.iterdir() if file.suffix.lower() in wanted and file.is_file()]
+
+
+def _inside(folder: Path, path: Path) -> str:
+    return path.relative_to(folder).as_posix()
+
+
+def _around(folder: Path, place: Path, image_folders: Iterable[Path]) -> Iterator[Path]:
+    """Folders for a folder of images, the nearest first: itself, those above it, and those beside them."""
+    with_images = set(image_folders)
+    yield place
+    while place != folder:
+        place = place.parent
+        yield place
+        beside = sorted((d for d in place.iterdir() if d.is_dir()), key=lambda d: natural_key(d.name))
+        # Folders beside, of another camera's poses too: what fits best counts.
+        yield from (d for d in beside if d not in with_images and not d.name.startswith("."))
+
+
+def _poses(folder: Path, place: Path, files: list[Path], image_folders: Iterable[Path]) -> FolderPoses | None:
+    """The poses that fit most of the images; of equals, those in the nearest place."""
+    best: tuple[int, FolderPoses] | None = None
+    for near in _around(folder, place, image_folders):
+        there = sorted(_files(near, (*TREES, *TABLES)), key=lambda file: natural_key(file.name))
+        candidates = [near] if len(there) >= LEAST_IMAGES and near != folder else []
+        if len(there) <= MOST_TRIED:
+            candidates += there
+        for candidate in candidates:
+            fitting = _fitting(folder, files, candidate)
+            if fitting is None:
+                continue
+            number = int(np.isfinite(fitting.T[:, 0, 0]).sum())
+            if best is None or number > best[0]:
+                best = number, fitting
+        if best is not None and best[0] >= 0.8 * len(files):
+            break  # what is further away belongs to another camera
+    return None if best is None else best[1]
+
+
+def _fitting(folder: Path, files: list[Path], path: Path) -> FolderPoses | None:
+    """The poses of a file or a folder if they fit the images, read as the first statement that reads them."""
+    found = (poses_read(folder, files, path, stated) for stated in STATEMENTS)
+    return next((poses for poses in found if poses is not None), None)
+
+
+def poses_read(folder: Path, files: Sequence[Path], path: Path, stated: PoseStatement) -> FolderPoses | None:
+    """The poses of a file or a folder for the images, read as stated; None if they cannot be, or fit no images."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what is left over: calibration says it
+            poses = read_poses(path, stated)
+            T = np.full((len(files), 4, 4), math.nan)
+            stamps, of_poses = image_stamps(files), pose_stamps(poses)
+            if stamps is not None and of_poses is not None:
+                order = np.argsort(of_poses)
+                at, wanted = np.array(of_poses)[order], np.array(stamps)
+                near = np.clip(np.searchsorted(at, wanted), 1, len(at) - 1)
+                near -= wanted - at[near - 1] < at[near] - wanted
+                inside = (wanted >= at[0]) & (wanted <= at[-1])
+                T[inside] = poses.T[order][near[inside]]
+                return FolderPoses(_inside(folder, path), stated, T, wanted, poses) if inside.any() else None
+            matched = match(files, poses, str(path))
+            T[list(matched.images)] = poses.T[list(matched.poses)]
+            return FolderPoses(_inside(folder, path), stated, T, None, poses)
+    except (LogError, FileFormatError):
+        return None  # no file of poses, or one that needs another statement
+
+
+def _intrinsics(
+    folder: Path, place: Path, size: tuple[int, int], image_folders: Iterable[Path]
+) -> tuple[str, str, Camera | None]:
+    """The nearest file with a camera of this size: its path, the camera's name in it, and the camera."""
+    words = set(place.relative_to(folder).parts)
+    for near in _around(folder, place, image_folders):
+        there = sorted(_files(near, INTRINSICS), key=lambda file: natural_key(file.name))
+        # A file that has the name of the camera's folder goes first.
+        there.sort(key=lambda file: not any(word in file.stem for word in words))
+        for file in there[:MOST_TRIED]:
+            try:
+                cameras = read_cameras(file, size)
+            except (FileFormatError, CameraError):
+                continue
+            fitting = {name: camera for name, camera in cameras.items() if (camera.width, camera.height) == size}
+            if fitting:
+                name = next((name for name in fitting if name in words), next(iter(fitting)))
+                return _inside(folder, file), name, fitting[name]
+    return "", "", None

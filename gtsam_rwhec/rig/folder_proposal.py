@@ -1,0 +1,331 @@
+"""A first rig file, proposed from the content of a folder of images; TODO marks the values that a person must state."""
+
+from __future__ import annotations
+from collections.abc import Sequence
+from pathlib import Path
+import numpy as np
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.rig.sections import Carriers
+from gtsam_rwhec.rig.sections import PoseSource
+from gtsam_rwhec.rig.sections import Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget
+from gtsam_rwhec.rig.target_sections import TargetSection
+from collections.abc import Iterator
+from dataclasses import dataclass
+from dataclasses import replace
+from gtsam_rwhec.logs.image_folder import pose_stamps
+from gtsam_rwhec.logs.pose_rows import PoseStatement
+from gtsam_rwhec.rig.carrier_roles import Rest
+from gtsam_rwhec.rig.carrier_roles import RoleEvidence
+from gtsam_rwhec.rig.carrier_roles import Seen
+from gtsam_rwhec.rig.carrier_roles import evidence_of_roles
+from gtsam_rwhec.rig.carrier_roles import origin_of
+from gtsam_rwhec.rig.carrier_roles import rest_of
+from gtsam_rwhec.rig.folder_contents import FolderPoses
+from gtsam_rwhec.rig.folder_contents import ImageFolder
+from gtsam_rwhec.rig.folder_contents import poses_read
+from gtsam_rwhec.rig.folder_contents import read_folder
+from gtsam_rwhec.rig.folder_contents import read_gray
+from gtsam_rwhec.rig.guessed_boards import STATED
+from gtsam_rwhec.rig.guessed_boards import BoardSeen
+from gtsam_rwhec.rig.guessed_boards import boards_seen
+from gtsam_rwhec.rig.guessed_boards import guessed_intrinsics
+from gtsam_rwhec.rig.guessed_targets import Guess
+from gtsam_rwhec.rig.guessed_targets import boards_guessed
+from gtsam_rwhec.rig.guessed_targets import targets_seen
+from gtsam_rwhec.rig.guessed_targets import with_size
+from gtsam_rwhec.rig.log_contents import ImageTopic
+from gtsam_rwhec.rig.log_contents import camera_name
+from gtsam_rwhec.rig.log_contents import free_name
+from gtsam_rwhec.rig.rig_file import rig_text
+from gtsam_rwhec.rig.section_types import is_text
+from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.detect.detections import Detection
+
+#: At most this number of images of each folder, spread over all, is searched for targets, and solved for roles.
+IMAGES = 16
+#: The frames of a folder's poses, whose names no file has.
+PARENT, CHILD = "base", "hand"
+
+
+def propose_folder_rig(
+    folder: str | Path, path: str | Path, *, progress: Progress | None = None
+) -> tuple[str, tuple[str, ...]]:
+    """Propose a rig file for folders of images with poses beside them; a person completes it.
+
+    Parameters
+    ----------
+    folder
+        Where the paths of the rig file start.
+    path
+        The rig file that will be written, for messages.
+    progress : callable, optional
+
+    Returns
+    -------
+    text : str
+        A rig file that `parse_rig` reads.
+    notes : tuple of str
+        What was seen, what was chosen, and what was left out.
+
+    Raises
+    ------
+    RigError
+        There are no images, or no poses that fit them; the message says what was looked at.
+    """
+    folder, tell = Path(folder), progress or silent
+    notes: list[str] = []
+    cameras = _cameras(folder, notes)
+    topics, boards = [], []
+    for camera in cameras:
+        tell(f"searching {camera.path}")
+        topic = ImageTopic(camera.path, "", len(camera.files))
+        for i in np.unique(np.linspace(0, len(camera.files) - 1, IMAGES).round().astype(int)):
+            gray = read_gray(camera.files[i])
+            if gray is not None and gray.shape[::-1] == camera.size:
+                topic.search(gray, int(i))
+        topics.append(topic)
+        boards.append(boards_seen(topic.pictures))
+    guesses, remarks = targets_seen(topics, [])
+    guesses += boards_guessed(
+        (topic.topic, topic.looked_at, seen) for topic, found in zip(topics, boards, strict=True) for seen in found
+    )
+    notes += remarks
+    if guesses:
+        notes.append(f"targets seen: {', '.join(guess.name for guess in guesses)}")
+    else:
+        notes.append(
+            f"no target in {sum(topic.looked_at for topic in topics)} images: no tags of any family, no checkerboard "
+            "and no grid of circles that passes the tests. Write the targets into the rig file"
+        )
+        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
+        guesses = [Guess("tag_0", nothing, "TODO an example: no targets were seen")]
+    text = _text(folder, cameras, topics, boards, guesses, notes, tell)
+    parse_rig(text, str(path))
+    return text, tuple(notes)
+
+
+def _cameras(folder: Path, notes: list[str]) -> list[ImageFolder]:
+    """The folders of images that have poses."""
+    if not folder.is_dir():
+        raise RigError(f"{folder}: there is no such folder")
+    found = [camera for camera in read_folder(folder) if is_text(camera.path)]
+    if not found:
+        raise RigError(f"{folder}: no folder in it has two images or more that can be read")
+    with_poses = [camera for camera in found if camera.poses is not None]
+    if not with_poses:
+        named = ", ".join(f"{camera.path} ({len(camera.files)} images)" for camera in found[:5])
+        raise RigError(
+            f"{folder}: images in {named}, and no file of poses that fits them. Put the robot's pose at each image "
+            "beside them, as poses.csv with a line an image: name, x, y, z, qx, qy, qz, qw (metres)"
+        )
+    notes += [f"not used: {camera.path}, no poses fit its images" for camera in found if camera.poses is None]
+    for camera in with_poses:
+        assert camera.poses is not None
+        number = int(np.isfinite(camera.poses.T[:, 0, 0]).sum())
+        notes.append(
+            f"camera {camera.path}: {len(camera.files)} images of {camera.size[0]} x {camera.size[1]}, {number} with a "
+            f"pose in {camera.poses.path}, intrinsics {camera.intrinsics or 'in no file'}"
+        )
+    return with_poses
+
+
+def _text(
+    folder: Path,
+    cameras: Sequence[ImageFolder],
+    topics: Sequence[ImageTopic],
+    boards: Sequence[Sequence[BoardSeen]],
+    guesses: Sequence[Guess],
+    notes: list[str],
+    tell: Progress,
+) -> str:
+    taken = {PARENT, CHILD}
+    remarks: dict[KeyPath, str] = {}
+    names = [free_name(camera_name(camera.path, ""), taken) for camera in cameras]
+    targets: dict[str, TargetSection] = {}
+    for guess in guesses:
+        name = free_name(guess.name, taken)
+        targets[name], remarks["targets", name] = guess.section, guess.remark
+    sensors: dict[str, Sensor] = {}
+    stated: list[tuple[str, Camera]] = []
+    for name, camera, found in zip(names, cameras, boards, strict=True):
+        assert camera.poses is not None
+        if camera.camera is not None:
+            section = Intrinsics(file=camera.intrinsics, camera=camera.camera_name or None, stated="nominal")
+            remarks["sensors", name, "intrinsics"] = STATED
+            stated.append((name, camera.camera))
+        else:
+            guess_ = guessed_intrinsics(camera.size, found)
+            section, remarks["sensors", name, "intrinsics"] = guess_.section, guess_.words
+            stated.append((name, guess_.camera))
+        rest = _rest(camera.poses)
+        remarks["sensors", name, "time_offset"] = (
+            f"s; {rest.words}, so no clock is estimated" if rest.at_rest else f"in motion: {rest.words}; or seconds"
+        )
+        sensors[name] = Sensor(
+            images=camera.path, poses=camera.poses.path, intrinsics=section,
+            time_offset=0.0 if rest.at_rest else "estimate",
+        )  # fmt: skip
+    tell("solving with the cameras on either carrier")
+    views = _views(cameras, topics, stated, [section.target(name) for name, section in targets.items()])
+    reading = best_reading(folder, cameras, views)
+    evidence = reading.evidence
+    notes.append(f"{evidence.in_words(PARENT, CHILD)}: {_role_words(evidence)}")
+    for name, factor in evidence.sizes.items():
+        targets[name] = with_size(targets[name], factor)
+        remarks["targets", name] += "; the length here is what the motion says"
+    carriers, remarks["carriers", "poses"] = _carriers(reading)
+    origin = origin_of([f for camera in cameras if camera.poses for f in camera.poses.path.split("/")])
+    notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
+    where = folder.resolve().name
+    head = (
+        f"# A first rig file, made from the folder {where if is_text(where) else repr(where)}; paths start from it.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets.\n"
+    )
+    return head + rig_text(rig, remarks)
+
+
+def _rest(poses: FolderPoses) -> Rest:
+    """Whether the images were taken at rest."""
+    stamps = poses.stamps_ns
+    if stamps is None:
+        return Rest(True, "images whose names are no stamps were taken at rest")
+    of_poses = np.array(pose_stamps(poses.all) or (), dtype=np.int64)
+    order = np.argsort(of_poses, kind="stable")
+    order = order[np.append(np.diff(of_poses[order]) > 0, True)]
+    return rest_of(stamps, Trajectory(of_poses[order], poses.all.T[order], poses.path))
+
+
+def _views(
+    cameras: Sequence[ImageFolder],
+    topics: Sequence[ImageTopic],
+    stated: Sequence[tuple[str, Camera]],
+    targets: Sequence[Target],
+) -> list[View]:
+    """The targets in the images that were searched."""
+    by_name = {target.name: target for target in targets}
+    views = []
+    for number, (topic, (name, intrinsics)) in enumerate(zip(topics, stated, strict=True)):
+        for place, found in zip(topic.places, Detector(intrinsics, targets)(topic.pictures), strict=True):
+            views += [View(number, place, name, by_name[d.target], d) for d in found.detections]
+    return views
+
+
+def _role_words(evidence: RoleEvidence) -> str:
+    return {
+        "child": f"the cameras are on {CHILD}",
+        "parent": f"the cameras are on {PARENT}, and the targets on {CHILD}",
+        None: "the data cannot tell",
+    }[evidence.role]
+
+
+def _carriers(reading: PoseReading) -> tuple[Carriers, str]:
+    said, evidence = reading.stated, reading.evidence
+    source = PoseSource(
+        frames=(PARENT, CHILD), quaternion=said.quaternion, euler=said.euler, angles=said.angles, length=said.length
+    )  # fmt: skip
+    if evidence.role is None:
+        remark = (
+            "TODO the images cannot tell what carries the sensors: exchange the two names for cameras beside the robot "
+            f"({evidence.in_words(PARENT, CHILD)})"
+        )
+    else:
+        remark = (
+            f"a guess, as is that the files have T_{PARENT}_{CHILD}: {evidence.in_words(PARENT, CHILD)}. If the files "
+            f"have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above"
+        )
+    if said.euler is not None and evidence.role is None:
+        remark += f"; TODO the files have three angles, and {said.euler} in degrees is a guess"
+    elif said.euler is not None:
+        remark += f"; of the usual conventions of angles {said.euler} in {said.angles} explains the images best"
+    elif reading.otherwise is not None:
+        remark += f"; with quaternions as x, y, z, w {reading.otherwise.in_words(PARENT, CHILD)}"
+    if said.length is not None:
+        remark += "; positions are spread as millimetres are"
+    sensors, targets = (PARENT, CHILD) if evidence.role == "parent" else (CHILD, PARENT)
+    return Carriers(sensors=sensors, targets=targets, poses=source), remark
+
+
+#: Conventions of three angles that arms' controllers and programs write, the commonest first.
+AXES = ("ZYX", "xyz", "XYZ", "rotation_vector", "ZYZ", "zyx")
+#: Poses are the same if their matrices differ by less than this.
+SAME = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A target in one image: the camera's number, the image's number in its folder, and the detection."""
+
+    camera: int
+    place: int
+    sensor: str
+    target: Target
+    detection: Detection
+
+
+@dataclass(frozen=True, eq=False)
+class PoseReading:
+    """How the poses are read.
+
+    Attributes
+    ----------
+    stated : PoseStatement
+        What the rig file must say.
+    evidence : RoleEvidence
+        Of the poses that are read so.
+    otherwise : RoleEvidence or None
+        Of the poses as they are read without a statement, where another reading explains the images far better.
+    """
+
+    stated: PoseStatement
+    evidence: RoleEvidence
+    otherwise: RoleEvidence | None
+
+
+def best_reading(folder: Path, cameras: Sequence[ImageFolder], views: Sequence[View]) -> PoseReading:
+    """The reading of the poses that explains the images; the usual one where no other is far better."""
+    usual = [camera.poses for camera in cameras if camera.poses is not None]
+    stated = usual[0].stated
+    as_read = _evidence(usual, views)
+    best, found = stated, as_read
+    for other in _others(stated):
+        read = [
+            poses_read(folder, camera.files, folder / poses.path, other)
+            for camera, poses in zip(cameras, usual, strict=True)
+        ]
+        there = [poses for poses in read if poses is not None]
+        if len(there) < len(read) or all(_is_same(a, b) for a, b in zip(there, usual, strict=True)):
+            continue
+        evidence = _evidence(there, views)
+        if evidence.explains_far_better(as_read) and (best is stated or evidence.is_better_than(found)):
+            best, found = other, evidence
+    return PoseReading(best, found, None if best is stated else as_read)
+
+
+def _others(stated: PoseStatement) -> Iterator[PoseStatement]:
+    if stated.euler is None:
+        yield replace(stated, quaternion="wxyz")
+        return
+    for axes in AXES:
+        yield replace(stated, euler=axes, angles="degrees")
+        yield replace(stated, euler=axes, angles="radians")
+
+
+def _is_same(first: FolderPoses, second: FolderPoses) -> bool:
+    return bool(np.allclose(first.T, second.T, rtol=0.0, atol=SAME, equal_nan=True))
+
+
+def _evidence(poses: Sequence[FolderPoses], views: Sequence[View]) -> RoleEvidence:
+    return evidence_of_roles(
+        Seen(view.sensor, view.target, view.detection, poses[view.camera].T[view.place]) for view in views
+    )

@@ -1,0 +1,351 @@
+"""A first rig file, proposed from the content of a log; TODO marks the values that a person must state."""
+
+from __future__ import annotations
+from dataclasses import dataclass
+from pathlib import Path
+from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.rig.sections import Carriers
+from gtsam_rwhec.rig.sections import Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget
+from gtsam_rwhec.rig.target_sections import TargetSection
+from collections.abc import Iterable
+from gtsam_rwhec.rig.carrier_roles import Origin
+from gtsam_rwhec.rig.carrier_roles import RoleEvidence
+from gtsam_rwhec.rig.carrier_roles import evidence_of_log
+from gtsam_rwhec.rig.guessed_boards import STATED
+from gtsam_rwhec.rig.guessed_boards import boards_seen
+from gtsam_rwhec.rig.guessed_targets import TODO as _TODO_SIZE
+from gtsam_rwhec.rig.guessed_targets import Guess
+from gtsam_rwhec.rig.guessed_targets import boards_guessed
+from gtsam_rwhec.rig.guessed_targets import targets_seen
+from gtsam_rwhec.rig.guessed_targets import with_size
+from gtsam_rwhec.rig.log_contents import DriverTopic
+from gtsam_rwhec.rig.log_contents import ImageTopic
+from gtsam_rwhec.rig.log_contents import LogContents
+from gtsam_rwhec.rig.log_contents import MovingPair
+from gtsam_rwhec.rig.log_contents import PoseTopic
+from gtsam_rwhec.rig.log_contents import camera_name
+from gtsam_rwhec.rig.log_contents import free_name
+from gtsam_rwhec.rig.log_contents import moving_pairs
+from gtsam_rwhec.rig.log_contents import read_contents
+from gtsam_rwhec.rig.odometry_sections import OdometrySensor
+from gtsam_rwhec.rig.odometry_sections import OdometrySource
+from gtsam_rwhec.rig.rig_file import rig_text
+from gtsam_rwhec.rig.section_types import is_name
+from gtsam_rwhec.rig.section_types import is_text
+from gtsam_rwhec.rig.sections import Intrinsics
+
+#: Written where a log has none, for a person to replace.
+_NO_INTRINSICS = Intrinsics(file="camera.yaml")
+#: Comment on a sensor's time offset.
+_TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A proposed sensor: name, section, its frame in the log, and comments on its lines by key."""
+
+    name: str
+    section: Sensor
+    frame: str
+    remarks: dict[str, str]
+
+
+def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
+    """Propose a rig file for a log; a person completes it.
+
+    Parameters
+    ----------
+    log : Log
+    path
+        The rig file that will be written, for messages.
+
+    Returns
+    -------
+    text : str
+        A rig file that `parse_rig` reads; its lengths are guesses, and TODO marks them.
+    notes : tuple of str
+        What was seen, what was chosen, and what was left out.
+
+    Raises
+    ------
+    RigError
+        The log has neither images nor detections, or no poses that move; the message has the topics of the log.
+    """
+    contents = read_contents(log)
+    notes: list[str] = []
+    cameras = _cameras(contents, notes)
+    if not cameras:
+        proposed = propose_odometries(contents.poses.values(), log.files[0].path.name)
+        if proposed is not None:
+            parse_rig(proposed[0], str(path))
+            return proposed
+        raise RigError(f"{_where(log)}: no images and no detections that can be read; {_topics(contents)}")
+    pairs, remarks = moving_pairs(contents.poses.values(), [camera.frame for camera in cameras])
+    notes += remarks
+    if not pairs:
+        raise RigError(
+            f"{_where(log)}: no poses of anything that moves, and without the carriers' motion nothing can be "
+            f"calibrated. Record the poses of the robot or of the motion capture too; {_topics(contents)}"
+        )
+    pair = pairs[0]
+    notes.append(f"moving: {_pair_words(pair)}")
+    notes += [f"moves too, not used: {_pair_words(other)}" for other in pairs[1:6]]
+    used = [contents.images[c.section.images] for c in cameras if c.section.images is not None]
+    drivers = [contents.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
+    guesses, remarks = targets_seen(used, drivers)
+    guesses += boards_guessed((topic.topic, topic.looked_at, b) for topic in used for b in boards_seen(topic.pictures))
+    notes += remarks
+    looked_at = sum(images.looked_at for images in used)
+    if guesses:
+        notes.append(
+            f"targets seen: {', '.join(guess.name for guess in guesses)} (sizes in rig.yaml are guesses: measure them)"
+        )
+    else:
+        notes.append(
+            f"no tags in {looked_at} images that were searched, no checkerboard and no grid of circles, and none from "
+            "drivers. Write the targets into the rig file"
+        )
+        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
+        guesses = [Guess("tag_0", nothing, "TODO an example: no tags were seen")]
+    text = _text(log, contents, pair, cameras, guesses, notes)
+    parse_rig(text, str(path))
+    return text, tuple(notes)
+
+
+def _text(
+    log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Camera], guesses: list[Guess], notes: list[str]
+) -> str:
+    parent, child = pair.source.parent_and_child
+    taken = {parent, child}
+    remarks: dict[KeyPath, str] = {}
+    sensors: dict[str, Sensor] = {}
+    targets: dict[str, TargetSection] = {}
+    names = {camera.name: free_name(camera.name, taken) for camera in cameras}
+    for guess in guesses:
+        name = free_name(guess.name, taken)
+        targets[name], remarks["targets", name] = guess.section, guess.remark
+    has_board = any(len(section.target(name).corners()) >= CORNERS for name, section in targets.items())
+    for camera in cameras:
+        name = names[camera.name]
+        frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
+        taken |= {frame} if frame else set()
+        sensors[name] = camera.section.model_copy(update={"frame": frame, "time_offset": "estimate"})
+        remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
+        if camera.section.images is not None and camera.section.intrinsics == _NO_INTRINSICS and has_board:
+            sensors[name] = sensors[name].model_copy(update={"intrinsics": Intrinsics(estimate="any")})
+            remarks["sensors", name, "intrinsics"] = "no topic has them: a board's images say them; a file is better"
+    of_log = evidence_of_log(log, contents, pair.source, sensors, [s.target(name) for name, s in targets.items()])
+    for name, sensor in sensors.items():
+        rest = of_log.rest.get(sensor.images or "")
+        remarks["sensors", name, "time_offset"] = _TIME_OFFSET
+        if rest is not None and rest.at_rest:
+            sensors[name] = sensor.model_copy(update={"time_offset": 0.0})
+            remarks["sensors", name, "time_offset"] = f"s; a guess: {rest.words}, and no clock is estimated from that"
+    if of_log.roles.images:
+        notes.append(of_log.roles.in_words(parent, child))
+    for name, factor in of_log.roles.sizes.items():
+        if _TODO_SIZE in remarks["targets", name] and "as its driver says" not in remarks["targets", name]:
+            targets[name] = with_size(targets[name], factor)
+            remarks["targets", name] += "; the length here is what the motion says"
+    carriers, remarks["carriers", "poses"] = _carriers(pair, of_log.roles, of_log.origin)
+    notes.append(f"poses: {of_log.origin.words}")
+    if carriers.noise is not None:
+        remarks["carriers", "noise"] = (
+            f"TODO errors of these poses, a guess: {of_log.origin.words}. Leave the line out if you do not know them: "
+            "residuals tell too"
+        )
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
+    file = log.files[0].path.name
+    head = (
+        f"# A first rig file, made from the log {file if is_text(file) else repr(file)}.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets: the sizes here are guesses.\n"
+    )
+    return head + rig_text(rig, remarks)
+
+
+def _carriers(pair: MovingPair, roles: RoleEvidence, origin: Origin) -> tuple[Carriers, str]:
+    parent, child = pair.source.parent_and_child
+    solved = roles.role
+    of_tf = "parent" if pair.on_parent > pair.on_child else "child" if pair.on_child else None
+    role = of_tf or solved or "child"
+    sensors, targets = (parent, child) if role == "parent" else (child, parent)
+    words = f"; {roles.in_words(parent, child)}" if roles.images else ""
+    if of_tf is not None and solved not in (of_tf, None):
+        remark = f"TODO {sensors} carries the sensors, as tf has it, but the images say the reverse{words}"
+    elif of_tf is not None:
+        remark = f"{sensors} carries the sensors, as tf has it{words}"
+    elif solved is not None:
+        remark = f"a guess: {sensors} carries the sensors{words}"
+        if pair.source.topic is not None:
+            remark += f". If the poses are T_{child}_{parent}, exchange parent and child, and sensors and targets above"
+    else:
+        remark = f"TODO fixed camera and target on the hand: exchange the two names{words}"
+    if pair.source.topic is not None:
+        remark += "; TODO check the frames' names: they are guesses if the topic has none"
+    return Carriers(sensors=sensors, targets=targets, poses=pair.source, noise=origin.noise), remark
+
+
+def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
+    """Sensors with images, and drivers' detections if the log has no images of the same camera."""
+    taken: set[str] = set()
+    cameras: list[_Camera] = []
+
+    def add(source: ImageTopic | DriverTopic, key: str, sources: int, missing: str) -> str:
+        """Add a sensor, with the comment `missing` if the log lacks the intrinsics that it needs; return its name."""
+        intrinsics, remark = _intrinsics(source.topic, source.frame, contents.intrinsics, sources)
+        if intrinsics is None and missing:
+            intrinsics, remark = _NO_INTRINSICS, missing
+        name = free_name(camera_name(source.topic, source.frame), taken)
+        section = Sensor.model_validate({key: source.topic, "intrinsics": intrinsics})
+        cameras.append(_Camera(name, section, source.frame, {"intrinsics": remark} if remark else {}))
+        return name
+
+    missing = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
+    for images in _without_copies(contents, notes):
+        name = add(images, "images", len(contents.images), missing)
+        notes.append(f"camera {name}: {images.count} images in {images.topic}, {images.looked_at} looked at")
+    with_images = {camera.frame for camera in cameras if camera.frame}
+    for driver in contents.drivers.values():
+        if driver.frame in with_images:
+            notes.append(f"not used: detections in {driver.topic}; the log has images of the same camera")
+            continue
+        missing = "" if driver.has_poses else "TODO no topic has them, and the driver gives no poses"
+        name = add(driver, "detections", len(contents.drivers), missing)
+        notes.append(f"driver {name}: {driver.count} detections in {driver.topic}")
+    return cameras
+
+
+def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]:
+    """One topic for each camera: the topic with most images, raw before compressed, and never of depth."""
+    best: dict[tuple[str, str], ImageTopic] = {}
+    ranked = sorted(contents.images.values(), key=lambda images: ("Compressed" in images.schema, images.topic))
+    for images in sorted(ranked, key=lambda images: -images.looked_at):
+        key = camera_name(images.topic, images.frame), images.frame
+        if "depth" in images.topic.lower():
+            notes.append(f"not used: {images.topic}, depth")
+        elif not images.looked_at:
+            notes.append(f"not used: {images.topic}, {images.undecoded or 'no images'}")
+        elif key in best:
+            notes.append(f"not used: {images.topic}, of the same camera as {best[key].topic}")
+        else:
+            best[key] = images
+    return sorted(best.values(), key=lambda images: images.topic)
+
+
+def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> tuple[Intrinsics | None, str]:
+    """The topic of intrinsics for another topic. It has the same frame, or its name begins in the same way."""
+    same_frame = [name for name, its_frame in known.items() if frame and its_frame == frame]
+    candidates = same_frame or list(known)
+    shared = {name: _shared(topic, name) for name in candidates}
+    most = max(shared.values(), default=0)
+    best = [name for name in candidates if shared[name] == most]
+    if not best or (not same_frame and not most and (len(known), sensors) != (1, 1)):
+        return None, ""
+    remark = f"TODO or {', '.join(best[1:])}; {STATED}" if len(best) > 1 else STATED
+    return Intrinsics(topic=best[0], stated="nominal"), remark
+
+
+def _shared(first: str, second: str) -> int:
+    """Count the common words with which two topics begin."""
+    pairs = list(zip(first.strip("/").split("/"), second.strip("/").split("/"), strict=False))
+    return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
+
+
+def _pair_words(pair: MovingPair) -> str:
+    parent, child = pair.source.parent_and_child
+    return f"{child} in {parent} ({pair.words})"
+
+
+def _where(log: Log) -> str:
+    return ", ".join(str(file.path) for file in log.files[:3]) + (", ..." if len(log.files) > 3 else "")
+
+
+def _topics(contents: LogContents) -> str:
+    listed = ", ".join(f"{topic.name} ({topic.schema}, {topic.count} messages)" for topic in contents.topics)
+    return f"topics: {listed or 'none'}"
+
+
+#: Words of topics that say what is published, and not by which sensor.
+OF_KIND = ("odom", "odometry", "pose", "poses", "odometry_pose", "pose_stamped", "local", "filtered")
+#: Names that point to visual odometry of one camera, whose lengths are not metres.
+OF_ONE_CAMERA = ("mono", "vo", "cam", "camera", "orb", "dso", "svo")
+_SCALE = (
+    "scale: estimate, inside odometry, where its lengths are not metres (visual odometry of one camera); "
+    "time_offset: 0.0 for one clock"
+)
+
+
+@dataclass(frozen=True)
+class _Found:
+    name: str
+    topic: PoseTopic
+
+    @property
+    def may_lack_scale(self) -> bool:
+        return any(word in self.name.lower().split("_") for word in OF_ONE_CAMERA)
+
+
+def propose_odometries(poses: Iterable[PoseTopic], where: str) -> tuple[str, tuple[str, ...]] | None:
+    """The text of a rig file, and what was seen; None with fewer than two topics of poses that move.
+
+    `where` is the log's name, for the head of the file. Poses in tf are of the robot's own tree, and are not proposed.
+    """
+    found = _found(poses)
+    if len(found) < 2:
+        return None
+    with_scale = [one for one in found if not one.may_lack_scale] or found
+    reference = max(with_scale, key=lambda one: one.topic.count)
+    remarks: dict[KeyPath, str] = {
+        ("reference",): "TODO a guess: the sensor in whose frame you want the others; its lengths must be metres"
+    }
+    sensors: dict[str, OdometrySensor] = {}
+    for one in found:
+        is_reference = one is reference
+        sensors[one.name] = OdometrySensor(
+            odometry=OdometrySource(topic=one.topic.topic), time_offset=0.0 if is_reference else "estimate"
+        )
+        if one.may_lack_scale:
+            remarks["sensors", one.name, "odometry"] = f"TODO {_SCALE}"
+    rig = Rig(sensors={**sensors}, reference=reference.name)  # type: ignore[call-arg]
+    head = (
+        f"# A first rig file, made from the log {where if is_text(where) else repr(where)}: it has no images and no "
+        "detections,\n# and several topics of poses, each taken as what one sensor says of its own motion.\n"
+        "# A vehicle that moves in a plane does not tell heights: add given: {heights_m: {SENSOR: 0.5, ...}}.\n"
+    )
+    notes = tuple(
+        f"moves: {one.name}, topic {one.topic.topic}, {one.topic.count} poses, up to {one.topic.motion()[0]:.2g} m "
+        "from the first"
+        for one in found
+    )
+    return head + rig_text(rig, remarks), (*notes, f"reference: {reference.name} (of those with metres, most poses)")
+
+
+def _found(poses: Iterable[PoseTopic]) -> list[_Found]:
+    by_topic: dict[str, list[PoseTopic]] = {}
+    for series in poses:
+        if not series.is_tf:
+            by_topic.setdefault(series.topic, []).append(series)
+    taken: set[str] = set()
+    found = []
+    for topic, (series, *others) in by_topic.items():
+        if others or not series.is_moving or not is_text(topic):
+            continue
+        name = free_name(_name(topic), taken)
+        taken.add(name)
+        found.append(_Found(name, series))
+    return found
+
+
+def _name(topic: str) -> str:
+    """The sensor's name: the topic without what says what is published."""
+    parts = [part for part in topic.strip("/").split("/") if part]
+    while len(parts) > 1 and parts[-1].lower() in OF_KIND:
+        parts.pop()
+    name = "_".join(parts)
+    return name if is_name(name) else "odometry"

@@ -1,0 +1,248 @@
+"""The reference of rig files, as Markdown, made of their sections: every key, its unit, default and an example."""
+
+from __future__ import annotations
+from collections.abc import Iterator
+from collections.abc import Sequence
+from typing import Any
+from typing import get_args
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from gtsam_rwhec.cameras.targets import FAMILIES
+from gtsam_rwhec.rig.rig import RigFile
+from gtsam_rwhec.rig.sections import Carriers
+from gtsam_rwhec.rig.sections import Cleaning
+from gtsam_rwhec.rig.sections import DetectionNoise
+from gtsam_rwhec.rig.sections import Link
+from gtsam_rwhec.rig.sections import PoseNoise
+from gtsam_rwhec.rig.sections import PoseSource
+from gtsam_rwhec.rig.sections import Sensor
+from gtsam_rwhec.rig.target_sections import BundleTagPlace
+from gtsam_rwhec.rig.target_sections import TargetSection
+import inspect
+import json
+import re
+from dataclasses import fields
+from pathlib import Path
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import core_schema
+from gtsam_rwhec.rig.odometry_sections import GivenDirection
+from gtsam_rwhec.rig.odometry_sections import GivenDistance
+from gtsam_rwhec.rig.odometry_sections import GivenGround
+from gtsam_rwhec.rig.odometry_sections import GivenSection
+from gtsam_rwhec.rig.odometry_sections import OdometryNoiseSection
+from gtsam_rwhec.rig.odometry_sections import OdometrySensor
+from gtsam_rwhec.rig.odometry_sections import OdometrySource
+from gtsam_rwhec.rig.section_types import in_yaml
+from gtsam_rwhec.rig.section_types import keys_of
+from gtsam_rwhec.rig.section_types import unit_of
+from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.detect.detections import DetectionOptions
+
+#: Before the tables.
+HEAD = """\
+# The rig file: every key
+
+<!-- Written by `gtsam-rwhec init --reference > docs/rig_file.md`: change the fields in gtsam_rwhec/rig. -->
+
+A rig file names the sensors and the targets, what carries them, and where the log or the folder has the data of each.
+[from_a_log.md](from_a_log.md) says how it is used; `gtsam-rwhec init LOG -o rig.yaml` writes a first one,
+`gtsam-rwhec init --template NAME -o rig.yaml` one of the usual cells.
+
+- It is YAML. A key that is not in the tables is an error that names the line and the nearest key.
+- No value is converted: `"0.1"` in quotes is text, and not a number.
+- A unit is the end of the key's name, as in `size_m`; else the table has it. Lengths of targets are in metres.
+- Frames are right-handed, and T_a_b maps coordinates in b to a. `[parent, child]` means poses T_parent_child.
+- **Every board is counted [across, down]**, as it is printed upright, and the key says what is counted: whole `squares`
+  of a ChArUco board, `inner_corners` of a checkerboard (one less than its squares each way), `tags`, `circles`.
+- Paths start from the rig file's folder; with images in a folder (`carriers.poses: {frames: ...}`), from that folder.
+- Editors complete and check with the JSON Schema, [rig_file.schema.json](../gtsam_rwhec/rig/rig_file.schema.json)
+  (`gtsam-rwhec init --schema` prints it). Rig files that `init` writes name it in their first line; in one of your own,
+  write `# yaml-language-server: $schema=PATH`.
+"""
+#: Sections with the path of their place; targets follow.
+SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
+    ("carriers", Carriers),
+    ("carriers: poses", PoseSource),
+    ("carriers: noise", PoseNoise),
+    ("sensors: NAME", Sensor),
+    ("sensors: NAME: intrinsics", Intrinsics),
+    ("sensors: NAME: link", Link),
+    ("sensors: NAME (with odometry)", OdometrySensor),
+    ("sensors: NAME: odometry", OdometrySource),
+    ("sensors: NAME: odometry: noise", OdometryNoiseSection),
+)
+#: Sections that come after the targets.
+LAST: tuple[tuple[str, type[BaseModel]], ...] = (
+    ("targets: NAME: layout", BundleTagPlace),
+    ("noise", DetectionNoise),
+    ("cleaning", Cleaning),
+    ("given", GivenSection),
+    ("given: ground", GivenGround),
+    ("given: directions", GivenDirection),
+    ("given: distances", GivenDistance),
+)
+
+
+def reference_text() -> str:
+    """The text of ``docs/rig_file.md``."""
+    definitions = rig_file_schema()["$defs"]
+    parts = [HEAD, "## The file\n\n" + _table(RigFile, rig_file_schema())]
+    for where, section in SECTIONS:
+        parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    parts.append(
+        "## `targets: NAME`\n\nA target's frame has its origin in the middle of what is printed, x to the right, y up, "
+        "z towards who looks\nat it. `type` says which keys there are. Families of tags: "
+        + ", ".join(f"`{family}`" for family in FAMILIES)
+        + "."
+    )
+    for section in target_sections():
+        kind = get_args(section.model_fields["type"].annotation)[0]
+        parts.append(f"### `type: {kind}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    for where, section in LAST:
+        parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    rows = [
+        (f"`{key}`", words, "number above 0", unit_of(key), f"`{default:g}`", f"`{key}: {default:g}`")
+        for key, default, words in detection_keys()
+    ]
+    parts.append("## `detection`\n\nLimits beyond which a detection is not used.\n\n" + _markdown(rows))
+    return "\n".join(part.rstrip("\n") + "\n" for part in parts)
+
+
+def target_sections() -> tuple[type[BaseModel], ...]:
+    """The section of each type of target, in the order of `TargetSection`."""
+    return get_args(get_args(TargetSection)[0])
+
+
+def _about(section: type[BaseModel]) -> str:
+    return " ".join((section.__doc__ or "").split())
+
+
+def _table(section: type[BaseModel], schema: dict[str, Any]) -> str:
+    rows = []
+    for key, field in keys_of(section).items():
+        said = schema["properties"][key]
+        rows.append((
+            f"`{key}`", field.description or _kind(said), _kind(said), unit_of(key, field), _default(field),
+            f"`{key}: {in_yaml(_example(said, field))}`",
+        ))  # fmt: skip
+    return _markdown(rows)
+
+
+def _markdown(rows: Sequence[tuple[str, ...]]) -> str:
+    head = ("key", "is", "value", "unit", "default", "example")
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+        for row in (head, ("---",) * len(head), *rows)
+    )
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "must be given"
+    given = field.default
+    if isinstance(given, BaseModel):
+        given = {}
+    return "" if given is None or given == {} else f"`{in_yaml(given)}`"
+
+
+def _example(said: dict[str, Any], field: FieldInfo) -> Any:
+    if field.examples:
+        return field.examples[0]
+    return said.get("const", {})
+
+
+def _kind(said: dict[str, Any]) -> str:
+    """What a value is, in words, from its schema."""
+    return " or ".join(dict.fromkeys(_kinds(said)))
+
+
+def _kinds(said: dict[str, Any]) -> Iterator[str]:
+    for choice in said.get("anyOf", said.get("oneOf", ())):
+        yield from _kinds(choice)
+    if "anyOf" in said or "oneOf" in said or said.get("type") == "null":
+        return
+    if "const" in said:
+        yield f"`{said['const']}`"
+    elif "enum" in said:
+        is_family = said["enum"] == list(FAMILIES)
+        yield "a family, see above" if is_family else ", ".join(f"`{name}`" for name in said["enum"])
+    elif said.get("type") == "array":
+        item = _kind(said["items"])
+        many = said.get("minItems")
+        yield f"[{', '.join([item] * many)}]" if many else f"list of {item}s"
+    elif "$ref" in said or said.get("type") == "object":
+        yield "section"
+    elif said.get("type") == "number":
+        yield "number" + (" above 0" if "exclusiveMinimum" in said else "")
+    else:
+        yield {"string": "text", "integer": "whole number", "boolean": "true or false"}[said["type"]]
+
+
+#: Editors know this version of JSON Schema, all of them.
+DIALECT = "http://json-schema.org/draft-07/schema#"
+#: The schema as the package ships it; `schema_text` makes its content.
+SCHEMA_FILE = Path(__file__).with_name("rig_file.schema.json")
+
+
+class _Draft07(GenerateJsonSchema):
+    """Lists of a fixed length as draft 07 has them, and no titles: the keys say as much."""
+
+    def tuple_schema(self, schema: core_schema.TupleSchema) -> JsonSchemaValue:
+        made = super().tuple_schema(schema)
+        items = made.pop("prefixItems", None)
+        if items:  # lists of rig files have items of one kind
+            made["items"] = items[0]
+        return made
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+def rig_file_schema() -> dict[str, Any]:
+    """The JSON Schema of rig files, of draft 07.
+
+    It knows every key, its type, its limits, and which keys exclude or need each other within a section. Faults between
+    sections, as one name for two frames, are found when the file is read.
+    """
+    schema = RigFile.model_json_schema(schema_generator=_Draft07)
+    schema["properties"]["detection"] |= {
+        "additionalProperties": False,
+        "properties": {
+            key: {"type": "number", "exclusiveMinimum": 0, "default": default, "description": words}
+            for key, default, words in detection_keys()
+        },
+    }
+    _without(schema, "title")
+    return {"$schema": DIALECT, "title": "Rig file of gtsam-rwhec", **schema}
+
+
+def schema_text() -> str:
+    """The content of `SCHEMA_FILE`."""
+    return json.dumps(rig_file_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def editor_line() -> str:
+    """The first line of a rig file that names the schema for editors, with the line's end."""
+    return f"# yaml-language-server: $schema={SCHEMA_FILE.as_uri()}\n"
+
+
+def detection_keys() -> list[tuple[str, float, str]]:
+    """Key, default and description of each key of the section ``detection``, from `DetectionOptions`' own words."""
+    said = inspect.cleandoc(DetectionOptions.__doc__ or "").partition("Attributes\n----------\n")[2]
+    words = {
+        name: " ".join(text.split()) for name, text in re.findall(r"^(\w+) : \w+\n((?:    .*\n?)+)", said, re.MULTILINE)
+    }
+    return [(field.name, float(str(field.default)), words[field.name]) for field in fields(DetectionOptions)]
+
+
+def _without(node: Any, key: str) -> None:
+    """Take a schema's own words with this key away; keys of rig files stand under ``properties``."""
+    if isinstance(node, dict):
+        node.pop(key, None)
+        for name, value in node.items():
+            for part in value.values() if name in ("properties", "$defs") else [value]:
+                _without(part, key)
+    elif isinstance(node, list):
+        for part in node:
+            _without(part, key)

@@ -1,0 +1,69 @@
+"""Columns and rows of boards of tags from where the tags are in images; what does not lie as on a board gives none."""
+
+from __future__ import annotations
+import numpy as np
+import pytest
+from gtsam_rwhec.cameras import AprilGrid
+from gtsam_rwhec.cameras.targets import TagGrid
+from gtsam_rwhec.detect.tags import SeenTag
+from gtsam_rwhec.rig.guessed_targets import Kind
+from gtsam_rwhec.rig.guessed_targets import layout_of
+
+KINDS: tuple[Kind, ...] = ("charuco", "tag_grid")
+SQUARE = 0.5 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+
+
+def charuco(columns: int, rows: int, share: float) -> np.ndarray:
+    """Corners (n, 4, 2) of the markers, y up."""
+    squares = [(x, -y) for y in range(rows) for x in range(columns) if (x + y) % 2 == 1]
+    return np.array(squares, dtype=float)[:, None] + share * SQUARE
+
+
+def views(
+    corners: np.ndarray, first: int = 0, number: int = 4, lost: int = 0, noise: float = 0.2
+) -> list[list[SeenTag]]:
+    """What images from several sides see of tags with these corners (n, 4, 2)."""
+    rng = np.random.default_rng(1)
+    middle, size = corners.reshape(-1, 2).mean(axis=0), np.ptp(corners.reshape(-1, 2), axis=0).max()
+    found = []
+    for k in range(number):
+        turn = 0.4 * k
+        plane = (corners - middle) / size @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        depth = 1.0 + 0.3 * plane[..., :1] * (-1) ** k + 0.2 * plane[..., 1:]
+        px = 320.0 + 300.0 * plane * [1.0, -1.0] / depth + noise * rng.normal(size=plane.shape)  # y down in images
+        kept = np.sort(rng.permutation(len(px))[lost:])
+        found.append([
+            SeenTag("f", first + int(i), False, px[i].mean(axis=0), float(np.linalg.norm(px[i, 0] - px[i, 1])), px[i])
+            for i in kept
+        ])  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(7, 5), (5, 7), (6, 6), (8, 11), (4, 9)])
+def test_a_charuco_board(columns: int, rows: int) -> None:
+    corners = charuco(columns, rows, 0.75)
+    ids = range(20, 20 + len(corners))
+    found = layout_of(KINDS, ids, views(corners, first=20, lost=3))
+    assert found is not None
+    assert (found.kind, found.columns, found.rows) == ("charuco", columns, rows)
+    assert found.share == pytest.approx(0.75, rel=0.02)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(6, 6), (4, 3), (5, 7)])
+def test_grids_count_from_the_top_or_from_the_bottom(columns: int, rows: int) -> None:
+    april = AprilGrid("grid", "tag36h11", columns, rows, 0.088, 0.3).corners()[:, :2].reshape(-1, 4, 2)
+    grid = TagGrid("grid", "tag36h11", columns, rows, 0.04, 0.01).corners()[:, :2].reshape(-1, 4, 2)
+    ids = range(columns * rows)
+    for corners, kind, share in ((april, "aprilgrid", 1 / 1.3), (grid, "tag_grid", 0.8)):
+        found = layout_of(("aprilgrid", "tag_grid"), ids, views(corners))
+        assert found is not None
+        assert (found.kind, found.columns, found.rows) == (kind, columns, rows)
+        assert found.share == pytest.approx(share, rel=0.02)
+
+
+def test_tags_in_the_room_are_no_board() -> None:
+    rng = np.random.default_rng(3)
+    corners = 10.0 * rng.uniform(size=(12, 1, 2)) + SQUARE
+    assert layout_of(KINDS, range(12), views(corners)) is None
+    assert layout_of(KINDS, range(35 // 2), views(charuco(7, 5, 0.75), number=1)) is None  # one image
+    assert layout_of(KINDS, range(35 // 2), views(charuco(7, 5, 0.75), lost=12)) is None  # too few tags in each
