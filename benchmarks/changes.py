@@ -23,20 +23,19 @@ with 1 if a bar is missed.
 """
 
 from __future__ import annotations
+
 import json
 import multiprocessing
 import sys
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures import as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
+
 import gtsam
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from binomial import Share
 from numpy.typing import NDArray
 from rich.console import Console
@@ -44,21 +43,15 @@ from rich.progress import track
 from scipy.optimize import brentq
 from scipy.special import chdtri
 from scipy.stats import ncx2
-from simulated_arms import ARM
-from simulated_arms import BENT_RAD
-from simulated_arms import Arm
-from simulated_arms import moved_by
-from simulated_arms import white
+from simulated_arms import ARM, BENT_RAD, Arm, moved_by, white
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.results.change_test import change_test
-from gtsam_rwhec.results.common_quantities import Quantities
-from gtsam_rwhec.results.common_quantities import quantities
-from gtsam_rwhec.results.difference import as_result
-from gtsam_rwhec.results.difference import without_constant_errors
+from gtsam_rwhec.results.common_quantities import Quantities, quantities
+from gtsam_rwhec.results.difference import as_result, without_constant_errors
 from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.simulate.simulated_rigs import Motion
-from gtsam_rwhec.simulate.simulated_rigs import carrier_poses
+from gtsam_rwhec.simulate.simulated_rigs import Motion, carrier_poses
 
 FloatArray = NDArray[np.float64]
 KINDS = ("white", "carriers", "drift", "arm")

@@ -18,32 +18,28 @@ what each fleet gave, from which an interrupted campaign goes on. Exits with 1 i
 """
 
 from __future__ import annotations
+
 import json
 import math
 import sys
 import warnings
-from collections.abc import Callable
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from binomial import Share
 from changes import log_of
 from numpy.typing import NDArray
 from rwhec_factors import se3
 from simulated_arms import ARM
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fleet.rows import RobotRow
-from gtsam_rwhec.fleet.rows import RowFrame
-from gtsam_rwhec.fleet.watching import DAY_NS
-from gtsam_rwhec.fleet.watching import Watched
-from gtsam_rwhec.fleet.watching import watch
-from gtsam_rwhec.results.difference import as_result
-from gtsam_rwhec.results.difference import without_constant_errors
+from gtsam_rwhec.fleet.rows import RobotRow, RowFrame
+from gtsam_rwhec.fleet.watching import DAY_NS, Watched, watch
+from gtsam_rwhec.results.difference import as_result, without_constant_errors
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 FloatArray = NDArray[np.float64]

@@ -8,6 +8,7 @@ error what is wrong with damaged images.
 """
 
 from __future__ import annotations
+
 import argparse
 import io
 import struct
@@ -16,42 +17,30 @@ import tempfile
 import tracemalloc
 import warnings
 from collections import Counter
-from collections.abc import Callable
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
 import cv2
 import imagesize
 import numpy as np
 import zstandard
-from bars import Row
-from bars import print_rows
+from bars import Row, print_rows
 from interleaved import interleaved
-from log_files import POSE
-from log_files import TRANSFORM
-from log_files import header
-from log_files import ros2_log
-from log_files import xyz
+from log_files import POSE, TRANSFORM, header, ros2_log, xyz
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
-from rosbags.typesys import Stores
-from rosbags.typesys import get_types_from_msg
-from rosbags.typesys import get_typestore
-from vision_rate import CELL
-from vision_rate import the_log
-from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.detect.images import stated_size
-from gtsam_rwhec.detect.tags import dictionary
-from gtsam_rwhec.detect.tags import identified
-from gtsam_rwhec.detect.tags import quadrangles
-from gtsam_rwhec.detect.tags import tag_detector
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.rig import read_rig
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from vision_rate import CELL, the_log
+
+from gtsam_rwhec.detect.images import decode_gray, stated_size
+from gtsam_rwhec.detect.tags import dictionary, identified, quadrangles, tag_detector
+from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.logs.ros2_messages import ros2_decoder
+from gtsam_rwhec.rig import read_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "logs"))
 

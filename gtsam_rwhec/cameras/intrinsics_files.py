@@ -1,23 +1,19 @@
 """Intrinsics from files: Kalibr's camchains, ROS's camera_info YAML, OpenCV's FileStorage (YAML, XML, JSON), COLMAP."""
 
 from __future__ import annotations
+
 import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
-from typing import NoReturn
+from typing import Any, NoReturn
+
 import numpy as np
-from gtsam_rwhec.cameras.camera import MODELS
-from gtsam_rwhec.cameras.camera import Camera
+
+from gtsam_rwhec.cameras.camera import MODELS, Camera
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.files.yaml_lines import YamlFile
-from gtsam_rwhec.files.yaml_lines import read_text
-from gtsam_rwhec.files.yaml_lines import read_yaml
-from gtsam_rwhec.files.yaml_lines import shown
+from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_storage, read_text, read_yaml, shown
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.files.yaml_lines import parse_storage
 
 #: Kalibr's camera models that are supported, with the distortion models that go with them.
 KALIBR_MODELS = {"pinhole": ("none", "radtan", "equidistant"), "omni": ("none", "radtan")}

@@ -1,25 +1,21 @@
 """``gtsam-rwhec diff``: what changed from one calibration to the next."""
 
 from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
+
 import typer
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import check_output
-from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.cli.calibrate_command import is_log
-from gtsam_rwhec.cli.calibrate_command import other_than_csv
-from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.cli.calibrate_command import is_log, other_than_csv
+from gtsam_rwhec.cli.failures import ExitStatus, check_output
 from gtsam_rwhec.cli.report_command import read_of
-from gtsam_rwhec.cli.shared_options import FOLDER_OF_CSV
-from gtsam_rwhec.cli.shared_options import RigOption
-from gtsam_rwhec.cli.shared_options import SensorsOption
-from gtsam_rwhec.cli.shared_options import TargetsOption
-from gtsam_rwhec.cli.shared_options import WorkersOption
+from gtsam_rwhec.cli.shared_options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
+from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.terminal_text import say
-from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 #: As ``rw.results.LEVEL``, which help must not bring in.
 LEVEL = 0.01

@@ -1,18 +1,18 @@
 """``gtsam-rwhec convert``: make an MCAP log of the files of other programs."""
 
 from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated
-from typing import Literal
+from typing import Annotated, Literal
+
 import typer
+
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.cli.shared_options import McapOption, refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.terminal_text import say
-from gtsam_rwhec.files.terminal_text import shown_path
-from gtsam_rwhec.cli.failures import ExitStatus
-from gtsam_rwhec.cli.shared_options import McapOption
-from gtsam_rwhec.cli.shared_options import refuse
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 

@@ -1,18 +1,17 @@
 """``gtsam-rwhec fleet run``: every robot of a fleet, from its logs to its calibration."""
 
 from __future__ import annotations
+
 import os
-from typing import Annotated
-from typing import Literal
-import typer
-import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import said_in_the_report
-from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.files.terminal_text import say
 from pathlib import Path
-from gtsam_rwhec.cli.failures import ExitStatus
-from gtsam_rwhec.cli.failures import check_output
-from gtsam_rwhec.files.terminal_text import shown_path
+from typing import Annotated, Literal
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.failures import ExitStatus, check_output, said_in_the_report
+from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 from gtsam_rwhec.files.whole_files import write_atomically
 
 Each = Literal["robot", "day", "log"]

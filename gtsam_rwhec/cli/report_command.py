@@ -1,15 +1,17 @@
 """``gtsam-rwhec report``: the report of a result as one HTML file."""
 
 from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
+
 import typer
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import check_output
+from gtsam_rwhec.cli.failures import ExitStatus, check_output
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.files.terminal_text import say
-from gtsam_rwhec.files.terminal_text import shown_path
-from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.files.terminal_text import say, shown_path
+
 
 def report(
     result: Annotated[Path, typer.Argument(help="Output folder of a calibration, or its result file (JSON).")],

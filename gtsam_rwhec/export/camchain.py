@@ -1,14 +1,12 @@
 """The cameras as a Kalibr camchain."""
 
 from __future__ import annotations
+
 import numpy as np
 from rwhec_factors.se3 import inverse
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.export.camera_words import NOT_KNOWN
-from gtsam_rwhec.export.camera_words import lacks
-from gtsam_rwhec.export.camera_words import origin
-from gtsam_rwhec.export.camera_words import row
-from gtsam_rwhec.export.camera_words import sorted_out
+from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, row, sorted_out
 from gtsam_rwhec.export.overlaps import overlaps
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.geometry.poses import Array

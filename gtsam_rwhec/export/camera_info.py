@@ -1,14 +1,13 @@
 """Each camera in ROS's camera_info YAML, as camera_calibration_parsers writes it and camera_info_manager reads it."""
 
 from __future__ import annotations
+
 from collections.abc import Iterable
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.export.camera_words import comment
-from gtsam_rwhec.export.camera_words import lacks
-from gtsam_rwhec.export.camera_words import origin
-from gtsam_rwhec.export.camera_words import plain_names
-from gtsam_rwhec.export.camera_words import row
+from gtsam_rwhec.export.camera_words import comment, lacks, origin, plain_names, row
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.rig_frames import RigFrames
 

@@ -1,7 +1,9 @@
 """What files for other programs say of a camera: where its intrinsics are from, and why a format cannot have it."""
 
 from __future__ import annotations
+
 from collections.abc import Iterable
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.files.terminal_text import shown

@@ -1,13 +1,12 @@
 """The cameras as COLMAP's ``cameras.txt``."""
 
 from __future__ import annotations
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import PIXEL_CENTRE
-from gtsam_rwhec.export.camera_words import NOT_KNOWN
-from gtsam_rwhec.export.camera_words import lacks
-from gtsam_rwhec.export.camera_words import origin
-from gtsam_rwhec.export.camera_words import sorted_out
+from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, sorted_out
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.rig.rig_frames import RigFrames
 

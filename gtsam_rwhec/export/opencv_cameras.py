@@ -1,15 +1,12 @@
 """The cameras, with their poses, in one file of OpenCV's FileStorage."""
 
 from __future__ import annotations
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.export.camera_info import ros_lacks
-from gtsam_rwhec.export.camera_words import NOT_KNOWN
-from gtsam_rwhec.export.camera_words import lacks
-from gtsam_rwhec.export.camera_words import origin
-from gtsam_rwhec.export.camera_words import plain_names
-from gtsam_rwhec.export.camera_words import row
-from gtsam_rwhec.export.camera_words import sorted_out
+from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, plain_names, row, sorted_out
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.rig_frames import RigFrames
 

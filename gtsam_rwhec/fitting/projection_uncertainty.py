@@ -10,21 +10,20 @@ pose by what hides dk best where corners were seen, dp = -(sum Jp' Jp)^-1 sum Jp
 """
 
 from __future__ import annotations
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.held_out import REGIONS
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import Regions
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
+from gtsam_rwhec.fitting.stated_intrinsics import parameters_of, pixels_and_derivatives
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.files.terminal_text import rounded
 
 #: A part of the image is said to be uncertain where projections are so many times as uncertain as in the best part,
 #: and by more than this: what was learnt in one part is extrapolated.

@@ -1,19 +1,17 @@
 """A comparison of methods as JSON: one object, lengths in metres, angles in radians, times in seconds."""
 
 from __future__ import annotations
+
 import dataclasses
 import json
 import math
 from pathlib import Path
 from typing import Any
-from gtsam_rwhec.methods.chained import Chained
-from gtsam_rwhec.methods.comparison import Compared
-from gtsam_rwhec.methods.comparison import Comparison
-from gtsam_rwhec.results.schema import CONVENTIONS
-from gtsam_rwhec.results.schema import SENSOR_CARRIER
-from gtsam_rwhec.results.schema import TARGET_CARRIER
-from gtsam_rwhec.results.schema import pose_rows
+
 from gtsam_rwhec.files.whole_files import write_atomically
+from gtsam_rwhec.methods.chained import Chained
+from gtsam_rwhec.methods.comparison import Compared, Comparison
+from gtsam_rwhec.results.schema import CONVENTIONS, SENSOR_CARRIER, TARGET_CARRIER, pose_rows
 
 FORMAT = "gtsam-rwhec comparison"
 FORMAT_VERSION = 1

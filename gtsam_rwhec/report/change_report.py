@@ -1,17 +1,13 @@
 """What changed between two calibrations, on the terminal: the verdict, a table, and what to keep in mind."""
 
 from __future__ import annotations
+
+from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import report_console
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
 from gtsam_rwhec.results.change_test import ChangeTest
 from gtsam_rwhec.results.common_quantities import Movement
-from gtsam_rwhec.results.difference import Difference
-from gtsam_rwhec.results.difference import share_words
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.results.difference import Difference, share_words
 
 MOVED_HEADINGS = ("mm", "°", "deviations", "chance", "changed")
 NUMBER_HEADINGS = ("old", "new", "deviations", "chance", "changed")

@@ -1,30 +1,28 @@
 """The report of a refinement from corners: errors in pixels, models tried, intrinsics, boards, consequences."""
 
 from __future__ import annotations
+
 import math
 from collections.abc import Iterator
+
 import numpy as np
 from rich.console import Console
+
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.corners_as_refined import CARRIER_RAD
-from gtsam_rwhec.fitting.corners_as_refined import CENTRE_PX
-from gtsam_rwhec.fitting.corners_as_refined import FOCAL_SHARE
-from gtsam_rwhec.fitting.corners_as_refined import OF_CARRIERS
-from gtsam_rwhec.fitting.corners_as_refined import centre_causes
-from gtsam_rwhec.fitting.corners_as_refined import focal_cause
+from gtsam_rwhec.files.terminal_text import natural_key, rounded
+from gtsam_rwhec.fitting.corners_as_refined import (
+    CARRIER_RAD,
+    CENTRE_PX,
+    FOCAL_SHARE,
+    OF_CARRIERS,
+    centre_causes,
+    focal_cause,
+)
 from gtsam_rwhec.fitting.projection_uncertainty import uneven_words
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.reprojection_record import Consequence
-from gtsam_rwhec.fitting.reprojection_record import Intrinsics
-from gtsam_rwhec.fitting.reprojection_record import Reprojection
+from gtsam_rwhec.fitting.reprojection_record import Consequence, Intrinsics, Reprojection
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import report_console
-from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
 
 ERRORS_LEGEND = (
     "rms: root mean square of the corners that count, along each axis. hold-out: root mean square length of the error "

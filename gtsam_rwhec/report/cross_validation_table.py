@@ -1,17 +1,16 @@
 """Hold-out errors as tables: of all measurements, of each sensor and target, and of each pair on request."""
 
 from __future__ import annotations
+
 import math
 from collections.abc import Mapping
+
 from rich.console import Console
-from gtsam_rwhec.calibration.cross_validation import CrossValidation
-from gtsam_rwhec.calibration.cross_validation import HoldOutError
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import report_console
+
+from gtsam_rwhec.calibration.cross_validation import CrossValidation, HoldOutError
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.report.pose_table import FrameTable
+from gtsam_rwhec.report.printing import print_list, print_sentence, print_tables, report_console
 
 HEADINGS = ("rms mm", "median", "95%", "rms°", "median", "95%", "seen mm", "seen°", "n")
 LEGEND = (

@@ -1,22 +1,19 @@
 """The tables of poses of the short report: with all standard deviations, or with the largest ones alone."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Collection
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+
 import gtsam
+
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
-from gtsam_rwhec.report.covariance_report import deviation_cells
-from gtsam_rwhec.report.covariance_report import label
-from gtsam_rwhec.report.covariance_report import scale_and_offset_sentences
-from gtsam_rwhec.report.pose_table import POSE_HEADINGS
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.pose_table import pose_cells
+from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS, deviation_cells, label, scale_and_offset_sentences
+from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
 from gtsam_rwhec.report.short_report import PoseTables
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.files.terminal_text import natural_key
 
 ANGLES = "R = Rz(yaw) Ry(pitch) Rx(roll)"
 ALL_DEVIATIONS = f"{ANGLES}. ±: one standard deviation along and about the frame's own axes"

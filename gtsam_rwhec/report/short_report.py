@@ -5,28 +5,23 @@ poses get the lines that are left. Where they do not fit, the short report says 
 """
 
 from __future__ import annotations
+
 import math
-from collections.abc import Callable
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+
 import numpy as np
-from rich.console import Console
-from rich.console import RenderableType
+from rich.console import Console, RenderableType
 from rich.text import Text
+
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.files.terminal_text import LONGEST_LINE
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.files.terminal_text import LONGEST_LINE, rounded, shown, shown_path
 from gtsam_rwhec.report.advice import Styled
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import STYLES
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import report_console
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.report.printing import STYLES, print_heading, print_sentence, report_console
 
 #: Lines of a short report, with what a command says besides.
 LINES = 40

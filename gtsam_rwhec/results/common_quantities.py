@@ -1,23 +1,23 @@
 """The quantities that two refined calibrations have in common: their difference, and the covariances of both."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Collection
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
+
 import gtsam
 import numpy as np
 from rwhec_factors.se3 import right_jacobian_inverse
-from gtsam_rwhec.fitting.joint_covariance import SHARE
-from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+
+from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.fitting.joint_covariance import SHARE, JointCovariance
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.files.terminal_text import rounded
+
 
 @dataclass(frozen=True)
 class Movement:

@@ -1,19 +1,21 @@
 """What follows from a calibration's poses and covariances alone, as people read it: angles, relative poses, points."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Iterator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Literal
+
 import gtsam
 import numpy as np
 from pydantic import Field
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.results.evidence_record import EvidenceRecord
-from gtsam_rwhec.files.terminal_text import natural_key
 
 Triple = tuple[float, float, float]
 Deviations = tuple[float | None, float | None, float | None]

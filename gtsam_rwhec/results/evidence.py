@@ -15,9 +15,8 @@ from pydantic import Field, ValidationError
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.files.whole_files import read_whole, write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected

@@ -21,6 +21,12 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.trial_fits import TrialFit, fitted
+from gtsam_rwhec.cameras.board_turns import choose_turns, turns_about_z
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Tag, Target, family_named
+from gtsam_rwhec.detect.detections import Detection
+from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import CameraError, LogError, PoseError, StampError, TransformError
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
@@ -30,12 +36,6 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig.log_contents import DriverTopic, LogContents
 from gtsam_rwhec.rig.sections import PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.trajectories.trajectory import Trajectory
-from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
-from gtsam_rwhec.cameras.board_turns import choose_turns, turns_about_z
-from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.detect.detections import Detection
-from gtsam_rwhec.detect.detector import Detector
-from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Tag, Target, family_named
 
 #: A sensor's target counts with at least this number of images.
 LEAST_IMAGES = 6

@@ -5,37 +5,35 @@ that has a camera of the images' size.
 """
 
 from __future__ import annotations
+
 import math
 import os
 import warnings
-from collections.abc import Iterable
-from collections.abc import Iterator
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_cameras
-from gtsam_rwhec.detect.images import Gray
-from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.detect.images import Gray, decode_gray
+from gtsam_rwhec.errors import CameraError, FileFormatError, ImageError, LogError
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs.image_folder import FORMATS
-from gtsam_rwhec.logs.image_folder import LARGEST_IMAGE
-from gtsam_rwhec.logs.pose_rows import NamedPoses
-from gtsam_rwhec.logs.pose_rows import PoseStatement
-from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.logs.image_folder import TABLES
-from gtsam_rwhec.logs.image_folder import TREES
-from gtsam_rwhec.logs.image_folder import image_stamps
-from gtsam_rwhec.logs.image_folder import match
-from gtsam_rwhec.logs.image_folder import pose_stamps
-from gtsam_rwhec.logs.image_folder import read_poses
+from gtsam_rwhec.logs.image_folder import (
+    FORMATS,
+    LARGEST_IMAGE,
+    TABLES,
+    TREES,
+    image_stamps,
+    match,
+    pose_stamps,
+    read_poses,
+)
+from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement
 
 #: Folders are looked at to this depth.
 DEPTH = 4

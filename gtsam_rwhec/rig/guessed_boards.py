@@ -7,31 +7,28 @@ in at least two images, the one that passes most often.
 """
 
 from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Callable
-from collections.abc import Iterator
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import permutations, product
+
 import cv2
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import CORNERS
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
+from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid
+from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
 from gtsam_rwhec.detect.board_evidence import evidence
 from gtsam_rwhec.detect.checkerboards import find_checkerboard
 from gtsam_rwhec.detect.circle_grids import find_circle_grid
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.detect.saddles import regions
-from gtsam_rwhec.geometry.poses import Array
-from collections.abc import Iterable
-from itertools import permutations
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.sections import Intrinsics
-from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
 
 #: The smallest board that is looked for, in corners or circles a side, and the largest.
 SMALLEST, LARGEST = 3, 30

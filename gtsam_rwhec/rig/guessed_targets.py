@@ -1,33 +1,32 @@
 """Guesses of the targets from the tags that were seen: single tags and boards. Their sizes are guesses too."""
 
 from __future__ import annotations
+
 import math
 import re
 from collections import Counter
-from collections.abc import Collection
-from collections.abc import Iterable
-from collections.abc import Iterator
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from gtsam_rwhec.cameras.targets import FAMILIES
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import family_named
-from gtsam_rwhec.detect.tags import SeenTag
-from gtsam_rwhec.rig.target_sections import AprilGridTarget
-from gtsam_rwhec.rig.target_sections import CharucoTarget
-from gtsam_rwhec.rig.target_sections import CheckerboardTarget
-from gtsam_rwhec.rig.target_sections import CircleGridTarget
-from gtsam_rwhec.rig.target_sections import TagGridTarget
-from gtsam_rwhec.rig.target_sections import TagTarget
-from gtsam_rwhec.rig.target_sections import TargetSection
 from typing import Literal
+
 import cv2
 import numpy as np
+
+from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, family_named
+from gtsam_rwhec.detect.tags import SeenTag
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.guessed_boards import BoardSeen
-from gtsam_rwhec.rig.log_contents import DriverTopic
-from gtsam_rwhec.rig.log_contents import ImageTopic
+from gtsam_rwhec.rig.log_contents import DriverTopic, ImageTopic
+from gtsam_rwhec.rig.target_sections import (
+    AprilGridTarget,
+    CharucoTarget,
+    CheckerboardTarget,
+    CircleGridTarget,
+    TagGridTarget,
+    TagTarget,
+    TargetSection,
+)
 
 #: Metres. A tag's side has this value in a first rig file, until a person measures it.
 TAG_M = 0.1

@@ -1,29 +1,22 @@
 """The content of a log for a rig file: cameras, tags in some of their images, drivers, and frames that move."""
 
 from __future__ import annotations
+
 import math
 from collections import Counter
-from dataclasses import dataclass
-from dataclasses import field
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.detect.images import Gray
-from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.detect.tags import BY_TRUST
-from gtsam_rwhec.detect.tags import SeenTag
-from gtsam_rwhec.detect.tags import tags_in_image
+
+from gtsam_rwhec.detect.images import Gray, decode_gray
+from gtsam_rwhec.detect.tags import BY_TRUST, SeenTag, tags_in_image
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import IntrinsicsRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import PoseRecord
-from gtsam_rwhec.logs import Topic
-from collections.abc import Iterable
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
 from gtsam_rwhec.logs.records import schema_word
-from gtsam_rwhec.rig.section_types import is_name
-from gtsam_rwhec.rig.section_types import is_text
+from gtsam_rwhec.rig.section_types import is_name, is_text
 from gtsam_rwhec.rig.sections import PoseSource
 
 #: This number of images of each topic, taken evenly from all, is searched for tags.

@@ -1,44 +1,36 @@
 """A first rig file, proposed from the content of a log; TODO marks the values that a person must state."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+
 from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.rig.rig import Rig
-from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.rig.sections import Carriers
-from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.rig.target_sections import TagTarget
-from gtsam_rwhec.rig.target_sections import TargetSection
-from collections.abc import Iterable
-from gtsam_rwhec.rig.carrier_roles import Origin
-from gtsam_rwhec.rig.carrier_roles import RoleEvidence
-from gtsam_rwhec.rig.carrier_roles import evidence_of_log
-from gtsam_rwhec.rig.guessed_boards import STATED
-from gtsam_rwhec.rig.guessed_boards import boards_seen
+from gtsam_rwhec.rig.carrier_roles import Origin, RoleEvidence, evidence_of_log
+from gtsam_rwhec.rig.guessed_boards import STATED, boards_seen
 from gtsam_rwhec.rig.guessed_targets import TODO as _TODO_SIZE
-from gtsam_rwhec.rig.guessed_targets import Guess
-from gtsam_rwhec.rig.guessed_targets import boards_guessed
-from gtsam_rwhec.rig.guessed_targets import targets_seen
-from gtsam_rwhec.rig.guessed_targets import with_size
-from gtsam_rwhec.rig.log_contents import DriverTopic
-from gtsam_rwhec.rig.log_contents import ImageTopic
-from gtsam_rwhec.rig.log_contents import LogContents
-from gtsam_rwhec.rig.log_contents import MovingPair
-from gtsam_rwhec.rig.log_contents import PoseTopic
-from gtsam_rwhec.rig.log_contents import camera_name
-from gtsam_rwhec.rig.log_contents import free_name
-from gtsam_rwhec.rig.log_contents import moving_pairs
-from gtsam_rwhec.rig.log_contents import read_contents
-from gtsam_rwhec.rig.odometry_sections import OdometrySensor
-from gtsam_rwhec.rig.odometry_sections import OdometrySource
-from gtsam_rwhec.rig.rig_file import rig_text
-from gtsam_rwhec.rig.section_types import is_name
-from gtsam_rwhec.rig.section_types import is_text
-from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.rig.guessed_targets import Guess, boards_guessed, targets_seen, with_size
+from gtsam_rwhec.rig.log_contents import (
+    DriverTopic,
+    ImageTopic,
+    LogContents,
+    MovingPair,
+    PoseTopic,
+    camera_name,
+    free_name,
+    moving_pairs,
+    read_contents,
+)
+from gtsam_rwhec.rig.odometry_sections import OdometrySensor, OdometrySource
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
+from gtsam_rwhec.rig.section_types import is_name, is_text
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 
 #: Written where a log has none, for a person to replace.
 _NO_INTRINSICS = Intrinsics(file="camera.yaml")

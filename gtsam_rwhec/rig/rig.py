@@ -1,47 +1,25 @@
 """A whole rig file: its sections, with a check for contradictions between them."""
 
 from __future__ import annotations
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
-from typing import Any
-from typing import Literal
-from typing import TypeAlias
-from pydantic import ConfigDict
-from pydantic import Discriminator
-from pydantic import Field
-from pydantic import ValidationError
-from pydantic import model_validator
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import ConfigDict, Discriminator, Field, ValidationError, model_validator
 from pydantic import Tag as UnionTag
-from pydantic_core import InitErrorDetails
-from pydantic_core import PydanticCustomError
-from gtsam_rwhec.cameras.targets import Target
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target, print_of
 from gtsam_rwhec.detect.detections import DetectionOptions
-from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.files.yaml_lines import dotted
-from gtsam_rwhec.rig.sections import Carriers
-from gtsam_rwhec.rig.sections import Cleaning
-from gtsam_rwhec.rig.sections import DetectionNoise
-from gtsam_rwhec.rig.sections import Sensor
+from gtsam_rwhec.errors import OptionError, TargetError
+from gtsam_rwhec.files.yaml_lines import KeyPath, dotted, suggestion
+from gtsam_rwhec.rig.odometry_sections import GivenSection, OdometrySensor, odometry_contradictions, with_what_follows
+from gtsam_rwhec.rig.section_types import Name, Section
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
-from collections.abc import Iterator
-from dataclasses import fields
-from dataclasses import replace
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.files.yaml_lines import suggestion
-from gtsam_rwhec.rig.odometry_sections import GivenSection
-from gtsam_rwhec.rig.odometry_sections import OdometrySensor
-from gtsam_rwhec.rig.odometry_sections import odometry_contradictions
-from gtsam_rwhec.rig.odometry_sections import with_what_follows
-from gtsam_rwhec.rig.section_types import Name
-from gtsam_rwhec.rig.section_types import Section
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import print_of
 
 #: Sensors that see targets have images or detections; others have odometry.
 AnySensor: TypeAlias = Annotated[

@@ -1,23 +1,22 @@
 """The calibrated frames that are exported and plotted: poses on the carriers, intrinsics, time offsets, topics."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Iterator
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
+
 from rwhec_factors.se3 import inverse
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import one_transform
+from gtsam_rwhec.errors import FrameError, StampError
+from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import Intrinsics
-from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics
+from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.rig.section_types import NAME
+
 
 class CalibratedFrame(NamedTuple):
     """One frame and its parent: names, and T_parent_child (4, 4) in metres."""

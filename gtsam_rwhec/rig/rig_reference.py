@@ -1,43 +1,35 @@
 """The reference of rig files, as Markdown, made of their sections: every key, its unit, default and an example."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Sequence
-from typing import Any
-from typing import get_args
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
-from gtsam_rwhec.cameras.targets import FAMILIES
-from gtsam_rwhec.rig.rig import RigFile
-from gtsam_rwhec.rig.sections import Carriers
-from gtsam_rwhec.rig.sections import Cleaning
-from gtsam_rwhec.rig.sections import DetectionNoise
-from gtsam_rwhec.rig.sections import Link
-from gtsam_rwhec.rig.sections import PoseNoise
-from gtsam_rwhec.rig.sections import PoseSource
-from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.rig.target_sections import BundleTagPlace
-from gtsam_rwhec.rig.target_sections import TargetSection
+
 import inspect
 import json
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from pydantic.json_schema import GenerateJsonSchema
-from pydantic.json_schema import JsonSchemaValue
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
-from gtsam_rwhec.rig.odometry_sections import GivenDirection
-from gtsam_rwhec.rig.odometry_sections import GivenDistance
-from gtsam_rwhec.rig.odometry_sections import GivenGround
-from gtsam_rwhec.rig.odometry_sections import GivenSection
-from gtsam_rwhec.rig.odometry_sections import OdometryNoiseSection
-from gtsam_rwhec.rig.odometry_sections import OdometrySensor
-from gtsam_rwhec.rig.odometry_sections import OdometrySource
-from gtsam_rwhec.rig.section_types import in_yaml
-from gtsam_rwhec.rig.section_types import keys_of
-from gtsam_rwhec.rig.section_types import unit_of
-from gtsam_rwhec.rig.sections import Intrinsics
+
+from gtsam_rwhec.cameras.targets import FAMILIES
 from gtsam_rwhec.detect.detections import DetectionOptions
+from gtsam_rwhec.rig.odometry_sections import (
+    GivenDirection,
+    GivenDistance,
+    GivenGround,
+    GivenSection,
+    OdometryNoiseSection,
+    OdometrySensor,
+    OdometrySource,
+)
+from gtsam_rwhec.rig.rig import RigFile
+from gtsam_rwhec.rig.section_types import in_yaml, keys_of, unit_of
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, Link, PoseNoise, PoseSource, Sensor
+from gtsam_rwhec.rig.target_sections import BundleTagPlace, TargetSection
 
 #: Before the tables.
 HEAD = """\

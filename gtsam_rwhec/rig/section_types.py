@@ -1,21 +1,17 @@
 """Types of single values of a rig file: names, lengths, positive numbers, with messages for wrong values."""
 
 from __future__ import annotations
+
 import json
 import re
-from typing import Annotated
-from typing import Any
-from typing import Literal
-from typing import TypeAlias
-from pydantic import AfterValidator
-from pydantic import BeforeValidator
-from pydantic import GetJsonSchemaHandler
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema
+
 from gtsam_rwhec.cameras.targets import LARGEST_M
 from gtsam_rwhec.files.yaml_lines import shown
-from pydantic import BaseModel
-from pydantic import ConfigDict
 
 #: A frame's name must match this pattern.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")

@@ -5,30 +5,30 @@ end with it stand beside the field: the reference (`reference`) and the JSON Sch
 """
 
 from __future__ import annotations
-from typing import Annotated
-from typing import Any
-from typing import Literal
-from pydantic import BeforeValidator
-from pydantic import Field
-from pydantic import model_validator
-from gtsam_rwhec.fitting.fit_options import Stated
+
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
+
 import numpy as np
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.quaternions import to_rotations
-from gtsam_rwhec.rig.section_types import EulerAxes
-from gtsam_rwhec.rig.section_types import FramePair
-from gtsam_rwhec.rig.section_types import Name
-from gtsam_rwhec.rig.section_types import OrText
-from gtsam_rwhec.rig.section_types import Positive
-from gtsam_rwhec.rig.section_types import Section
-from gtsam_rwhec.rig.section_types import Text
-from gtsam_rwhec.rig.section_types import TimeOffset
-from gtsam_rwhec.rig.section_types import list_of
-from gtsam_rwhec.rig.section_types import one_of
+from pydantic import BeforeValidator, Field, model_validator
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import Lens
+from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import to_rotations
+from gtsam_rwhec.rig.section_types import (
+    EulerAxes,
+    FramePair,
+    Name,
+    OrText,
+    Positive,
+    Section,
+    Text,
+    TimeOffset,
+    list_of,
+    one_of,
+)
 
 #: REP 103: a link's x is forward, y left, z up; an optical frame's z is forward, x right, y down. T_link_optical's R.
 R_LINK_OPTICAL = ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0))

@@ -1,35 +1,28 @@
 """The sections of a rig file that describe targets, one class for each type of target."""
 
 from __future__ import annotations
-from typing import Annotated
-from typing import ClassVar
-from typing import Literal
-from typing import TypeAlias
-from pydantic import Field
-from gtsam_rwhec.cameras.targets import FAMILIES
-from gtsam_rwhec.cameras.targets import AprilGrid
-from gtsam_rwhec.cameras.targets import Bundle
-from gtsam_rwhec.cameras.targets import BundleTag
-from gtsam_rwhec.cameras.targets import Charuco
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.cameras.targets import TagGrid
-from gtsam_rwhec.cameras.targets import Target
+
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-from typing import NoReturn
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.files.yaml_lines import YamlFile
-from gtsam_rwhec.files.yaml_lines import read_yaml
-from gtsam_rwhec.files.yaml_lines import shown
-from gtsam_rwhec.rig.section_types import InSchema
-from gtsam_rwhec.rig.section_types import Length
-from gtsam_rwhec.rig.section_types import Positive
-from gtsam_rwhec.rig.section_types import Section
-from gtsam_rwhec.rig.section_types import list_of
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeAlias
+
+from pydantic import Field
+
+from gtsam_rwhec.cameras.targets import (
+    FAMILIES,
+    AprilGrid,
+    Bundle,
+    BundleTag,
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    Tag,
+    TagGrid,
+    Target,
+)
+from gtsam_rwhec.errors import FileFormatError, RigError
+from gtsam_rwhec.files.yaml_lines import YamlFile, read_yaml, shown
+from gtsam_rwhec.rig.section_types import InSchema, Length, Positive, Section, list_of
 
 #: How many there are across and down, as the board is printed upright.
 Counts: TypeAlias = Annotated[tuple[int, int], list_of(2, "two whole numbers, [across, down]")]

@@ -1,33 +1,27 @@
 """Pictures of the detections in the images of a log, as PNG files in a folder."""
 
 from __future__ import annotations
+
 from collections import defaultdict
-from collections.abc import Iterable
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+
 import cv2
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.detect.images import decode_gray
 from gtsam_rwhec.detect.pictures import draw
 from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.files.progress import Counted
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.image_names import image_name
-from gtsam_rwhec.runs.image_names import image_names
-from gtsam_rwhec.runs.image_names import picture_file
-from gtsam_rwhec.runs.image_options import check_drawable
-from gtsam_rwhec.runs.log_contract import detections_topic
-from gtsam_rwhec.runs.log_contract import records_of
-from gtsam_rwhec.runs.log_metadata import read_cameras
-from gtsam_rwhec.runs.log_metadata import read_embedded_rig
-from gtsam_rwhec.runs.output_paths import made_folder
+from gtsam_rwhec.files.progress import Counted, Progress, silent
 from gtsam_rwhec.files.whole_files import write_atomically
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log, open_log
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.image_names import image_name, image_names, picture_file
+from gtsam_rwhec.runs.image_options import check_drawable
+from gtsam_rwhec.runs.log_contract import detections_topic, records_of
+from gtsam_rwhec.runs.log_metadata import read_cameras, read_embedded_rig
+from gtsam_rwhec.runs.output_paths import made_folder
+
 
 def draw_log(
     log_path: str | Path, detected_path: str | Path, folder: str | Path, *, progress: Progress | None = None

@@ -1,17 +1,15 @@
 """The intrinsics of each sensor, from the topic, file or numbers that the rig file names."""
 
 from __future__ import annotations
+
 import warnings
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_cameras
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import CameraWarning
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import IntrinsicsRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogError
+from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.logs.records import INTRINSICS_SCHEMAS
+from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.sections import Intrinsics
 
 #: Lens models without rays for more than this share of the image are warned of.

@@ -6,25 +6,22 @@ has no right checksum: it is dropped, and its images are detected again. Arrays 
 """
 
 from __future__ import annotations
+
 import base64
 import json
 import zlib
-from collections.abc import Iterator
-from collections.abc import Mapping
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
 import numpy as np
-from gtsam_rwhec.detect.detections import Detection
-from gtsam_rwhec.detect.detections import ImageDetections
-from gtsam_rwhec.detect.detections import Rejection
+
+from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.whole_files import appending_stream, write_atomically
 from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.files.whole_files import appending_stream
-from gtsam_rwhec.files.whole_files import write_atomically
 
 #: The kinds of objects that a line has, by the names that it has for them.
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection)}

@@ -1,24 +1,22 @@
 """Reading odometries: the poses of each sensor that knows only its own motion, from a log or from files."""
 
 from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import RwhecError
+
+from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import LogWriter
+from gtsam_rwhec.logs import Log, LogWriter
+from gtsam_rwhec.logs.image_folder import as_ns, read_poses
 from gtsam_rwhec.logs.pose_rows import PoseStatement
-from gtsam_rwhec.odometry import OdometryNoise
-from gtsam_rwhec.odometry import OdometryTrack
+from gtsam_rwhec.odometry import OdometryNoise, OdometryTrack
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.carrier_motion import poses_of_tf
-from gtsam_rwhec.runs.carrier_motion import poses_of_topic
-from gtsam_rwhec.logs.image_folder import as_ns
-from gtsam_rwhec.logs.image_folder import read_poses
 from gtsam_rwhec.rig.odometry_sections import odometry_topic
+from gtsam_rwhec.runs.carrier_motion import poses_of_tf, poses_of_topic
 
 #: A track of fewer poses has no motion to compare.
 FEWEST = 3

@@ -1,16 +1,16 @@
 """The calibrated frames of a solved log, for the exported files: poses, cameras, time offsets and topics."""
 
 from __future__ import annotations
+
 from collections.abc import Iterable
+
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.results.result_judgement import shortage
-from gtsam_rwhec.rig import CameraLink
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.runs.solving_stage import Solved
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.results.result_judgement import shortage
+from gtsam_rwhec.rig import CameraLink, Rig, RigFrames
 from gtsam_rwhec.rig.rig_frames import known_cameras
 from gtsam_rwhec.rig.sections import link_of_optical
+from gtsam_rwhec.runs.solving_stage import Solved
 
 #: Of intrinsics that were estimated before detection, and that no refinement from corners made better.
 BOARDS_ALONE = "estimated from views of boards alone, before the poses; standard deviations are not known"

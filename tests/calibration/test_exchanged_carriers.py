@@ -1,13 +1,15 @@
 """Carriers that are exchanged are told from those that are not, also at a few stations."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.misreadings import Exchange
-from gtsam_rwhec.calibration.misreadings import exchange_of
+from gtsam_rwhec.calibration.misreadings import Exchange, exchange_of
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+
 
 def at_stations(number: int, *, exchanged: bool, seed: int = 0, turn: float = 1.0) -> rw.Problem:
     """A camera on a hand over a board: 0.1 degree and 1 mm, turned by up to a radian or so."""

@@ -1,10 +1,11 @@
 """The verdict says how carriers turned where that is why poses are not known: one axis, a plane, too little."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
-from rwhec_factors.se3 import expmap
-from rwhec_factors.se3 import inverse
+from rwhec_factors.se3 import expmap, inverse
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.stages import turning_of
 from gtsam_rwhec.geometry.poses import Array

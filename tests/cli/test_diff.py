@@ -1,17 +1,18 @@
 """``gtsam-rwhec diff``: exit statuses, the verdict first, and names that cannot steer a terminal."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import gtsam
 import numpy as np
 import pytest
-from two_logs import calibrated
-from two_logs import log_of
+from two_logs import calibrated, log_of
 from typer.testing import CliRunner
+
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli import compare_results
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.cli.compare_results import diff
-from gtsam_rwhec.cli.compare_results import verify
 from gtsam_rwhec.cli.failures import ExitStatus
 
 BAD_NAME = "\x1b[31mleft<script>"
@@ -73,7 +74,7 @@ def test_a_calibration_of_csv_files_is_verified_on_others(folder: Path, tmp_path
 
 
 def test_the_level_is_that_of_the_library() -> None:
-    assert diff.LEVEL == rw.results.LEVEL
+    assert compare_results.LEVEL == rw.results.LEVEL
 
 
 def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path, tmp_path: Path) -> None:
@@ -104,15 +105,15 @@ def test_a_log_that_the_calibration_was_made_from_is_known_again(tmp_path: Path)
     result.write_bytes(b"{}")
     log.write_bytes(b"a log")
     other.write_bytes(b"another log")
-    assert not verify.is_of_old_log(result, log)  # nothing says what it was made from
+    assert not compare_results.is_of_old_log(result, log)  # nothing says what it was made from
     inputs = rw.results.Inputs(files=rw.results.input_files([log]), versions={})
     rw.results.write_evidence(rw.results.Evidence(inputs=inputs), rw.results.evidence_path(result), result)
     (tmp_path / "bag").mkdir()
-    assert not verify.is_of_old_log(result, tmp_path / "bag")
+    assert not compare_results.is_of_old_log(result, tmp_path / "bag")
     (tmp_path / "bag" / "again.mcap").write_bytes(b"a log")
-    assert verify.is_of_old_log(result, log)
-    assert verify.is_of_old_log(result, tmp_path / "bag")
-    assert not verify.is_of_old_log(result, other)
+    assert compare_results.is_of_old_log(result, log)
+    assert compare_results.is_of_old_log(result, tmp_path / "bag")
+    assert not compare_results.is_of_old_log(result, other)
 
 
 def test_a_path_that_is_none_is_refused(tmp_path: Path, folder: Path) -> None:

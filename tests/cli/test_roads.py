@@ -20,8 +20,8 @@ from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.solver import solve_options as solver_options
 from gtsam_rwhec.cli import calibrate_command
 from gtsam_rwhec.cli import shared_options
-from gtsam_rwhec.cli.convert_command import convert
 from gtsam_rwhec.cli.shared_options import command_of
+from gtsam_rwhec.cli import convert_command
 
 COMMANDS: Mapping[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 LOG = ("calibrate", CELL / "robot_cell.mcap", "--rig", CELL / "rig.yaml", "-o", "out")
@@ -54,8 +54,8 @@ ROADS = {
         calibrate_command.NOT_CERTIFIED_ONLY,
         calibrate_command.OF_FOLDER | calibrate_command.OF_SOLVE,
     ),
-    "bag": (BAG, convert.NOT_FOR_A_BAG, {"source", "output", "poses", "rig"}),
-    "described": ((*BAG, "--rig", "rig.yaml"), convert.NOT_WITH_A_RIG, {"source", "output", "rig"}),
+    "bag": (BAG, convert_command.NOT_FOR_A_BAG, {"source", "output", "poses", "rig"}),
+    "described": ((*BAG, "--rig", "rig.yaml"), convert_command.NOT_WITH_A_RIG, {"source", "output", "rig"}),
 }
 # These choose the way, and so are never passed over.
 CHOOSING = {"folder": {"rig"}, "certified": {"rig"}}

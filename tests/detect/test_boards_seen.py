@@ -1,16 +1,13 @@
 """Sizes of boards without tags, found out from rendered images; no size where there is no such board."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
-from rendered import pose
-from rendered import printed
-from rendered import render
-from gtsam_rwhec.cameras import Camera
-from gtsam_rwhec.cameras import Charuco
-from gtsam_rwhec.cameras import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Target
+from rendered import pose, printed, render
+
+from gtsam_rwhec.cameras import Camera, Charuco, Checkerboard
+from gtsam_rwhec.cameras.targets import CircleGrid, Target
 from gtsam_rwhec.rig.guessed_boards import boards_seen
 
 CAMERA = Camera.of(480, 360, "pinhole", [[500.0, 0, 240], [0, 500.0, 180], [0, 0, 1]], (), "a test")

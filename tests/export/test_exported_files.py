@@ -1,6 +1,7 @@
 """Every exported format read back by its own rules, and compared with the transforms that went in."""
 
 from __future__ import annotations
+
 import ast
 import sys
 import types
@@ -8,32 +9,21 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 import yaml
-from exported_rigs import ONE
-from exported_rigs import camera
-from exported_rigs import frames_of
-from exported_rigs import on_random_poses
-from exported_rigs import transforms
-from hypothesis import example
-from hypothesis import given
-from hypothesis import settings
+from exported_rigs import ONE, camera, frames_of, on_random_poses, transforms
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+
 from gtsam_rwhec.cameras.intrinsics_files import read_colmap_cameras
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.export import camchain_yaml
-from gtsam_rwhec.export import export_all
-from gtsam_rwhec.export import static_tf_launch
-from gtsam_rwhec.export import tf_yaml
-from gtsam_rwhec.export import urdf_xacro
-from gtsam_rwhec.export.written_poses import fixed_axis_angles
-from gtsam_rwhec.export.written_poses import number
-from gtsam_rwhec.export.written_poses import quaternion_xyzw
-from gtsam_rwhec.rig import CameraLink
-from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.export import camchain_yaml, export_all, static_tf_launch, tf_yaml, urdf_xacro
+from gtsam_rwhec.export.written_poses import fixed_axis_angles, number, quaternion_xyzw
+from gtsam_rwhec.rig import CameraLink, RigFrames
 from gtsam_rwhec.rig.sections import link_of_optical
 
 XACRO = {"xacro": "http://www.ros.org/wiki/xacro"}

@@ -2,10 +2,12 @@
 
 import subprocess
 import sys
+
 import pytest
-from gtsam_rwhec.errors import MissingPackageError
-from gtsam_rwhec.errors import RwhecError
+
+from gtsam_rwhec.errors import MissingPackageError, RwhecError
 from gtsam_rwhec.files.optional_packages import extra_named
+
 
 def test_missing_package_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
@@ -24,11 +26,7 @@ def test_other_missing_modules_are_left_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("package", "statement", "extra"),
-    [
-        ("cv2", "rw.detect.decode_gray", "log"),
-        ("mcap", "rw.calibrate_log", "log"),
-    ],
+    ("package", "statement", "extra"), [("cv2", "rw.detect.decode_gray", "log"), ("mcap", "rw.calibrate_log", "log")]
 )
 def test_names_of_packages(package: str, statement: str, extra: str) -> None:
     code = f"""

@@ -1,20 +1,18 @@
 """Losses of GTSAM's and graduated truncation inside refine."""
 
 from __future__ import annotations
+
 from typing import Any
+
 import numpy as np
 import pytest
-from refinement_problems import copied
-from refinement_problems import distance
-from refinement_problems import refined
-from refinement_problems import rig
+from refinement_problems import copied, distance, refined, rig
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.pose_models import GeodesicModel
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.simulate import Noise, Simulation, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 LOSSES = ("huber", "cauchy", "tukey", "geman_mcclure")

@@ -1,25 +1,21 @@
 """The demo says which errors we put into its log, and how far its answer is from the truth."""
 
 from __future__ import annotations
+
 import dataclasses
 import io
 from pathlib import Path
+
 import gtsam
 import numpy as np
 import pytest
 from rich.console import Console
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import slots_of
-from gtsam_rwhec.report.demo_report import hidden_sentences
-from gtsam_rwhec.report.demo_report import print_demo
-from gtsam_rwhec.report.demo_report import truth_table
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.log_history import OutlierCount
-from gtsam_rwhec.results.log_history import SizeFields
-from gtsam_rwhec.results.log_history import TrackCount
 from gtsam_rwhec.datasets import demo_truth
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, slots_of
+from gtsam_rwhec.report.demo_report import hidden_sentences, print_demo, truth_table
+from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TrackCount
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 

@@ -1,26 +1,24 @@
 """What changed from one calibration to the next: two logs, a camera that was knocked, and what cannot be compared."""
 
 from __future__ import annotations
+
 import dataclasses
 from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from two_logs import KNOCKED
-from two_logs import calibrated
-from two_logs import log_of
+from two_logs import KNOCKED, calibrated, log_of
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import FileFormatError, FrameError, OptionError
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.results.difference import without_constant_errors
-from gtsam_rwhec.results.log_history import CleaningReport
-from gtsam_rwhec.results.log_history import DetectionReport
-from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport, LogFields
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.results.schema import CalibrationFields
 from gtsam_rwhec.simulate.simulated_rigs import Motion
+
 
 @pytest.fixture(scope="module")
 def old() -> rw.Calibration:

@@ -1,23 +1,21 @@
 """Whether an old calibration still holds on a new log: knocked cameras, moved boards, short logs, gross errors."""
 
 from __future__ import annotations
+
 import dataclasses
 from typing import Any
+
 import numpy as np
 import pytest
 from rwhec_factors.se3 import expmap
-from two_logs import X
-from two_logs import Y
-from two_logs import calibrated
-from two_logs import log_of
+from two_logs import X, Y, calibrated, log_of
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, UnderdeterminedError
 from gtsam_rwhec.results.near_answer import without_gross_errors
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.simulate.simulated_rigs import Motion
+
 
 def verified(
     old: rw.Calibration | Result, problem: rw.Problem, *, systematic: bool = False, **options: Any

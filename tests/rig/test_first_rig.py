@@ -1,35 +1,27 @@
 """First rig files: what is named by looking at a log, what is marked for a person, and logs that give none."""
 
 from __future__ import annotations
+
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
-from gtsam_rwhec.detect.tags import dictionary
-from gtsam_rwhec.detect.tags import tags_in_image
+
+from gtsam_rwhec.detect.tags import dictionary, tags_in_image
 from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.rig import AprilGridTarget
-from gtsam_rwhec.rig import CharucoTarget
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.rig import propose_rig
+from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
+from gtsam_rwhec.rig import AprilGridTarget, CharucoTarget, Rig, parse_rig, propose_rig
 from gtsam_rwhec.rig.guessed_targets import targets_seen
-from gtsam_rwhec.rig.log_contents import ImageTopic
-from gtsam_rwhec.rig.log_contents import Tags
-from gtsam_rwhec.rig.log_contents import frame_name
+from gtsam_rwhec.rig.log_contents import ImageTopic, Tags, frame_name
 from gtsam_rwhec.rig.section_types import is_name
 
 STEP_NS = 100_000_000

@@ -1,17 +1,19 @@
 """Files of poses that do not say what their numbers mean: the reading that explains the images is found."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
+
 from gtsam_rwhec.cameras.targets import Tag
 from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.rig.folder_contents import read_folder
-from gtsam_rwhec.rig.folder_proposal import View
-from gtsam_rwhec.rig.folder_proposal import best_reading
+from gtsam_rwhec.rig.folder_proposal import View, best_reading
 
 TAG = Tag("tag", "tag36h11", 0, 0.1)
 COUNT = 12

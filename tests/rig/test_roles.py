@@ -1,17 +1,14 @@
 """Eye-in-hand or eye-to-hand: what solving both ways tells, and where it cannot tell."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
-from gtsam_rwhec.cameras.targets import CORNERS
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.cameras.targets import Target
+
+from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid, Tag, Target
 from gtsam_rwhec.detect.detector import Detection
-from gtsam_rwhec.rig.carrier_roles import Seen
-from gtsam_rwhec.rig.carrier_roles import evidence_of_roles
+from gtsam_rwhec.rig.carrier_roles import Seen, evidence_of_roles
 
 TAG = Tag("tag", "tag36h11", 0, 0.1)
 

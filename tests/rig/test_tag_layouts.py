@@ -1,13 +1,14 @@
 """Columns and rows of boards of tags from where the tags are in images; what does not lie as on a board gives none."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
+
 from gtsam_rwhec.cameras import AprilGrid
 from gtsam_rwhec.cameras.targets import TagGrid
 from gtsam_rwhec.detect.tags import SeenTag
-from gtsam_rwhec.rig.guessed_targets import Kind
-from gtsam_rwhec.rig.guessed_targets import layout_of
+from gtsam_rwhec.rig.guessed_targets import Kind, layout_of
 
 KINDS: tuple[Kind, ...] = ("charuco", "tag_grid")
 SQUARE = 0.5 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])

@@ -1,16 +1,14 @@
 """Gross outliers of a pair found without knowing X or Y."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.runs import ConsensusOptions
-from gtsam_rwhec.runs import find_consensus
-from gtsam_rwhec.runs.pair_consensus import closed_form
-from gtsam_rwhec.runs.pair_consensus import distances
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.runs import ConsensusOptions, find_consensus
+from gtsam_rwhec.runs.pair_consensus import closed_form, distances
+from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 NOISE = Noise(0.02, 0.5 / np.radians(2.0) ** 2)

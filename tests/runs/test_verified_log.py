@@ -1,20 +1,21 @@
 """Whether an old calibration still holds on a new log, from the messages on."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import numpy as np
 import pytest
 import synthetic_logs as made
 from rwhec_factors import se3
 from typer.testing import CliRunner
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.runs.old_calibration import OldCalibration
-from gtsam_rwhec.runs.old_calibration import with_cameras
-from gtsam_rwhec.runs.verified_log import verify_log
 from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.errors import FrameError, LogError
+from gtsam_rwhec.runs.old_calibration import OldCalibration, with_cameras
+from gtsam_rwhec.runs.verified_log import verify_log
 
 #: Three of the old calibration's joint deviations and more: 4 mm and 0.3 degrees.
 KNOCK = se3.expmap(np.array([[0.0, 0.005, 0.0, 0.004, 0.0, 0.0]]))[0]

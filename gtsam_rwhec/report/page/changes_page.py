@@ -1,25 +1,18 @@
 """The page of what changed between two calibrations, and of whether an old one still holds."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.report.change_report import CHANGE_LEGEND
-from gtsam_rwhec.report.change_report import change_tables
-from gtsam_rwhec.report.change_report import remark_sentences
-from gtsam_rwhec.report.page.blocks import Block
-from gtsam_rwhec.report.page.blocks import Listing
-from gtsam_rwhec.report.page.blocks import Page
-from gtsam_rwhec.report.page.blocks import Paragraph
-from gtsam_rwhec.report.page.blocks import Section
-from gtsam_rwhec.report.page.blocks import Table
+from gtsam_rwhec.files.whole_files import checked_path
+from gtsam_rwhec.report.change_report import CHANGE_LEGEND, change_tables, remark_sentences
+from gtsam_rwhec.report.page.blocks import Block, Listing, Page, Paragraph, Section, Table
 from gtsam_rwhec.report.page.html import write_page
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.verification_report import ERROR_LEGEND
-from gtsam_rwhec.report.verification_report import verification_remarks
-from gtsam_rwhec.report.verification_report import verification_tables
+from gtsam_rwhec.report.verification_report import ERROR_LEGEND, verification_remarks, verification_tables
 from gtsam_rwhec.results.difference import Difference
 from gtsam_rwhec.results.verification import Verification
-from gtsam_rwhec.files.whole_files import checked_path
 
 MADE_BY = "Written by gtsam-rwhec."
 

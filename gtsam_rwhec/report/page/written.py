@@ -1,33 +1,30 @@
 """``write_html``: the report of a calibration as one HTML file."""
 
 from __future__ import annotations
+
 import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import EvidenceWarning
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import EvidenceWarning, FileFormatError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.files.whole_files import checked_path, is_one_of, read_whole
 from gtsam_rwhec.report.page.blocks import Page
 from gtsam_rwhec.report.page.figure_files import write_figures
 from gtsam_rwhec.report.page.html import write_page
 from gtsam_rwhec.report.page.sections import sections_of
 from gtsam_rwhec.report.page.shown_result import ShownResult
-from gtsam_rwhec.results import Evidence
-from gtsam_rwhec.results import evidence_path
-from gtsam_rwhec.results import read_evidence
+from gtsam_rwhec.results import Evidence, evidence_path, read_evidence
 from gtsam_rwhec.results.evidence import checksum
 from gtsam_rwhec.results.json_tree import MOST_BYTES
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_file import calibration_json
-from gtsam_rwhec.files.whole_files import checked_path
-from gtsam_rwhec.files.whole_files import is_one_of
 
 #: The name of a result in an output folder.
 RESULT_FILE = "result.json"

@@ -1,23 +1,19 @@
 """Charts of the joint covariance: standard deviations of each frame by axis, and the correlation of all unknowns."""
 
 from __future__ import annotations
+
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
+
 import numpy as np
-from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.page.blocks import Block
-from gtsam_rwhec.report.page.blocks import Chart
-from gtsam_rwhec.report.page.blocks import Paragraph
-from gtsam_rwhec.report.page.figures import INK
-from gtsam_rwhec.report.page.figures import svg_figure
-from gtsam_rwhec.report.plots.drawing import AXIS_COLOURS
-from gtsam_rwhec.report.plots.drawing import AXIS_NAMES
-from gtsam_rwhec.report.plots.drawing import plain_decades
-from gtsam_rwhec.report.plots.drawing import shortened
+
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.report.page.blocks import Block, Chart, Paragraph
+from gtsam_rwhec.report.page.figures import INK, svg_figure
+from gtsam_rwhec.report.plots.drawing import AXIS_COLOURS, AXIS_NAMES, plain_decades, shortened
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

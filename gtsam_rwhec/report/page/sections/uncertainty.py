@@ -1,27 +1,16 @@
 """Section 7: how well poses are known: deviations, correlation, points at several distances, intrinsics and clocks."""
 
 from __future__ import annotations
-from collections.abc import Callable
-from collections.abc import Iterator
+
+from collections.abc import Callable, Iterator
+
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
-from gtsam_rwhec.report.page.blocks import Block
-from gtsam_rwhec.report.page.blocks import Folded
-from gtsam_rwhec.report.page.blocks import Number
-from gtsam_rwhec.report.page.blocks import Paragraph
-from gtsam_rwhec.report.page.blocks import Section
-from gtsam_rwhec.report.page.blocks import Table
-from gtsam_rwhec.report.page.blocks import Words
-from gtsam_rwhec.report.page.blocks import significant
-from gtsam_rwhec.report.page.sections.covariance_charts import correlation_chart
-from gtsam_rwhec.report.page.sections.covariance_charts import deviations_chart
-from gtsam_rwhec.report.page.sections.pose_tables import ANGLES
-from gtsam_rwhec.report.page.sections.pose_tables import LEGEND
-from gtsam_rwhec.report.page.sections.pose_tables import TRANSLATION
-from gtsam_rwhec.report.page.sections.pose_tables import deviation_cells
-from gtsam_rwhec.report.page.sections.pose_tables import known_unknowns
+from gtsam_rwhec.report.page.blocks import Block, Folded, Number, Paragraph, Section, Table, Words, significant
+from gtsam_rwhec.report.page.sections.covariance_charts import correlation_chart, deviations_chart
+from gtsam_rwhec.report.page.sections.pose_tables import ANGLES, LEGEND, TRANSLATION, deviation_cells, known_unknowns
 from gtsam_rwhec.report.page.shown_result import ShownResult
-from gtsam_rwhec.files.terminal_text import natural_key
 
 #: So many frames have a column of their own in a table of what moves them.
 MOST_COLUMNS = 12
