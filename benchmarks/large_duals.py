@@ -9,24 +9,22 @@ one, is not counted. CPU seconds are those of the whole search.
 """
 
 from __future__ import annotations
+
 import time
 from collections import Counter
 from collections.abc import Sequence
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.solver.certificate import Cause
-from gtsam_rwhec.solver.certificate import Multipliers
-from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.search import Found
-from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.solve_options import SolveOptions
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver.certificate import Cause, Multipliers
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.solve_options import SolveOptions
 
 KINDS = ("star", "many sensors", "chain", "graph")
 

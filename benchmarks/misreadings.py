@@ -10,34 +10,27 @@ Exits with 1 if a bar is missed.
 """
 
 from __future__ import annotations
+
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
-from misread_problems import KINDS
-from misread_problems import KINDS_OF_GRAPHS
-from misread_problems import Kind
-from misread_problems import misread
+from misread_problems import KINDS, KINDS_OF_GRAPHS, Kind, misread
 from rwhec_factors.se3 import expmap
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
 from gtsam_rwhec.calibration.trial_fits import implausible
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import cameras
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import sphere
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.simulate import Motion, Noise, cameras, general, sphere
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver.solution import Solution
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 

@@ -9,24 +9,20 @@ one is missed.
 """
 
 from __future__ import annotations
+
 import argparse
 import functools
 import os
 import sys
 import time
 import warnings
+
 import numpy as np
-from paper_tables import BAR
-from paper_tables import Experiment
-from paper_tables import Runs
-from paper_tables import in_parallel
-from paper_tables import largest_difference
-from paper_tables import print_table
-from paper_tables import simulated
-from paper_tables import wide_console
+from paper_tables import BAR, Experiment, Runs, in_parallel, largest_difference, print_table, simulated, wide_console
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.solver.solve_options import Method
 from gtsam_rwhec.simulate.simulated_noise import NoiseModel
+from gtsam_rwhec.solver.solve_options import Method
 
 EXPERIMENTS = (
     Experiment(2, 125, 0.01, ((10.9, 5.6), (0.77, 0.36), (3.71, 2.13), (0.62, 0.36))),

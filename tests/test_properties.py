@@ -1,31 +1,27 @@
 """What must hold for every problem: gauges, order, batches, merging, bounds, exact data, a world far away."""
 
 from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_cost import naive_cost
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import pose
+from rwhec_factors.se3 import inverse, pose
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
+from gtsam_rwhec.simulate.simulated_noise import random_poses, rotations_of_vectors
 from gtsam_rwhec.solver.answers import answer_of
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.rotations import kkt_multipliers
-from gtsam_rwhec.solver.rotations import random_rotations
-from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
+from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
 
 NOISE = Noise(0.01, 500.0)
 SEEDS = st.integers(0, 2**31 - 1)

@@ -1,34 +1,28 @@
 """The calibration that ``calibrate`` returns: the poses to use, the verdict, and everything that was found."""
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import field
+
+from dataclasses import dataclass, field
+
 import gtsam
 from numpy.typing import ArrayLike
+
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.noise_choice import NoiseFound
-from gtsam_rwhec.calibration.outliers import Outliers
-from gtsam_rwhec.calibration.outliers import contradicted_frames
-from gtsam_rwhec.calibration.point_uncertainty import Carriers
-from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
-from gtsam_rwhec.calibration.point_uncertainty import SensorView
-from gtsam_rwhec.calibration.point_uncertainty import point_uncertainty
+from gtsam_rwhec.calibration.outliers import Outliers, contradicted_frames
+from gtsam_rwhec.calibration.point_uncertainty import Carriers, PointUncertainty, SensorView, point_uncertainty
 from gtsam_rwhec.calibration.sizes import TargetSize
 from gtsam_rwhec.calibration.trial_fits import Implausible
-from gtsam_rwhec.calibration.verdict import REFINEMENT
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.calibration.verdict import REFINEMENT, Choice, Finding, Judgement, Verdict
 from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.poses import Array, PoseLike
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.files.terminal_text import natural_key
+
 
 @dataclass(frozen=True)
 class Calibration:

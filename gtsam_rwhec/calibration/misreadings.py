@@ -10,41 +10,45 @@ none, never (280 draws).
 """
 
 from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+
 import numpy as np
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import so3_logmap
+from rwhec_factors.se3 import inverse, so3_logmap
+
 from gtsam_rwhec.calibration.moved_frames import explains_more
-from gtsam_rwhec.calibration.other_readings import A_INVERTED
-from gtsam_rwhec.calibration.other_readings import AS_READ
-from gtsam_rwhec.calibration.other_readings import DOUBLE
-from gtsam_rwhec.calibration.other_readings import SINGLE
-from gtsam_rwhec.calibration.other_readings import Mistake
-from gtsam_rwhec.calibration.other_readings import OtherReading
-from gtsam_rwhec.calibration.other_readings import WrongUnit
-from gtsam_rwhec.calibration.other_readings import readings_of_angles
-from gtsam_rwhec.calibration.other_readings import shifted
-from gtsam_rwhec.calibration.other_readings import wrong_unit
-from gtsam_rwhec.calibration.trial_fits import Implausible
-from gtsam_rwhec.calibration.trial_fits import Sampled
-from gtsam_rwhec.calibration.trial_fits import Spread
-from gtsam_rwhec.calibration.trial_fits import TrialFit
-from gtsam_rwhec.calibration.trial_fits import fitted
-from gtsam_rwhec.calibration.trial_fits import implausible
-from gtsam_rwhec.calibration.trial_fits import residual_of
-from gtsam_rwhec.calibration.trial_fits import signal_of
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import check_progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.calibration.other_readings import (
+    A_INVERTED,
+    AS_READ,
+    DOUBLE,
+    SINGLE,
+    Mistake,
+    OtherReading,
+    WrongUnit,
+    readings_of_angles,
+    shifted,
+    wrong_unit,
+)
+from gtsam_rwhec.calibration.trial_fits import (
+    Implausible,
+    Sampled,
+    Spread,
+    TrialFit,
+    fitted,
+    implausible,
+    residual_of,
+    signal_of,
+)
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.files.terminal_text import rounded
+
 
 @dataclass(frozen=True)
 class Reading:

@@ -1,28 +1,20 @@
 """The stage of the noise: by which model it is found, the refined answer under it, and what is said of it."""
 
 from __future__ import annotations
+
 import math
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import numpy as np
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
-from gtsam_rwhec.calibration.calibrate_options import Run
-from gtsam_rwhec.calibration.calibrate_options import offsets_of
-from gtsam_rwhec.calibration.outliers import Inliers
-from gtsam_rwhec.calibration.outliers import spare_equations
-from gtsam_rwhec.calibration.verdict import REFINEMENT
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import UnderdeterminedError
+
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run, offsets_of
+from gtsam_rwhec.calibration.outliers import Inliers, spare_equations
+from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
+from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import Component
-from gtsam_rwhec.fitting.fit_options import NoiseOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE
-from gtsam_rwhec.fitting.noise_in_data import NoiseInData
-from gtsam_rwhec.fitting.noise_in_data import ratio_words
+from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio_words
 from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
@@ -30,10 +22,8 @@ from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.certified_solution import solve
-from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.solution import contradicted_by
-from gtsam_rwhec.solver.solution import overstated_by
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by
+
 
 @dataclass(frozen=True)
 class NoiseFound:

@@ -6,21 +6,19 @@ names exchanged are both poses inverted. Where the residuals cannot tell two rea
 """
 
 from __future__ import annotations
+
 import itertools
-from collections.abc import Callable
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+
 import numpy as np
-from rwhec_factors.se3 import expmap
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import pose
-from rwhec_factors.se3 import so3_logmap
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.quaternions import of_rows
-from gtsam_rwhec.geometry.quaternions import to_rotations
-from gtsam_rwhec.problem.measurements import Pair
+from rwhec_factors.se3 import expmap, inverse, pose, so3_logmap
+
 from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import of_rows, to_rotations
+from gtsam_rwhec.problem.measurements import Pair
 
 Rows = tuple[Array, Array]
 

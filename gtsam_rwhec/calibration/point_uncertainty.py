@@ -8,33 +8,26 @@ The noise of one new measurement is told apart: it averages out over measurement
 """
 
 from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 from rwhec_factors import se3
-from scipy.special import chdtr
-from scipy.special import chdtri
-from scipy.special import fdtr
-from scipy.special import fdtri
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import PoseError
-from gtsam_rwhec.files.terminal_text import brief
+from scipy.special import chdtr, chdtri, fdtr, fdtri
+
+from gtsam_rwhec.errors import FrameError, OptionError, PoseError
+from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.geometry.poses import LARGEST_M
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.geometry.poses import one_transform
+from gtsam_rwhec.geometry.poses import LARGEST_M, Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_real
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.files.terminal_text import rounded
 
 #: Nodes of the quadrature over directions, in cos(polar angle) and in azimuth. With these the probability of a ball is
 #: right to 1e-6 for axes of any ratio that changes the radius.

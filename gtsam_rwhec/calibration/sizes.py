@@ -7,31 +7,23 @@ is estimated again under the whole model of the noise; where there is none, bloc
 """
 
 from __future__ import annotations
+
 import math
 import warnings
-from collections.abc import Mapping
-from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import check_progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.fitting.fit_options import NoiseOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.fit_options import Walk
+
+from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions, Walk
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_refinement import refine_under_noise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
@@ -39,7 +31,6 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.certified_solution import solve
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.files.terminal_text import rounded
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
 SIZE_SIGMAS = 5.0

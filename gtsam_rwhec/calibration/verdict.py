@@ -1,14 +1,17 @@
 """The verdict on a calibration: may its poses be used? Reports, files, exports and the exit status share this rule."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+
+from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FEW
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.files.terminal_text import rounded
+
 
 class Verdict(StrEnum):
     """What to do with the poses. ``str()`` is a sentence; the value is the word that files have."""

@@ -11,6 +11,7 @@ of A_i X = Y B_i. The caller names the words for targets and sensors; either wor
 """
 
 from __future__ import annotations
+
 import codecs
 import io
 import math
@@ -18,21 +19,17 @@ import re
 import warnings
 from pathlib import Path
 from typing import NoReturn
+
 import numpy as np
 from numpy.typing import NDArray
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.files.whole_files import read_whole
+
+from gtsam_rwhec.errors import FileFormatError, RwhecWarning
+from gtsam_rwhec.files.terminal_text import brief, natural_key, shown
+from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.long_translations import LongTranslations
-from gtsam_rwhec.problem.long_translations import warn_of_millimetres
-from gtsam_rwhec.problem.measurements import GivenMeasurements
-from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
+from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.files.whole_files import checked_path
 
 COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 

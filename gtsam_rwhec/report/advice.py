@@ -1,19 +1,19 @@
 """What a person should do about a calibration: where it needs other measurements, and what is odd about its log."""
 
 from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+
 import numpy as np
 from rich.console import Console
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeReason
+
+from gtsam_rwhec.calibration.verdict import Ground, Judgement
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.report.printing import print_heading, print_sentence
+from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 
 #: A sentence as it is printed, and its style.
 Styled = tuple[str, str]

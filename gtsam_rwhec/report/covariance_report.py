@@ -1,15 +1,16 @@
 """The report of a refined calibration: how well each frame, relative pose, scale and time offset is known."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Callable
-from collections.abc import Collection
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
+
 import numpy as np
 from rich.console import Console
+
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.fitting.refined import PairNoise
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import PairNoise, Refined
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
@@ -17,22 +18,11 @@ from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.advice import print_advice
 from gtsam_rwhec.report.corner_report import print_corners
 from gtsam_rwhec.report.log_report import print_log
-from gtsam_rwhec.report.pose_table import POSE_HEADINGS
-from gtsam_rwhec.report.pose_table import RESIDUAL_LEGEND
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.pose_table import pose_cells
-from gtsam_rwhec.report.pose_table import residual_table
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import print_verdict
-from gtsam_rwhec.report.printing import report_console
+from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
+from gtsam_rwhec.report.printing import print_heading, print_sentence, print_tables, print_verdict, report_console
 from gtsam_rwhec.report.solution_report import print_solution_details
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_judgement import contradicted
-from gtsam_rwhec.results.result_judgement import contradicted_names
-from gtsam_rwhec.results.result_judgement import judge
-from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.results.result_judgement import contradicted, contradicted_names, judge
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 #: Beside the name of a frame whose pose is not to be used.

@@ -1,21 +1,20 @@
 """The report of the demo: the errors in its log, how far the calibration is from the truth, and what to do next."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import numpy as np
 from rich.console import Console
+
+from gtsam_rwhec.datasets import DemoTruth
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import report_console
+from gtsam_rwhec.report.printing import print_heading, print_list, print_tables, report_console
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.datasets import DemoTruth
 
 LEGEND = (
     "off: difference between the found pose and the true pose. 95 %: whether the true pose is inside the 95 % "

@@ -1,25 +1,21 @@
 """Tables of calibrated frames: their poses, and the residuals of their measurements."""
 
 from __future__ import annotations
+
 import math
-from collections.abc import Collection
-from collections.abc import Iterable
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+
 import gtsam
 import numpy as np
 from rich import box
-from rich.console import Console
-from rich.console import ConsoleOptions
-from rich.console import RenderResult
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
-from gtsam_rwhec.files.terminal_text import printable
-from gtsam_rwhec.files.terminal_text import shown
+
+from gtsam_rwhec.files.terminal_text import natural_key, printable, shown
 from gtsam_rwhec.solver.answers import Residual
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.files.terminal_text import natural_key
 
 RESIDUAL_LEGEND = (
     "rms: root mean square length of the residuals of a frame's n measurements, weighted as in the cost, in mm "

@@ -1,13 +1,13 @@
 """A solution in words: what is proven, its parts, its scale and its weights."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
-from gtsam_rwhec.solver.certificate import Basis
-from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.certificate import Status
-from gtsam_rwhec.solver.solution import Solution
+
+from collections.abc import Iterator, Mapping
+
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.solver.certificate import Basis, Certificate, Status
+from gtsam_rwhec.solver.solution import Solution
+
 
 def certificate_sentence(certificate: Certificate, answer: str = "this answer") -> str:
     """What the certificate proves about the cost of the answer, which the sentence calls ``answer``."""

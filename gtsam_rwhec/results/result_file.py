@@ -4,65 +4,58 @@
 """
 
 from __future__ import annotations
+
 import json
-from collections.abc import Collection
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import fields
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
 import numpy as np
-from pydantic import BaseModel
-from pydantic import ConfigDict
+from pydantic import BaseModel, ConfigDict
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import ResultVersionError
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.results.agreement import check_certificates
-from gtsam_rwhec.results.agreement import check_log
-from gtsam_rwhec.results.agreement import check_says_what_it_is_about
-from gtsam_rwhec.results.agreement import check_scale
-from gtsam_rwhec.results.agreement import check_sizes
-from gtsam_rwhec.results.agreement import check_top
-from gtsam_rwhec.results.agreement import check_verdict
+from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
+from gtsam_rwhec.files.terminal_text import brief, shown
+from gtsam_rwhec.files.whole_files import checked_path, read_whole, write_atomically
+from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
+from gtsam_rwhec.results.agreement import (
+    check_certificates,
+    check_log,
+    check_says_what_it_is_about,
+    check_scale,
+    check_sizes,
+    check_top,
+    check_verdict,
+)
 from gtsam_rwhec.results.corners_agreement import check_corners
-from gtsam_rwhec.results.covariance_agreement import check_frames
-from gtsam_rwhec.results.covariance_agreement import check_joint
-from gtsam_rwhec.results.earlier_versions import FIRST_VERSION
-from gtsam_rwhec.results.earlier_versions import FIRST_WITH_CALIBRATION
-from gtsam_rwhec.results.earlier_versions import FIRST_WITH_REGION
-from gtsam_rwhec.results.earlier_versions import FIRST_WITH_VERDICT
-from gtsam_rwhec.results.earlier_versions import as_version_4
-from gtsam_rwhec.results.json_tree import MOST_BYTES
-from gtsam_rwhec.results.json_tree import POSED
-from gtsam_rwhec.results.json_tree import from_json
-from gtsam_rwhec.results.json_tree import in_words
-from gtsam_rwhec.results.json_tree import parse_json
-from gtsam_rwhec.results.json_tree import to_json
+from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
+from gtsam_rwhec.results.earlier_versions import (
+    FIRST_VERSION,
+    FIRST_WITH_CALIBRATION,
+    FIRST_WITH_REGION,
+    FIRST_WITH_VERDICT,
+    as_version_4,
+)
+from gtsam_rwhec.results.json_tree import MOST_BYTES, POSED, from_json, in_words, parse_json, to_json
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_judgement import contradicted_names
-from gtsam_rwhec.results.result_judgement import judge
-from gtsam_rwhec.results.schema import CONVENTIONS
-from gtsam_rwhec.results.schema import FORMAT
-from gtsam_rwhec.results.schema import FORMAT_VERSION
-from gtsam_rwhec.results.schema import SENSOR_CARRIER
-from gtsam_rwhec.results.schema import TARGET_CARRIER
-from gtsam_rwhec.results.schema import CalibrationFields
-from gtsam_rwhec.results.schema import FrameFields
-from gtsam_rwhec.results.schema import RefinedFields
-from gtsam_rwhec.results.schema import ResultFile
-from gtsam_rwhec.results.schema import pose_rows
+from gtsam_rwhec.results.result_judgement import contradicted_names, judge
+from gtsam_rwhec.results.schema import (
+    CONVENTIONS,
+    FORMAT,
+    FORMAT_VERSION,
+    SENSOR_CARRIER,
+    TARGET_CARRIER,
+    CalibrationFields,
+    FrameFields,
+    RefinedFields,
+    ResultFile,
+    pose_rows,
+)
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.files.whole_files import checked_path
+
 
 @dataclass(frozen=True)
 class Result:

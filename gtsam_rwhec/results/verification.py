@@ -1,43 +1,28 @@
 """Whether an old calibration still holds: the record, and its verdict in words."""
 
 from __future__ import annotations
+
 from collections.abc import Collection
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import numpy as np
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.cross_validation import PredictionError
-from gtsam_rwhec.calibration.cross_validation import prediction_errors
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.calibration.cross_validation import PredictionError, prediction_errors
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import Component
-from gtsam_rwhec.fitting.fit_options import NoiseOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.files.terminal_text import rounded, shown
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.change_test import LEVEL
-from gtsam_rwhec.results.change_test import ChangeTest
-from gtsam_rwhec.results.change_test import change_test
-from gtsam_rwhec.results.change_test import checked_level
-from gtsam_rwhec.results.common_quantities import Movement
-from gtsam_rwhec.results.common_quantities import Quantities
-from gtsam_rwhec.results.common_quantities import quantities
-from gtsam_rwhec.results.difference import as_result
-from gtsam_rwhec.results.difference import share_words
-from gtsam_rwhec.results.difference import without_constant_errors
-from gtsam_rwhec.results.near_answer import NearAnswer
-from gtsam_rwhec.results.near_answer import near
-from gtsam_rwhec.results.near_answer import stated_as
+from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
+from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
+from gtsam_rwhec.results.difference import as_result, share_words, without_constant_errors
+from gtsam_rwhec.results.near_answer import NearAnswer, near, stated_as
 from gtsam_rwhec.results.result_file import Result
-from gtsam_rwhec.files.terminal_text import rounded
 
 #: Why frames are not checked.
 UNSEEN_SENSOR = "the new log has no measurement by it"

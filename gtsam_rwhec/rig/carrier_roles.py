@@ -30,12 +30,12 @@ from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import CameraError, LogError, PoseError, StampError, TransformError
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log, TfBuffer
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig.log_contents import DriverTopic, LogContents
 from gtsam_rwhec.rig.sections import PoseNoise, PoseSource, Sensor
-from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: A sensor's target counts with at least this number of images.
 LEAST_IMAGES = 6

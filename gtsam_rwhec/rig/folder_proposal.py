@@ -1,55 +1,33 @@
 """A first rig file, proposed from the content of a folder of images; TODO marks the values that a person must state."""
 
 from __future__ import annotations
-from collections.abc import Sequence
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detections import Detection
 from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.rig.rig import Rig
-from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.rig.sections import Carriers
-from gtsam_rwhec.rig.sections import PoseSource
-from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.rig.target_sections import TagTarget
-from gtsam_rwhec.rig.target_sections import TargetSection
-from collections.abc import Iterator
-from dataclasses import dataclass
-from dataclasses import replace
 from gtsam_rwhec.logs.image_folder import pose_stamps
 from gtsam_rwhec.logs.pose_rows import PoseStatement
-from gtsam_rwhec.rig.carrier_roles import Rest
-from gtsam_rwhec.rig.carrier_roles import RoleEvidence
-from gtsam_rwhec.rig.carrier_roles import Seen
-from gtsam_rwhec.rig.carrier_roles import evidence_of_roles
-from gtsam_rwhec.rig.carrier_roles import origin_of
-from gtsam_rwhec.rig.carrier_roles import rest_of
-from gtsam_rwhec.rig.folder_contents import FolderPoses
-from gtsam_rwhec.rig.folder_contents import ImageFolder
-from gtsam_rwhec.rig.folder_contents import poses_read
-from gtsam_rwhec.rig.folder_contents import read_folder
-from gtsam_rwhec.rig.folder_contents import read_gray
-from gtsam_rwhec.rig.guessed_boards import STATED
-from gtsam_rwhec.rig.guessed_boards import BoardSeen
-from gtsam_rwhec.rig.guessed_boards import boards_seen
-from gtsam_rwhec.rig.guessed_boards import guessed_intrinsics
-from gtsam_rwhec.rig.guessed_targets import Guess
-from gtsam_rwhec.rig.guessed_targets import boards_guessed
-from gtsam_rwhec.rig.guessed_targets import targets_seen
-from gtsam_rwhec.rig.guessed_targets import with_size
-from gtsam_rwhec.rig.log_contents import ImageTopic
-from gtsam_rwhec.rig.log_contents import camera_name
-from gtsam_rwhec.rig.log_contents import free_name
-from gtsam_rwhec.rig.rig_file import rig_text
+from gtsam_rwhec.rig.carrier_roles import Rest, RoleEvidence, Seen, evidence_of_roles, origin_of, rest_of
+from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, poses_read, read_folder, read_gray
+from gtsam_rwhec.rig.guessed_boards import STATED, BoardSeen, boards_seen, guessed_intrinsics
+from gtsam_rwhec.rig.guessed_targets import Guess, boards_guessed, targets_seen, with_size
+from gtsam_rwhec.rig.log_contents import ImageTopic, camera_name, free_name
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
 from gtsam_rwhec.rig.section_types import is_text
-from gtsam_rwhec.rig.sections import Intrinsics
-from gtsam_rwhec.detect.detections import Detection
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 
 #: At most this number of images of each folder, spread over all, is searched for targets, and solved for roles.
 IMAGES = 16

@@ -13,7 +13,7 @@ from rwhec_factors.se3 import inverse, pose
 from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.pairs import ByPair, Pair
+from gtsam_rwhec.problem.measurements import ByPair, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.simulated_noise import (
     Noise,

@@ -1,18 +1,17 @@
 """Which clocks are worth estimating: motion between the stamps decides, not the stamps alone."""
 
 from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.clock_offsets import FEWEST_STAMPS
-from gtsam_rwhec.calibration.clock_offsets import Clock
-from gtsam_rwhec.calibration.clock_offsets import offsets_worth_estimating
+from gtsam_rwhec.calibration.clock_offsets import FEWEST_STAMPS, Clock, offsets_worth_estimating
 from gtsam_rwhec.geometry import Trajectory
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 X, Y = random_poses(2, 0.5, np.random.default_rng(0))

@@ -1,27 +1,22 @@
 """Misreadings are named with their cures, and good problems are not accused."""
 
 from __future__ import annotations
+
 import math
+
 import numpy as np
 import pytest
-from misread_problems import KINDS
-from misread_problems import KINDS_OF_GRAPHS
-from misread_problems import Kind
-from misread_problems import misread
+from misread_problems import KINDS, KINDS_OF_GRAPHS, Kind, misread
 from rwhec_factors.se3 import expmap
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.calibration.other_readings import Mistake
-from gtsam_rwhec.calibration.other_readings import shifted
-from gtsam_rwhec.calibration.trial_fits import Sampled
-from gtsam_rwhec.calibration.trial_fits import fitted
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.calibration.other_readings import Mistake, shifted
+from gtsam_rwhec.calibration.trial_fits import Sampled, fitted
+from gtsam_rwhec.errors import OptionError, RwhecError
+from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver.solution import Solution
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
 #: One of each mistake; benchmarks/misreadings.py has all, on real and simulated rigs.

@@ -1,13 +1,13 @@
 """Outliers that agree with one another name the frame that moved; others, and the frames beside it, are not named."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
-from rwhec_factors.se3 import expmap
-from rwhec_factors.se3 import inverse
+from rwhec_factors.se3 import expmap, inverse
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.moved_frames import Measured
-from gtsam_rwhec.calibration.moved_frames import moved_with_outliers
+from gtsam_rwhec.calibration.moved_frames import Measured, moved_with_outliers
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair

@@ -1,27 +1,24 @@
 """What a subcommand passes over it refuses: every option, on every way that the subcommand can go."""
 
 from __future__ import annotations
+
 import shlex
-from collections.abc import Collection
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
-from typing import get_args
+from typing import Any, get_args
+
 import pytest
 import typer
-from places import CELL
-from places import DEMO
+from places import CELL, DEMO
 from typer.testing import CliRunner
-from gtsam_rwhec.calibration.calibrate_options import NoiseChoice
-from gtsam_rwhec.calibration.calibrate_options import RobustChoice
+
+from gtsam_rwhec.calibration.calibrate_options import NoiseChoice, RobustChoice
+from gtsam_rwhec.cli import calibrate_command, convert_command, shared_options
 from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.cli.shared_options import command_of
 from gtsam_rwhec.logs.image_folder import Columns
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.solver import solve_options as solver_options
-from gtsam_rwhec.cli import calibrate_command
-from gtsam_rwhec.cli import shared_options
-from gtsam_rwhec.cli.shared_options import command_of
-from gtsam_rwhec.cli import convert_command
 
 COMMANDS: Mapping[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 LOG = ("calibrate", CELL / "robot_cell.mcap", "--rig", CELL / "rig.yaml", "-o", "out")

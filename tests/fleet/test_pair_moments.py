@@ -1,21 +1,18 @@
 """Moments of parts, merged in any partition, are the moments of the whole."""
 
 from __future__ import annotations
+
 import numpy as np
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.fleet.merging import CHUNK
-from gtsam_rwhec.fleet.merging import merged
+from gtsam_rwhec.fleet.merging import CHUNK, merged
 from gtsam_rwhec.fleet.pair_moments import PairMoments
 from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.selection import problem_of_moments
-from gtsam_rwhec.simulate.simulated_noise import Noise
-from gtsam_rwhec.simulate.simulated_noise import perturb
-from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.simulate.simulated_rigs import Motion
-from gtsam_rwhec.simulate.simulated_rigs import carrier_poses
+from gtsam_rwhec.simulate.simulated_noise import Noise, perturb, random_poses
+from gtsam_rwhec.simulate.simulated_rigs import Motion, carrier_poses
 
 NOISE = Noise(sigma_m=0.002, kappa=0.5 / np.radians(0.2) ** 2)
 RNG = np.random.default_rng(5)

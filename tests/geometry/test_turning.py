@@ -1,14 +1,14 @@
 """Turns of a sensor and of its carrier."""
 
 from __future__ import annotations
+
 import numpy as np
-from turning_tracks import Y
-from turning_tracks import carrier
-from turning_tracks import track
+from turning_tracks import Y, carrier, track
+
 from gtsam_rwhec.geometry.carrier_motion import SmoothPath
-from gtsam_rwhec.geometry.time_offset import Turns
-from gtsam_rwhec.geometry.time_offset import aligned
+from gtsam_rwhec.geometry.time_offset import Turns, aligned
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+
 
 def test_the_best_rotation_of_vectors() -> None:
     R = random_poses(1, 1.0, np.random.default_rng(3))[0, :3, :3]

@@ -1,11 +1,12 @@
 """A carrier that turns about all axes, and what a sensor sees of a target."""
 
 from __future__ import annotations
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.geometry import Trajectory
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 X, Y = random_poses(2, 1.0, np.random.default_rng(0))

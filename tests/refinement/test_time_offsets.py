@@ -1,18 +1,17 @@
 """Time offsets as variables, and the carriers' twists."""
 
 from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
-from refinement_problems import KAPPA
-from refinement_problems import SIGMA_M
-from refinement_problems import refined
+from refinement_problems import KAPPA, SIGMA_M, refined
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry import Trajectory
 from gtsam_rwhec.geometry.carrier_motion import LocalPaths
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 X = gtsam.Pose3.Expmap(np.array([0.3, 0.1, -0.4, 1.0, 0.5, 0.2])).matrix()

@@ -1,17 +1,15 @@
 """Where poses come from, by names and types; whether images were taken at rest."""
 
 from __future__ import annotations
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
+
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.rig import PoseNoise
-from gtsam_rwhec.rig.carrier_roles import ARM
-from gtsam_rwhec.rig.carrier_roles import MOTION_CAPTURE
-from gtsam_rwhec.rig.carrier_roles import ODOMETRY
-from gtsam_rwhec.rig.carrier_roles import origin_of
-from gtsam_rwhec.rig.carrier_roles import rest_of
-from gtsam_rwhec.rig.carrier_roles import smoothness_m
+from gtsam_rwhec.rig.carrier_roles import ARM, MOTION_CAPTURE, ODOMETRY, origin_of, rest_of, smoothness_m
+
 
 @pytest.mark.parametrize(
     ("names", "schema", "noise", "reason"),

@@ -1,29 +1,26 @@
 """``solve`` and ``certify`` from outside: optimality against the measurements, anybody's answer, starts, reports."""
 
 from __future__ import annotations
+
 import warnings
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 from naive_cost import naive_cost
 from rwhec_factors.se3 import pose
-from solved_problems import MODES
-from solved_problems import NOISE
-from solved_problems import matrices
-from solved_problems import simulated
+from solved_problems import MODES, NOISE, matrices, simulated
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import NotCertifiedWarning
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.solver import Cause
-from gtsam_rwhec.solver import Start
+from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning
+from gtsam_rwhec.simulate import Motion, Noise, general
+from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver import Cause, Start
 from gtsam_rwhec.solver import search as attempt
 from gtsam_rwhec.solver.bound import Bound
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.simulate.simulated_noise import random_poses
+
 
 def cost_of(problem: rw.Problem, X: Any, Y: Any, scale: Any) -> float:
     """By plain loops over the measurements."""

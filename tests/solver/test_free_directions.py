@@ -1,24 +1,25 @@
 """What is free: records, and their words."""
 
 from __future__ import annotations
+
 import warnings
 from typing import Any
+
 import numpy as np
 import pytest
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import pose
+from rwhec_factors.se3 import inverse, pose
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import carrier_poses
-from gtsam_rwhec.simulate import perturb
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeKind
-from gtsam_rwhec.solver.free_directions import FreeReason
-from gtsam_rwhec.solver.free_directions import free_directions_of
-from gtsam_rwhec.solver.free_directions import reason_for
-from gtsam_rwhec.solver.free_directions import sparse_basis
+from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, perturb
 from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
+from gtsam_rwhec.solver.free_directions import (
+    FreeDirection,
+    FreeKind,
+    FreeReason,
+    free_directions_of,
+    reason_for,
+    sparse_basis,
+)
 
 NOISE = Noise(0.005, 5000.0)
 

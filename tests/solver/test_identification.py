@@ -1,25 +1,19 @@
 """What the motion determines: alone, along the graph, together; without noise and with it."""
 
 from __future__ import annotations
+
 from typing import Any
+
 import numpy as np
 import pytest
-from identified_problems import FRAMES
-from identified_problems import MOCAP
-from identified_problems import NOISE
-from identified_problems import identify
-from identified_problems import of_motions
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import pose
+from identified_problems import FRAMES, MOCAP, NOISE, identify, of_motions
+from rwhec_factors.se3 import inverse, pose
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
-from gtsam_rwhec.simulate import sphere
-from gtsam_rwhec.solver import FreeKind
-from gtsam_rwhec.solver import FreeReason
+from gtsam_rwhec.simulate import Motion, general, perturb, sphere
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver import FreeKind, FreeReason
 
 # -- one pair: Corollaries 2 and 4 ------------------------------------------------------------------
 

@@ -1,24 +1,20 @@
 """The information that motions give, against residuals differentiated numerically."""
 
 from __future__ import annotations
+
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 from rwhec_factors.se3 import inverse
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.solver.answers import Answer
-from gtsam_rwhec.solver.answers import PairPoses
-from gtsam_rwhec.solver.answers import costs_of_pairs
-from gtsam_rwhec.solver.information import information
-from gtsam_rwhec.solver.information import order_of
-from gtsam_rwhec.solver.information import pair_information
-from gtsam_rwhec.solver.information import prior_information
-from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver.answers import Answer, PairPoses, costs_of_pairs
+from gtsam_rwhec.solver.information import information, order_of, pair_information, prior_information
+from gtsam_rwhec.solver.parts import Part, parts_of
 
 NOISE = Noise(0.02, 300.0)
 STEP = 1e-5

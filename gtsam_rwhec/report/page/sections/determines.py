@@ -1,27 +1,16 @@
 """Section 4: which sensor and target determine each other, and which directions are free or weak, with their cures."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
+
+from collections.abc import Iterator, Mapping
+
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.report.page.blocks import Block
-from gtsam_rwhec.report.page.blocks import Folded
-from gtsam_rwhec.report.page.blocks import Listing
-from gtsam_rwhec.report.page.blocks import Number
-from gtsam_rwhec.report.page.blocks import Paragraph
-from gtsam_rwhec.report.page.blocks import Section
-from gtsam_rwhec.report.page.blocks import Table
-from gtsam_rwhec.report.page.blocks import Words
-from gtsam_rwhec.report.page.blocks import significant
+from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Number, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.sections.weak_directions import weak_blocks
 from gtsam_rwhec.report.page.shown_result import ShownResult
-from gtsam_rwhec.report.pair_grid import DETERMINED
-from gtsam_rwhec.report.pair_grid import NOT_DETERMINED
-from gtsam_rwhec.report.pair_grid import NOT_OBSERVED
-from gtsam_rwhec.report.pair_grid import Symbol
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeReason
-from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10
