@@ -103,7 +103,7 @@ def test_choices_are_those_of_the_library() -> None:
     assert set(get_args(calibrate_command.Method)) == set(get_args(solver_options.Method))
     assert set(get_args(calibrate_command.Noise)) == set(get_args(NoiseChoice))
     assert set(get_args(calibrate_command.Robust)) == set(get_args(RobustChoice))
-    assert set(get_args(convert.Columns)) == set(get_args(Columns))
+    assert set(get_args(convert_command.Columns)) == set(get_args(Columns))
 
 
 def test_all_refused_options_are_named_at_once() -> None:
