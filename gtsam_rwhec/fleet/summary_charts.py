@@ -11,9 +11,8 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.page.blocks import Chart
-from gtsam_rwhec.report.page.figures import svg_figure
-from gtsam_rwhec.report.plots.drawing import GREEN, ORANGE, VERMILLION, plain_decades
+from gtsam_rwhec.report.figures import GREEN, ORANGE, VERMILLION, plain_decades, svg_figure
+from gtsam_rwhec.report.report_blocks import Chart
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

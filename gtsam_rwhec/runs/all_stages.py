@@ -1,19 +1,20 @@
 """All stages, one after the other: from a log and a rig file to a folder with the calibration in every form."""
 
 from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
-from gtsam_rwhec.export.files import FILES, FOLDERS
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.export.files import FILES
+from gtsam_rwhec.export.files import FOLDERS
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.result_file import write_calibration
 from gtsam_rwhec.rig import Rig
@@ -21,31 +22,40 @@ from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_inputs import inputs_of
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.earlier_output import OutputFolder, list_written, log_name, output_folder, remove_unchanged
-from gtsam_rwhec.runs.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
+from gtsam_rwhec.runs.earlier_output import OutputFolder
+from gtsam_rwhec.runs.earlier_output import list_written
+from gtsam_rwhec.runs.earlier_output import log_name
+from gtsam_rwhec.runs.earlier_output import output_folder
+from gtsam_rwhec.runs.earlier_output import remove_unchanged
+from gtsam_rwhec.runs.folder_log import check_is_no_other_folder
+from gtsam_rwhec.runs.folder_log import is_folder_of_images
+from gtsam_rwhec.runs.folder_log import write_folder_log
 from gtsam_rwhec.runs.image_detections import image_count
 from gtsam_rwhec.runs.image_options import check_image_options
 from gtsam_rwhec.runs.intrinsics import check_intrinsics_files
 from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.log_contract import (
-    CLEAN_LOG,
-    CLEANING_METADATA,
-    DETECTED_LOG,
-    PLOTS_FOLDER,
-    RECORDED_LOG,
-    RESULT_FILE,
-    SEEN_SHEET,
-    is_from_stage,
-)
-from gtsam_rwhec.runs.log_metadata import read_embedded_rig, read_metadata
+from gtsam_rwhec.runs.log_contract import CLEAN_LOG
+from gtsam_rwhec.runs.log_contract import CLEANING_METADATA
+from gtsam_rwhec.runs.log_contract import DETECTED_LOG
+from gtsam_rwhec.runs.log_contract import RECORDED_LOG
+from gtsam_rwhec.runs.log_contract import RESULT_FILE
+from gtsam_rwhec.runs.log_contract import SEEN_SHEET
+from gtsam_rwhec.runs.log_contract import is_from_stage
+from gtsam_rwhec.runs.log_metadata import read_embedded_rig
+from gtsam_rwhec.runs.log_metadata import read_metadata
 from gtsam_rwhec.runs.log_report import write_report
-from gtsam_rwhec.runs.output_paths import INSIDE, LEFT, check_is_not_read, made_folder, made_output_folder
-from gtsam_rwhec.runs.samples_log import is_file_of_samples, write_samples_log
+from gtsam_rwhec.runs.output_paths import LEFT
+from gtsam_rwhec.runs.output_paths import check_is_not_read
+from gtsam_rwhec.runs.output_paths import made_folder
+from gtsam_rwhec.runs.output_paths import made_output_folder
+from gtsam_rwhec.runs.samples_log import is_file_of_samples
+from gtsam_rwhec.runs.samples_log import write_samples_log
 from gtsam_rwhec.runs.seen_in_log import Pictures
 from gtsam_rwhec.runs.solution_frames import frames_of
-from gtsam_rwhec.runs.solution_plots import plot_all
-from gtsam_rwhec.runs.solved_log import read_solved, write_solved
-from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
+from gtsam_rwhec.runs.solved_log import read_solved
+from gtsam_rwhec.runs.solved_log import write_solved
+from gtsam_rwhec.runs.solving_stage import Calibrated
+from gtsam_rwhec.runs.solving_stage import solve_log
 
 #: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
 OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
@@ -78,7 +88,7 @@ def calibrate_log(
 
     The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
     ``camchain.yaml``, ``cameras.opencv.yaml``, ``cameras.txt`` (COLMAP's), ``camera_info/`` (ROS's, one file a camera),
-    ``seen.png`` (a contact sheet of the images), ``plots/``, and ``report.html`` with its ``evidence.json``. For a log
+    ``seen.png`` (a contact sheet of the images), and ``report.html`` with its ``evidence.json``. For a log
     that a stage wrote, only the stages after it run. A cleaned log is cleaned again if the settings for cleaning in
     `rig` differ from those that the log was cleaned with.
 
@@ -278,10 +288,9 @@ def solve_into(
 def export_solved(
     solved_path: str | Path, out: str | Path, *, anyway: bool = False, progress: Progress | None = None
 ) -> list[Path]:
-    """Write the files for other programs, and plots, from a solved log into a folder; return their paths.
+    """Write the files for other programs from a solved log into a folder; return their paths.
 
-    Poses that are not to be used get plots only, and no files for other programs: those of an earlier calibration in
-    this folder are removed.
+    Poses that are not to be used get no such files: those of an earlier calibration in this folder are removed.
 
     Parameters
     ----------
@@ -310,8 +319,6 @@ def export_solved(
             (out / name).unlink(missing_ok=True)
     else:
         written = export_all(frames_of(solved), out)
-    tell("plotting")
-    written += plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))
-    remove_unchanged(out, INSIDE, keep=written)
+    remove_unchanged(out, FOLDERS, keep=written)
     list_written(out, solved.log.detection.sources, written)
     return written

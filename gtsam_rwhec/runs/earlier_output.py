@@ -11,23 +11,31 @@ programs do not say what they are from. One rule serves ``calibrate``, ``demo`` 
 """
 
 from __future__ import annotations
-
 import hashlib
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection
+from collections.abc import Iterable
+from collections.abc import Iterator
+from collections.abc import Sequence
+from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from typing import Literal, TypeAlias
-
-from pydantic import BaseModel, ConfigDict
-
-from gtsam_rwhec.errors import LogError, RwhecError
+from typing import Literal
+from typing import TypeAlias
+from pydantic import BaseModel
+from pydantic import ConfigDict
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.runs.detection_inputs import differences
-from gtsam_rwhec.runs.kept_detections import KeptDetections, kept_inputs
-from gtsam_rwhec.runs.log_contract import DETECTED_LOG, RECORDED_LOG
-from gtsam_rwhec.runs.output_paths import INSIDE, is_written, made_output_folder
+from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.kept_detections import kept_inputs
+from gtsam_rwhec.runs.log_contract import DETECTED_LOG
+from gtsam_rwhec.runs.log_contract import RECORDED_LOG
+from gtsam_rwhec.runs.output_paths import is_written
+from gtsam_rwhec.runs.output_paths import made_output_folder
+from gtsam_rwhec.export.files import FOLDERS
 
 try:
     import fcntl
@@ -235,7 +243,7 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
             "(--force; in Python replace=True), or give another folder"
         )
     is_going_on = before is not None and before.state != "finished"
-    others_of_ours = {LIST_FILE, DETECTIONS, *INSIDE}
+    others_of_ours = {LIST_FILE, DETECTIONS, *FOLDERS}
     if before is not None and is_going_on and before.log.endswith(RECORDED_LOG):
         others_of_ours.add(before.log)
     ours = {name for name in there if is_written(name) or name in others_of_ours}
@@ -275,7 +283,7 @@ def _names_in(folder: Path) -> list[str]:
     names = []
     try:
         for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
-            if entry.name in INSIDE and entry.is_dir() and not entry.is_symlink():
+            if entry.name in FOLDERS and entry.is_dir() and not entry.is_symlink():
                 names += [f"{entry.name}/{inside.name}" for inside in sorted(entry.iterdir())]
             elif entry.name not in _OF_DESKTOPS:
                 names.append(entry.name)

@@ -1,30 +1,37 @@
 """The evidence of a calibration from a log, gathered: what its report shows beside the result."""
 
 from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 from os.path import commonpath
 from pathlib import Path
-
 from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results import Evidence
 from gtsam_rwhec.results.contribution import contribution_of
 from gtsam_rwhec.results.derived import derived_of
-from gtsam_rwhec.results.evidence import Inputs, input_files, versions
-from gtsam_rwhec.results.linear_model import LinearModel, MeasuredRows
+from gtsam_rwhec.results.evidence import Inputs
+from gtsam_rwhec.results.evidence import input_files
+from gtsam_rwhec.results.evidence import versions
+from gtsam_rwhec.results.linear_model import LinearModel
+from gtsam_rwhec.results.linear_model import MeasuredRows
 from gtsam_rwhec.results.proof_spectrum import proof_of
 from gtsam_rwhec.results.residual_evidence import residuals_of
-from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
+from gtsam_rwhec.results.scene_evidence import SceneEvidence
+from gtsam_rwhec.results.scene_evidence import scene_of
 from gtsam_rwhec.results.weak_poses import weak_directions
 from gtsam_rwhec.rig import rig_text
-from gtsam_rwhec.runs.seen_in_log import Pictures, seen_in_log
+from gtsam_rwhec.runs.seen_in_log import Pictures
+from gtsam_rwhec.runs.seen_in_log import seen_in_log
 from gtsam_rwhec.runs.solution_frames import frames_of
-from gtsam_rwhec.runs.solution_plots import by_estimated_intrinsics
-from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
-
+from gtsam_rwhec.runs.solving_stage import Calibrated
+from gtsam_rwhec.runs.solving_stage import Solved
+from dataclasses import replace
+from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.logs.mcap_reader import Log
+from gtsam_rwhec.runs.corner_answer import with_intrinsics
+from gtsam_rwhec.runs.log_corners import LogCorners
 
 def evidence_of_log(
     calibrated: Calibrated, log_path: str | Path, sources: Sequence[Path], pictures: Pictures | None = None
@@ -81,6 +88,20 @@ def rows_by_final_intrinsics(calibrated: Solved, log_path: str | Path) -> dict[P
     """The same with poses of targets by the estimated intrinsics, if there are any."""
     with open_log(log_path) as log:
         return rows_of_log(by_estimated_intrinsics(calibrated, log))
+
+
+def by_estimated_intrinsics(solved: Solved, log: Log) -> Solved:
+    """The same with poses of targets by the estimated intrinsics, if there are any; the log has those by the stated."""
+    refined = solved.refined
+    if refined.reprojection is None:
+        return solved
+    cameras = {**solved.cameras, **{name: one.camera for name, one in refined.intrinsics.items()}}
+    corners = LogCorners.of(log, solved.rig, cameras)
+    try:
+        pairs = with_intrinsics(solved.pairs, corners, cameras, refined.X, refined.Y, refined.reprojection.corner_px)
+    except TargetError:  # a bundle that is not flat has no pose by the corners of one image
+        return solved
+    return replace(solved, pairs=pairs)
 
 
 def _command(sources: Sequence[Path]) -> str:

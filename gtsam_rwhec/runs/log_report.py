@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.report.page.written import write_html
+from gtsam_rwhec.report.report_page import write_html
 from gtsam_rwhec.results import write_evidence
 from gtsam_rwhec.runs.log_contract import CLEAN_LOG, EVIDENCE_FILE, REPORT_FILE, RESULT_FILE
 from gtsam_rwhec.runs.log_evidence import evidence_of_log

@@ -28,7 +28,7 @@ from gtsam_rwhec.odometry.odometry_file import (
     result_of,
     write_odometry_result,
 )
-from gtsam_rwhec.report.page.odometry_page import write_odometry_page
+from gtsam_rwhec.report.odometry_report import write_odometry_page
 from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig, RigFrames
 from gtsam_rwhec.runs.changed_rig import rig_for_solving

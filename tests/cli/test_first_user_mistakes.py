@@ -5,13 +5,11 @@ The cells are small: a board that is drawn into images of 320 x 240 pixels, and 
 """
 
 from __future__ import annotations
-
 import dataclasses
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -19,11 +17,11 @@ import rendered
 from given_commands import command
 from places import REPOSITORY
 from scipy.spatial.transform import Rotation
-
-from gtsam_rwhec.cameras.targets import Checkerboard, Tag
+from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.cameras.targets import Tag
+import synthetic_logs as made
 
 sys.path.append(str(REPOSITORY / "tests" / "runs"))
-import synthetic_logs as made
 
 IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"
@@ -54,11 +52,6 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         np.savetxt(folder / "left" / "pose" / f"{i:04d}.csv", X @ np.linalg.inv(Y @ seen), delimiter=",")
     return folder
-
-
-@pytest.fixture(autouse=True)
-def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gtsam_rwhec.runs.all_stages.plot_all", lambda *_: [])
 
 
 def poses_of(folder: Path) -> list[Path]:

@@ -27,11 +27,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.write(tmp_path_factory.mktemp("mistakes") / "run.mcap", made.recording(3.0))
 
 
-@pytest.fixture(autouse=True)
-def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gtsam_rwhec.runs.all_stages.plot_all", lambda *_: [])
-
-
 def moved(message: made.Message) -> made.Message:
     """From the middle on tag 1 is 0.1 m aside, and turned."""
     if "detections" not in message.content or message.logged_ns < made.BEGIN_NS + 15 * 10**8:

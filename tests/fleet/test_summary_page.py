@@ -13,7 +13,7 @@ from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.fleet.summary_page import counts_in_words, put_summary, summary_page, write_summary
 from gtsam_rwhec.fleet.watch_page import watch_page
 from gtsam_rwhec.fleet.watching import Watched, watch
-from gtsam_rwhec.report.page.blocks import Chart, Link, Number, Table
+from gtsam_rwhec.report.report_blocks import Chart, Link, Number, Table
 
 
 @pytest.fixture(scope="module")

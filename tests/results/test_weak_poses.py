@@ -9,9 +9,9 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.report.page import Listing
-from gtsam_rwhec.report.page.sections.determines import determines_section
-from gtsam_rwhec.report.page.written import read_shown
+from gtsam_rwhec.report.determined_section import determines_section
+from gtsam_rwhec.report.report_blocks import Listing
+from gtsam_rwhec.report.report_page import read_shown
 from gtsam_rwhec.results.linear_model import measured_rows
 from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WeakDirection, weak_directions
 

@@ -26,7 +26,7 @@ SEEN = [message for message in RECORDED if message.topic != "/tf"]
 WITH_IMAGES = {
     camera: f"images: /{camera}/image\n    intrinsics: {{topic: /{camera}/camera_info}}" for camera in made.CAMERAS
 }
-#: What there is of a calibration, beside plots/.
+#: What there is of a calibration.
 WRITTEN = {
     "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
     "cameras.opencv.yaml", "cameras.txt", "report.html", "evidence.json",

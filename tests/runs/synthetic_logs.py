@@ -8,25 +8,27 @@ A test spoils the messages, or the rig file's text, before they are written or p
 """
 
 from __future__ import annotations
-
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from collections.abc import Mapping
+from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
-
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.mcap_writer import json_schema
-from gtsam_rwhec.rig import Rig, parse_rig, read_rig
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
+from gtsam_rwhec.runs.solving_stage import Calibrated
+from gtsam_rwhec.runs.solving_stage import solve_log
 
 BEGIN_NS = 1_700_000_000_000_000_000
 SIZE_M = 0.12
@@ -265,7 +267,7 @@ def _pose(T: Array) -> dict[str, dict[str, float]]:
 
 
 def solved(folder: Path, messages: Iterable[Message], text: str) -> Calibrated:
-    """The answer of the stages to a log and a rig file, without the files for others and the plots, which take long."""
+    """The answer of the stages to a log and a rig file, without the files for others."""
     (folder / "rig.yaml").write_text(text, encoding="utf-8")
     detected, rig = folder / "detected.mcap", read_rig(folder / "rig.yaml")
     detect_log(write(folder / "raw.mcap", messages), rig, detected)

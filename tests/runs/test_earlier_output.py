@@ -21,8 +21,6 @@ LOG = "run.mcap"
 ALL = (
     "result.json", "clean.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
     "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_0.yaml",
-    "plots/frames.png", "plots/residuals.png", "plots/coverage.png", "plots/deviations.png",
-    "plots/intrinsics.png",
 )  # fmt: skip
 
 
@@ -67,7 +65,7 @@ def test_a_finished_calibration_is_replaced_on_request_only(tmp_path: Path) -> N
     assert contents(out) == before
     run(out, *ALL, content=b"second", replace=True)
     run(out, *ALL, content=b"third", replace=True, log="other.mcap")
-    assert contents(out)["plots/frames.png"] == b"third"
+    assert contents(out)["camera_info/cam_0.yaml"] == b"third"
     assert earlier_run(out) == ("other.mcap", "finished")
 
 
@@ -87,11 +85,9 @@ def test_other_files_beside_a_calibration_stay(tmp_path: Path) -> None:
     run(tmp_path, *ALL, replace=True)
     assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
     interrupted(tmp_path / "unfinished", "tf.yaml")
-    (tmp_path / "unfinished" / "plots").mkdir()
     (tmp_path / "unfinished" / "camera_info").mkdir()
     (tmp_path / "unfinished" / "camera_info" / "notes.txt").write_bytes(b"mine")
-    (tmp_path / "unfinished" / "plots" / "mine.png").write_bytes(b"mine")
-    with pytest.raises(LogError, match=r"not of a calibration.*camera_info/notes\.txt, plots/mine\.png"):
+    with pytest.raises(LogError, match=r"not of a calibration.*camera_info/notes\.txt"):
         run(tmp_path / "unfinished")
 
 
@@ -122,8 +118,8 @@ def test_a_foreign_or_changed_file_beside_known_ones_is_never_replaced(name: str
 def test_a_link_and_a_folder_in_the_place_of_a_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "tf.yaml").symlink_to(tmp_path / "nothing")
     (tmp_path / "camchain.yaml").mkdir()
-    (tmp_path / "plots").write_text("mine", encoding="utf-8")
-    with pytest.raises(LogError, match=r"was changed: camchain\.yaml, plots, tf\.yaml\."):
+    (tmp_path / "camera_info").write_text("mine", encoding="utf-8")
+    with pytest.raises(LogError, match=r"was changed: camchain\.yaml, camera_info, tf\.yaml\."):
         run(tmp_path)
 
 
@@ -131,8 +127,8 @@ def test_an_unfinished_run_is_gone_on_with(tmp_path: Path) -> None:
     """Also one that was killed in the middle of a file, when it could not bring its list up to date."""
     interrupted(tmp_path, "tf.yaml")
     (tmp_path / "result.json").write_bytes(b"written just before the end")
-    (tmp_path / "plots").mkdir(exist_ok=True)
-    for part in (".clean.mcap.123.part", "plots/.frames.png.123.part"):
+    (tmp_path / "camera_info").mkdir(exist_ok=True)
+    for part in (".clean.mcap.123.part", "camera_info/.cam_0.yaml.123.part"):
         (tmp_path / part).write_bytes(b"half")
     with pytest.raises(LogError, match=rf"unfinished run on {LOG}, which is not other\.mcap.*Give {LOG}.*--force"):
         run(tmp_path, *ALL, log="other.mcap")

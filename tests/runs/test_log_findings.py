@@ -1,31 +1,31 @@
 """What a log's calibration says is wrong, with the line of the rig file to change."""
 
 from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-
 import numpy as np
 import pytest
 import synthetic_logs as made
-
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
-from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.calibration.verdict import Finding
+from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig import parse_rig
 from gtsam_rwhec.runs.all_stages import calibrate_log
-from gtsam_rwhec.runs.log_findings import in_rig_file, known_to_nothing, not_of_marked_outliers
+from gtsam_rwhec.runs.log_findings import in_rig_file
+from gtsam_rwhec.runs.log_findings import known_to_nothing
+from gtsam_rwhec.runs.log_findings import not_of_marked_outliers
 
 EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")
 ESTIMATED = "detections: /cam_{0}/tags\n    time_offset: estimate"
 
 
 def judged(folder: Path, messages: Iterable[made.Message], text: str) -> rw.Judgement:
-    """The judgement of the stages, without exports and plots."""
+    """The judgement of the stages, without exports."""
     return made.solved(folder, messages, text).judgement
 
 
@@ -114,10 +114,10 @@ def test_two_clocks_that_are_both_late_are_named(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_told_before_anything_is_computed(tmp_path: Path) -> None:
     log = made.write(tmp_path / "raw.mcap", made.recording(1.0))
     (tmp_path / "rig.yaml").write_text(made.RIG, encoding="utf-8")
-    for number, name in enumerate(("result.json", "clean.mcap", "tf.yaml", "plots")):
+    for number, name in enumerate(("result.json", "clean.mcap", "tf.yaml", "camera_info")):
         out = tmp_path / f"out_{number}"
         out.mkdir()
-        if name == "plots":
+        if name == "camera_info":
             (out / name).write_text("a file")
         else:
             (out / name).mkdir()

@@ -1,0 +1,137 @@
+"""Section 8: how much each image contributed, and which could be left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gtsam_rwhec.report.figures import SvgFigure, svg_figure
+from gtsam_rwhec.report.report_blocks import Block, Chart, Paragraph, Section, Table, Words, significant
+from gtsam_rwhec.report.residual_section import BLUE
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.contribution import ContributionEvidence, ImageContribution
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TITLE = "What each image contributed"
+ABOUT = (
+    "At the level of poses, with errors that are independent from image to image: where errors vary slowly, or are the "
+    "same in all images, fewer images tell less than this says. An image here is all that one camera saw at one stamp."
+)
+WITHOUT_STAMPS = " There are no stamps, so each measurement counts by itself."
+#: An image without which a pose moves more than this many of its deviations deserves a look.
+MOVES = 2.0
+
+
+def contribution_section(shown: ShownResult) -> Section:
+    """Information by image, leave-one-out, and how few images tell nearly as much."""
+    found = None if shown.evidence is None else shown.evidence.contribution
+    if found is None:
+        why = shown.why_missing(found, "the calibration has no covariances, and so no information to divide.")
+        return Section("contribution", TITLE, missing=why)
+    what = "images" if found.has_stamps else "measurements"
+    blocks: list[Block] = [*_fewer(shown, found, what)]
+    blocks.append(
+        Table(
+            f"The {len(found.important)} {what} that tell most",
+            _headings(found),
+            tuple(_row(shown, "important", i, one) for i, one in enumerate(found.important)),
+            "share: of all that was learnt. moves: without it the pose that moves most moves by so many of its "
+            "standard deviations, and millimetres. grows: the standard deviation that grows most without it.",
+        )
+    )
+    blocks += _influential(shown, found, what)
+    blocks.append(Paragraph(ABOUT + ("" if found.has_stamps else WITHOUT_STAMPS), "note"))
+    return Section("contribution", TITLE, tuple(blocks))
+
+
+def _fewer(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterator[Block]:
+    at = ("contribution", "fewer")
+    for i, one in enumerate(found.fewer):
+        if one.growth == 0.1:
+            of = what if found.bundle == 1 else f"bundles of {found.bundle} {what}"
+            yield Paragraph(
+                (
+                    shown.evident(*at, i, "bundles", spec=".0f"),
+                    " of ",
+                    shown.evident("contribution", "bundles", spec=".0f"),
+                    f" {of}, chosen well, tell nearly as much as all: no standard deviation is larger by more than ",
+                    shown.evident(*at, i, "growth", times=100.0, spec=".0f"),
+                    " %. The others could be left out.",
+                ),
+                "lead",
+            )
+    rows = tuple(
+        ((shown.evident(*at, i, "growth", times=100.0, spec=".0f"), " %"), shown.evident(*at, i, "bundles", spec=".0f"))
+        for i in range(len(found.fewer))
+    )
+    chosen = what if found.bundle == 1 else "bundles"
+    yield Table(f"How many {chosen} are enough", ("no deviation larger by", f"{chosen} needed"), rows)
+    yield Chart(
+        "contribution-curve",
+        f"With fewer {chosen}",
+        f"The largest growth of a standard deviation, if {chosen} are added in the best order found.",
+        _curve(found, chosen),
+    )
+
+
+def _curve(found: ContributionEvidence, what: str) -> SvgFigure:
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        growth = 100.0 * np.array(found.curve)
+        at = np.arange(1, len(growth) + 1)
+        low = growth <= 200.0
+        axes.plot(at[low], growth[low], color=BLUE, lw=2)
+        axes.set_xlabel(f"{what} used, of {found.bundles}")
+        axes.set_ylabel("worst deviation larger by (%)")
+        axes.set_ylim(0.0, 200.0)
+        axes.set_xlim(0.0, found.bundles)
+
+    return svg_figure(draw, 2.8)
+
+
+def _influential(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterator[Block]:
+    if not found.influential:
+        return
+    worst = found.influential[0]
+    at = ("contribution", "influential")
+    said = (
+        f"Look at these {what} first if you doubt the answer."
+        if worst.moved > MOVES
+        else f"No single one of the {what} decides the answer."
+    )
+    yield Paragraph(
+        (
+            f"Without the one that matters most, {worst.moved_frame} would move by ",
+            significant(shown.evident(*at, 0, "moved"), 2),
+            " of its standard deviations (",
+            significant(shown.evident(*at, 0, "moved_mm"), 2),
+            f" mm). {said}",
+        )
+    )
+    yield Table(
+        f"The {len(found.influential)} {what} without which the answer moves most",
+        _headings(found),
+        tuple(_row(shown, "influential", i, one) for i, one in enumerate(found.influential)),
+    )
+
+
+def _headings(found: ContributionEvidence) -> tuple[str, ...]:
+    return ("sensor", "time s" if found.has_stamps else "place", "targets", "share %", "moves", "", "mm", "grows %")
+
+
+def _row(shown: ShownResult, which: str, i: int, one: ImageContribution) -> tuple[Words, ...]:
+    at = ("contribution", which, i)
+    return (
+        one.sensor,
+        shown.evident(*at, "time", spec=".2f" if one.stamp_ns is not None else ".0f"),
+        ", ".join(one.targets),
+        significant(shown.evident(*at, "share", times=100.0), 2),
+        one.moved_frame,
+        significant(shown.evident(*at, "moved"), 2),
+        significant(shown.evident(*at, "moved_mm"), 2),
+        significant(shown.evident(*at, "growth", times=100.0), 2),
+    )

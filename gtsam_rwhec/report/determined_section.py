@@ -1,0 +1,273 @@
+"""Section 4: which sensor and target determine each other, and which directions are free or weak, with their cures."""
+
+from __future__ import annotations
+from collections.abc import Iterator
+from collections.abc import Mapping
+from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.report.pair_grid import DETERMINED
+from gtsam_rwhec.report.pair_grid import NOT_DETERMINED
+from gtsam_rwhec.report.pair_grid import NOT_OBSERVED
+from gtsam_rwhec.report.pair_grid import Symbol
+from gtsam_rwhec.solver.free_directions import FreeDirection
+from gtsam_rwhec.solver.free_directions import FreeReason
+import numpy as np
+from gtsam_rwhec.report.report_blocks import Block
+from gtsam_rwhec.report.report_blocks import Folded
+from gtsam_rwhec.report.report_blocks import Listing
+from gtsam_rwhec.report.report_blocks import Number
+from gtsam_rwhec.report.report_blocks import Paragraph
+from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.report_blocks import Words
+from gtsam_rwhec.report.report_blocks import significant
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.weak_poses import MORE
+from gtsam_rwhec.results.weak_poses import TURN_RAD
+from gtsam_rwhec.results.weak_poses import WEAK
+from gtsam_rwhec.results.weak_poses import WeakDirection
+
+#: A grid with more targets has a row for each target, and a column for each sensor.
+MOST_COLUMNS = 10
+#: A blank at which no line is broken.
+TOGETHER = "\N{NO-BREAK SPACE}"
+#: A grid with more rows is folded.
+MOST_ROWS = 40
+#: A direction with less than this many times the information at which it would be free is near to it.
+NEAR = 10.0
+#: What settles a free direction, by the reason for which it is free.
+CURES: Mapping[FreeReason, str] = {
+    FreeReason.CONTRADICTION: "First correct how A and B are read; the motion may be good.",
+    FreeReason.FEW: "Measure these frames at three poses or more, which turn about two different axes.",
+    FreeReason.NO_ROTATION: "Turn the carriers, by 30 degrees or more, about two axes that are far from parallel.",
+    FreeReason.ONE_AXIS: "Turn the carriers about a second axis, across the first, by 30 degrees or more.",
+    FreeReason.NOISE: "Turn by larger angles about the axes that were used least, or measure far more often.",
+    FreeReason.COMPENSATED: "Turn about a second axis, or state what is known: a size, a scale, or one of the poses.",
+    FreeReason.STANDSTILL: "Measure while the carriers move and turn, faster and with changes of direction.",
+    FreeReason.SYMMETRY: "Turn by other angles than half a turn, and about axes that are not in one plane.",
+}
+FREE_IN_WORDS = "Turn the carriers about at least two different axes, or fix frames that you know."
+ALL_DETERMINED = "The measurements determine every direction beyond their noise: none is free."
+NO_ANSWER = "the calibration has no answer."
+
+
+Count = tuple[Number | str, ...]
+
+
+def determines_section(shown: ShownResult) -> Section:
+    """The grid of the RWHEC paper's Figure 8 with counts; free and weak directions, with motions that settle them."""
+    title = "Who determines whom"
+    if shown.result is None:
+        return Section("determines", title, missing=NO_ANSWER)
+    known = shown.result.solution.identifiability
+    blocks: list[Block] = [Paragraph(str(known)), *_grid(shown), *_motions(shown)]
+    refined = shown.result.refined
+    free = (refined.free_directions if refined is not None else ()) or known.free_directions
+    if free:
+        blocks.append(Paragraph("Free directions: the poses can move along them and fit as well.", "bad"))
+        blocks.append(Listing(tuple(f"Not determined: {one}. {cure_of(one)}" for one in free)))
+    else:
+        blocks.append(Paragraph(ALL_DETERMINED))
+        blocks += _distance_to_free(shown)
+    blocks += weak_blocks(shown)
+    return Section("determines", title, tuple(blocks))
+
+
+def _distance_to_free(shown: ShownResult) -> Iterator[Block]:
+    """How far the least known direction is from being free, by the test against noise."""
+    at = ("certified", "identifiability")
+    weakest, threshold = (significant(shown.number(*at, name), 2) for name in ("weakest", "threshold"))
+    if weakest.value is None or threshold.value is None:
+        return
+    near = " That is near: turn more before you rely on it." if weakest.value < NEAR * threshold.value else ""
+    yield Paragraph(
+        (
+            "The least known direction of all holds ",
+            weakest,
+            " times the information that noise alone would make; up to ",
+            threshold,
+            f" times it would count as free.{near}",
+        )
+    )
+
+
+def cure_of(free: FreeDirection) -> str:
+    """The motion that settles a free direction."""
+    return FREE_IN_WORDS if free.reason is None else CURES[free.reason]
+
+
+def _grid(shown: ShownResult) -> Iterator[Block]:
+    """The grid: in each cell a sign, and the measurements that are used."""
+    assert shown.result is not None
+    alone = shown.result.solution.identifiability.pairs
+    counts = _counts(shown)
+    pairs = [pair for pair in counts if not pair.is_motion]
+    if not pairs:
+        return
+    targets = sorted({pair.target for pair in pairs}, key=natural_key)
+    sensors = sorted({pair.sensor for pair in pairs}, key=natural_key)
+
+    def cell(target: str, sensor: str) -> Words:
+        pair = Pair(target, sensor)
+        found = alone.get(pair)
+        sign = NOT_OBSERVED if found is None else DETERMINED if found.is_unique else NOT_DETERMINED
+        return _cell(sign, counts.get(pair))
+
+    by_targets = len(targets) > MOST_COLUMNS and len(targets) > len(sensors)
+    across, down = (sensors, targets) if by_targets else (targets, sensors)
+    rows = tuple((name, *(cell(name, other) if by_targets else cell(other, name) for other in across)) for name in down)
+    caption = "Sensors and targets (RWHEC paper, Figure 8)"
+    kind = "target" if by_targets else "sensor"
+    table = Table(caption, (kind, *across), rows, _legend(any(len(count) > 1 for count in counts.values())))
+    yield table if len(rows) <= MOST_ROWS else Folded(f"{caption}: {len(rows)} rows", (table,))
+
+
+def _legend(has_outliers: bool) -> str:
+    signs = "; ".join(f"{kind.symbol} {kind.meaning}" for kind in (DETERMINED, NOT_DETERMINED, NOT_OBSERVED))
+    more = ", out of how many where some were left out" if has_outliers else ""
+    return f"{signs}. The number beside a sign is that of the measurements in the answer{more}."
+
+
+def _cell(sign: Symbol, count: Count | None) -> Words:
+    return sign.symbol if count is None else (f"{sign.symbol}{TOGETHER}", *count)
+
+
+def _counts(shown: ShownResult) -> dict[Pair, Count]:
+    """The measurements of each pair in the answer, and how many there were, as the result has them."""
+    tree, certified = shown.tree, ("certified", "identifiability", "pairs")
+    counts: dict[Pair, Count] = {
+        Pair(row["target"], row["sensor"]): (shown.number(*certified, i, "number_of_measurements", spec=".0f"),)
+        for i, row in enumerate(tree["certified"]["identifiability"]["pairs"])
+    }
+    for i, row in enumerate((tree.get("log") or {}).get("outliers", ())):
+        if row.get("left_out", 0):
+            used, left_out = (shown.number("log", "outliers", i, name, spec=".0f") for name in ("used", "left_out"))
+            counts[Pair(row["target"], row["sensor"])] = (used, f"{TOGETHER}(-", left_out, ")")
+    for i, row in enumerate((tree.get("refined") or {}).get("inlier_counts", ())):
+        kept, of = row["value"]
+        if kept < of:
+            kept, of = (shown.number("refined", "inlier_counts", i, "value", k, spec=".0f") for k in range(2))
+            counts[Pair(row["target"], row["sensor"])] = (kept, "/", of)
+    return counts
+
+
+def _motions(shown: ShownResult) -> Iterator[Block]:
+    """A sentence for each sensor's own motion, which sees no target."""
+    assert shown.result is not None
+    sentences = [
+        f"{pair.sensor} from its own motion: {'determined' if alone.is_unique else 'not determined'}."
+        for pair, alone in shown.result.solution.identifiability.pairs.items()
+        if pair.is_motion
+    ]
+    if sentences:
+        yield Listing(tuple(sentences))
+
+
+NO_TURN = "No such turn would help clearly more than measuring on."
+#: A direction is called after a coordinate axis within 8 degrees of it.
+AXIS_COSINE = np.cos(np.radians(8.0))
+NOT_KNOWN = (
+    "Not shown: the least known directions beside those that are free. They need evidence.json beside the result, and "
+    "covariances that are finite for some frame."
+)
+NONE_IS_WEAK = (
+    f"No direction is weak: none has a standard deviation above {WEAK:g} times the median of all. The table has the "
+    "least known direction of each frame."
+)
+LEGEND = (
+    f"Least known first. With turns: {MORE} more measurements with the named partner in view, one carrier turned "
+    f"against the other by {np.degrees(TURN_RAD):.0f} degrees to both sides about an axis of the sensors' carrier, "
+    f"through the target. With more: {MORE} more like those there are. Both count for as much as those there are do, "
+    "correlation counted; errors that all measurements share stay."
+)
+
+
+def weak_blocks(shown: ShownResult) -> Iterator[Block]:
+    """The weak directions as sentences, and the least known direction of every frame as a table."""
+    weak = () if shown.evidence is None else shown.evidence.weak
+    if not weak:
+        yield Paragraph(NOT_KNOWN, "note")
+        return
+    said = tuple(_sentence(shown, i, one) for i, one in enumerate(weak) if one.is_weak)
+    if said:
+        yield Paragraph("Weak directions: determined, but far less well than the others.")
+        yield Listing(said)
+    else:
+        yield Paragraph(NONE_IS_WEAK)
+    can_help = any(one.turn is not None for one in weak)
+    turning = ("turn about", "with turns") if can_help else ()
+    tables = [
+        Table(
+            f"Least known {'directions' if kind == 'translation' else 'rotation axes'}",
+            ("frame", "along" if kind == "translation" else "about", unit, "measured with", *turning, "with more"),
+            tuple(_row(shown, i, one, can_help) for i, one in enumerate(weak) if one.kind == kind),
+            LEGEND if can_help else f"{NO_TURN} {LEGEND}",
+        )
+        for kind, unit in (("translation", "±mm"), ("rotation", "±°"))
+    ]
+    yield Folded("The least known direction of each frame, and the motion that would help", tuple(tables))
+
+
+def axis_words(axis: tuple[float, float, float], frame: str) -> str:
+    """Words for a direction: "hand's z axis", or "(0.60, 0.80, 0.00) of hand"."""
+    k = int(np.abs(axis).argmax())
+    if abs(axis[k]) > AXIS_COSINE:
+        return f"{frame}'s {'xyz'[k]} axis"
+    rounded = np.round(np.array(axis) * np.sign(axis[k]), 2) + 0.0
+    vector = ",\N{NO-BREAK SPACE}".join(f"{value:.2f}" for value in rounded)
+    return f"({vector}) of {frame}"
+
+
+def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
+    """A weak direction and its cure."""
+    along, unit = ("along", " mm") if one.kind == "translation" else ("about", "°")
+    deviation = significant(shown.evident("weak", i, "deviation"), 2)
+    words: tuple[str | object, ...] = (
+        f"{one.frame} {along} {axis_words(one.axis_in_carrier, one.carrier)}: ± ",
+        deviation,
+        f"{unit}.",
+    )
+    if one.turn is not None:
+        words += (
+            f" Turn by {np.degrees(TURN_RAD):.0f} degrees to both sides about "
+            f"{axis_words(one.turn, sensor_carrier(shown))}, with {_in_view(shown, one)}: {MORE} "
+            "measurements would bring it to about ± ",
+            significant(shown.evident("weak", i, "after_turning"), 2),
+            f"{unit}, as many like those there are to ± ",
+            significant(shown.evident("weak", i, "after_more"), 2),
+            f"{unit}.",
+        )
+    elif one.after_more is not None:
+        words += (
+            f" No turn helps more than measuring on: {MORE} more measurements would bring it to about ± ",
+            significant(shown.evident("weak", i, "after_more"), 2),
+            f"{unit}.",
+        )
+    return words  # type: ignore[return-value]
+
+
+def _in_view(shown: ShownResult, one: WeakDirection) -> str:
+    """Which target is to be in view of which sensor."""
+    is_target = any(row["child"] == one.frame for row in shown.tree["targets"])
+    target, sensor = (one.frame, one.partner) if is_target else (one.partner, one.frame)
+    return f"{target} in view of {sensor}"
+
+
+def _row(shown: ShownResult, i: int, one: WeakDirection, can_help: bool) -> tuple[Words, ...]:
+    turning: tuple[Words, ...] = (
+        "-" if one.turn is None else axis_words(one.turn, sensor_carrier(shown)),
+        "-" if one.after_turning is None else significant(shown.evident("weak", i, "after_turning"), 2),
+    )
+    return (
+        one.frame,
+        axis_words(one.axis_in_carrier, one.carrier),
+        significant(shown.evident("weak", i, "deviation"), 2),
+        one.partner or "-",
+        *(turning if can_help else ()),
+        "-" if one.after_more is None else significant(shown.evident("weak", i, "after_more"), 2),
+    )
+
+
+def sensor_carrier(shown: ShownResult) -> str:
+    """The name of the frame that carries the sensors."""
+    return str(shown.tree["sensors"][0]["parent"])

@@ -1,0 +1,412 @@
+"""What is drawn of a rig, in the axes of the carrier that stands still: frames, boards, views, path, ellipsoids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.identifiability.free_directions import SHARE, FreeDirection
+from gtsam_rwhec.report.figures import round_down
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.scene_evidence import SceneEvidence
+
+Kind = Literal["carrier", "sensor", "target"]
+#: Axes of frames have at most and at least this share of the scene, and this share of the distance between neighbours.
+AXIS, LEAST_AXIS, OF_NEIGHBOURS = 0.06, 0.01, 0.6
+#: The largest ellipsoid has a half axis of this share of the scene.
+ELLIPSOID = 0.035
+#: An ellipsoid this many times the median one does not set the magnification: it is drawn as a line.
+FAR_LARGER = 20.0
+#: A carrier whose origin is farther away than this many times the spread of all else is left out of sight.
+FAR = 5.0
+#: Boards of unknown size are squares of this share of the scene.
+PLAIN = 0.03
+#: Scenes are at least this wide, metres.
+SMALLEST_M = 1e-3
+#: With more frames than this, targets are points without ellipsoids.
+MANY = 60
+LEVEL = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame in the scene.
+
+    Attributes
+    ----------
+    name : str
+    kind : "carrier", "sensor" or "target"
+    T : (4, 4) array
+        Pose in the scene, metres.
+    words : tuple of str
+        What is known of it, line by line.
+    covariance : (3, 3) array or None
+        Of its position, in the scene's axes, m^2; None where it is not known, or not finite.
+    """
+
+    name: str
+    kind: Kind
+    T: Array
+    words: tuple[str, ...]
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera sees: its place (3,) and the border of its image (n, 3), from the top left corner clockwise."""
+
+    name: str
+    apex: Array
+    rim: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBoard:
+    """A board: its paper (n, 3), empty where it is not known, and its dark parts, each (n, 3), metres."""
+
+    paper: Array
+    dark: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A rig, or the frames on one of its carriers.
+
+    Attributes
+    ----------
+    world : str
+        The carrier whose axes the scene has.
+    frames : tuple of Frame
+    views : tuple of View
+    boards : tuple of PlacedBoard
+    path : (n, 7) array
+        x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps.
+    moving : str
+        Its name; empty where there is none.
+    low, high : (3,) arrays
+        The box that holds all of it.
+    times : float
+        Ellipsoids are drawn so many times as large.
+    radius : float
+        Deviations to the border of an ellipsoid of `LEVEL`.
+    out_of_sight : tuple of str
+        Carriers whose origins are too far away.
+    """
+
+    world: str
+    frames: tuple[Frame, ...]
+    views: tuple[View, ...]
+    boards: tuple[PlacedBoard, ...]
+    path: Array
+    moving: str
+    low: Array
+    high: Array
+    times: float
+    radius: float
+    out_of_sight: tuple[str, ...]
+
+    @property
+    def extent(self) -> float:
+        """The longest side of the box, metres."""
+        return float((self.high - self.low).max())
+
+    @property
+    def axes_m(self) -> dict[Kind, float]:
+        """Length of the axes of frames of each kind: shorter where frames are near to each other."""
+        found: dict[Kind, float] = {"carrier": 1.6 * AXIS * self.extent}
+        for kind in ("sensor", "target"):
+            places = np.array([frame.T[:3, 3] for frame in self.frames if frame.kind == kind]).reshape(-1, 3)
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
+            nearest = float(np.median(apart.min(axis=1))) if len(places) > 1 else self.extent
+            found[kind] = float(np.clip(OF_NEIGHBOURS * nearest, LEAST_AXIS * self.extent, AXIS * self.extent))
+        return found
+
+    @property
+    def ellipsoids(self) -> dict[str, Array]:
+        """The shape matrix (3, 3) of each ellipsoid that is drawn, as large as it is drawn: a a' of its half axes."""
+        factor = (self.times * self.radius) ** 2
+        many = len(self.frames) > MANY
+        known = {f.name: f for f in self.frames if f.covariance is not None and not (many and f.kind == "target")}
+        shapes = {name: factor * frame.covariance for name, frame in known.items() if frame.covariance is not None}
+        return {name: shape for name, shape in shapes.items() if np.linalg.norm(shape, 2) ** 0.5 <= 0.5 * self.extent}
+
+
+def scene_of_rig(shown: ShownResult, evidence: SceneEvidence) -> Scene:
+    """Both carriers, the moving one at its typical pose."""
+    typical = _pose(evidence.poses[evidence.typical])
+    stands = evidence.standing == "targets"
+    placed = {"targets": np.eye(4) if stands else typical, "sensors": typical if stands else np.eye(4)}
+    world, moving = (carrier(shown, kind) for kind in (("targets", "sensors") if stands else ("sensors", "targets")))
+    rpy = np.degrees([gtsam.Rot3.Quaternion(*row[3:]).rpy() for row in evidence.poses])
+    seconds = evidence.seconds or (np.nan,) * len(evidence.poses)
+    path = np.column_stack([np.array(evidence.poses)[:, :3], rpy, seconds])
+    return _scene(shown, evidence, placed, world, path, moving)
+
+
+def scene_of_carrier(shown: ShownResult, kind: Literal["sensors", "targets"]) -> Scene:
+    """The frames on one carrier, in its axes: all that a result alone tells."""
+    return _scene(shown, None, {kind: np.eye(4)}, carrier(shown, kind), np.zeros((0, 7)), "")
+
+
+def carrier(shown: ShownResult, kind: str) -> str:
+    """The name of the carrier of the sensors, or of the targets."""
+    rows = shown.tree.get(kind, [])
+    return str(rows[0]["parent"]) if rows else f"the carrier of the {kind}"
+
+
+def _scene(
+    shown: ShownResult,
+    evidence: SceneEvidence | None,
+    placed: Mapping[str, Array],
+    world: str,
+    path: Array,
+    moving: str,
+) -> Scene:
+    assert shown.result is not None
+    refined = shown.result.refined
+    frames = [
+        frame for kind, T in placed.items() for frame in _frames(shown, "sensor" if kind == "sensors" else "target", T)
+    ]
+    origins = [Frame(carrier(shown, kind), "carrier", T, _words(T, world)) for kind, T in placed.items()]
+    views = () if evidence is None else tuple(_views(frames, evidence))
+    extent = np.concatenate([path[:, :3], *(f.T[None, :3, 3] for f in frames), *(v.rim for v in views)])
+    near = [f for f in origins if f.name != world or _is_near(f.T[:3, 3], extent)]
+    extent = np.concatenate([extent, *(f.T[None, :3, 3] for f in near)])
+    size = max(float(np.ptp(extent, axis=0).max()), SMALLEST_M)
+    boards = tuple(_boards(frames, evidence, PLAIN * size))
+    extent = np.concatenate([extent, *(part for board in boards for part in (board.paper, *board.dark))])
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    margin = 0.04 * max(float((high - low).max()), SMALLEST_M)
+    radius = float(np.sqrt(7.814727903251179 if refined is None else refined.squared_radius(3, LEVEL)))
+    return Scene(
+        world=world,
+        frames=(*near, *frames),
+        views=views,
+        boards=boards,
+        path=path,
+        moving=moving,
+        low=low - margin,
+        high=high + margin,
+        times=_magnification(frames, radius, float((high - low).max())),
+        radius=radius,
+        out_of_sight=tuple(f.name for f in origins if f not in near),
+    )
+
+
+def _frames(shown: ShownResult, kind: Literal["sensor", "target"], placed: Array) -> Iterator[Frame]:
+    """The frames on a carrier that is placed in the scene."""
+    parts = shown.tree.get("refined", {}).get("frames", {})
+    for row in shown.tree[f"{kind}s"]:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = row["rotation_matrix"], row["translation_m"]
+        name, known = row["child"], parts.get(row["child"])
+        words, covariance = list(_words(T, row["parent"])), None
+        if known is not None:
+            words.append(_deviations(known))
+            block = np.array([line[3:] for line in known["covariance"][3:]], dtype=float)
+            if np.isfinite(block).all():
+                R = (placed @ T)[:3, :3]
+                covariance = R @ block @ R.T
+        if row.get("contradicted"):
+            words.append("its own measurements contradict this pose")
+        yield Frame(name, kind, placed @ T, tuple(words), covariance)
+
+
+def _deviations(known: Mapping[str, list[float | None]]) -> str:
+    """Standard deviations of a frame in words."""
+    mm, deg = (
+        ", ".join("free" if value is None else f"{value:.2g}" for value in known[f"standard_deviations_{unit}"])
+        for unit in ("mm", "deg")
+    )
+    return f"± {mm} mm, ± {deg}° (1 σ, own axes)"
+
+
+def _words(T: Array, parent: str) -> tuple[str, ...]:
+    """A pose in words."""
+    x, y, z = T[:3, 3]
+    roll, pitch, yaw = np.degrees(gtsam.Rot3(T[:3, :3]).rpy())
+    return f"in {parent}: {x:.4f}, {y:.4f}, {z:.4f} m", f"roll {roll:.2f}°, pitch {pitch:.2f}°, yaw {yaw:.2f}°"
+
+
+def _views(frames: list[Frame], evidence: SceneEvidence) -> Iterator[View]:
+    """Cameras' views, as far as the typical distance of what they saw."""
+    for frame in frames:
+        seen = evidence.sensors.get(frame.name) if frame.kind == "sensor" else None
+        if seen is None or not seen.rim or seen.distance_m is None:
+            continue
+        rim = seen.distance_m[1] * np.array(seen.rim) @ frame.T[:3, :3].T + frame.T[:3, 3]
+        yield View(frame.name, frame.T[:3, 3], rim)
+
+
+def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -> Iterator[PlacedBoard]:
+    """The boards in the scene; one of unknown shape is a plain square."""
+    square = plain * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    for frame in frames:
+        if frame.kind != "target":
+            continue
+        target = None if evidence is None else evidence.targets.get(frame.name)
+        board = None if target is None else target.board
+        R, t = frame.T[:3, :3], frame.T[:3, 3]
+        if board is None:
+            yield PlacedBoard(square @ R.T + t, ())
+            continue
+        paper = np.array(board.paper).reshape(-1, 3) @ R.T + t
+        yield PlacedBoard(paper, tuple(np.array(polygon) @ R.T + t for polygon in board.dark))
+
+
+def _is_near(place: Array, others: Array) -> bool:
+    spread = max(float(np.ptp(others, axis=0).max()), SMALLEST_M)
+    return bool(np.linalg.norm(place - others.mean(axis=0)) <= FAR * spread)
+
+
+def _magnification(frames: list[Frame], radius: float, extent: float) -> float:
+    """One factor for all ellipsoids, with which the largest can be seen: 1, 2 or 5 times a power of ten."""
+    half = [radius * float(np.linalg.norm(f.covariance, 2)) ** 0.5 for f in frames if f.covariance is not None]
+    half = [each for each in half if each > 0.0]
+    if not half:
+        return 1.0
+    largest = max(each for each in half if each <= FAR_LARGER * float(np.median(half)))
+    return max(round_down(ELLIPSOID * extent / largest), 1.0)
+
+
+def _pose(row: tuple[float, ...]) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = gtsam.Rot3.Quaternion(*row[3:]).matrix(), row[:3]
+    return T
+
+
+#: A line has this share of the scene to each side, and its arrowheads and circles this one.
+LENGTH, HEAD = 0.16, 0.022
+#: Of each direction so many frames are drawn, and of all so many lines.
+MOST_FRAMES, MOST_LINES = 40, 200
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A direction of a frame.
+
+    Attributes
+    ----------
+    frame : str
+    label : str
+        "free 1" or "weak 2"; the list below the scene has the same.
+    words : str
+        The sentence.
+    is_free : bool
+    pieces : tuple of (n, 3) arrays
+        Lines to be drawn: the direction itself first.
+    moves, about : (3,) arrays or None
+        The unit vector in the scene along which it moves, or about which it turns.
+    """
+
+    frame: str
+    label: str
+    words: str
+    is_free: bool
+    pieces: tuple[Array, ...]
+    moves: Array | None = field(default=None)
+    about: Array | None = field(default=None)
+
+
+def free_directions(shown: ShownResult) -> tuple[FreeDirection, ...]:
+    """The free directions of the poses that the page shows."""
+    assert shown.result is not None
+    refined = shown.result.refined
+    return shown.result.solution.identifiability.free_directions if refined is None else refined.free_directions
+
+
+def lines_of(shown: ShownResult, scene: Scene) -> tuple[Line, ...]:
+    """Free directions, then weak ones, then positions that are too uncertain for an ellipsoid."""
+    frames = {frame.name: frame for frame in scene.frames}
+    lines = [
+        line
+        for number, direction in enumerate(free_directions(shown), start=1)
+        for line in _free(direction, f"free {number}", frames, scene.extent)
+    ]
+    weak = () if shown.evidence is None else shown.evidence.weak
+    number = 0
+    for one in weak:
+        if not one.is_weak:
+            continue
+        number += 1
+        if (frame := frames.get(one.frame)) is None:
+            continue
+        along = frame.T[:3, :3] @ np.array(one.axis)
+        what, unit = ("along", "mm") if one.kind == "translation" else ("about", "°")
+        words = f"{one.frame}: ± {one.deviation:.2g} {unit} {what} this line"
+        draw = _shift if one.kind == "translation" else _turn
+        yield_at = {"moves" if one.kind == "translation" else "about": along}
+        pieces = draw(frame.T[:3, 3], along, 0.5 * scene.extent)
+        lines.append(Line(one.frame, f"weak {number}", words, False, pieces, **yield_at))
+    return (*lines, *_too_large(scene))[:MOST_LINES]
+
+
+def _free(direction: FreeDirection, label: str, frames: dict[str, Frame], extent: float) -> Iterator[Line]:
+    words = str(direction)
+    for name, twist in list(direction.frames.items())[:MOST_FRAMES]:
+        if (frame := frames.get(name)) is None:
+            continue
+        R, t = frame.T[:3, :3], frame.T[:3, 3]
+        omega, v = R @ np.array(twist[:3]), R @ np.array(twist[3:])
+        turn, shift = float(np.linalg.norm(omega)), float(np.linalg.norm(v)) / direction.length_m
+        if turn > SHARE * max(turn, shift):
+            axis = omega / turn
+            foot = np.cross(omega, v) / turn**2
+            # An axis far off turns the frame as a shift does; it is drawn at the frame then.
+            at = t + foot if np.linalg.norm(foot) <= 0.5 * extent else t
+            yield Line(name, label, words, True, _turn(at, axis, extent), about=axis)
+        else:
+            along = v / np.linalg.norm(v)
+            yield Line(name, label, words, True, _shift(t, along, extent), moves=along)
+
+
+def _too_large(scene: Scene) -> Iterator[Line]:
+    """The longest axis of ellipsoids that would be larger than the scene."""
+    drawn = scene.ellipsoids
+    for frame in scene.frames:
+        if frame.covariance is None or frame.name in drawn or not frame.covariance.any():
+            continue
+        variances, vectors = np.linalg.eigh(frame.covariance)
+        half = scene.radius * float(np.sqrt(variances[-1]))
+        if scene.times * half <= 0.5 * scene.extent:
+            continue  # one of many, without an ellipsoid
+        words = f"{frame.name}: 95 % within ± {1e3 * half:.3g} mm along this line"
+        pieces = _shift(frame.T[:3, 3], vectors[:, -1], scene.extent)
+        yield Line(frame.name, frame.name, words, False, pieces, moves=vectors[:, -1])
+
+
+def _shift(at: Array, along: Array, extent: float) -> tuple[Array, ...]:
+    """A line with arrowheads at both ends."""
+    reach, head = LENGTH * extent * along, HEAD * extent
+    side = _across(along)
+    heads = (
+        np.array([end - sign * head * along + 0.5 * head * side, end, end - sign * head * along - 0.5 * head * side])
+        for end, sign in ((at + reach, 1.0), (at - reach, -1.0))
+    )
+    return (np.array([at - reach, at + reach]), *heads)
+
+
+def _turn(at: Array, axis: Array, extent: float) -> tuple[Array, ...]:
+    """An axis with a circle about its upper end, and an arrowhead on the circle."""
+    reach, radius = 0.7 * LENGTH * extent * axis, 1.5 * HEAD * extent
+    first = _across(axis)
+    second = np.cross(axis, first)
+    angles = np.linspace(0.0, np.radians(300.0), 19)[:, None]
+    circle = at + reach + radius * (np.cos(angles) * first + np.sin(angles) * second)
+    forward = np.cross(axis, circle[-1] - at - reach) / radius
+    outward = (circle[-1] - at - reach) / radius
+    head = 0.5 * HEAD * extent
+    arrow = circle[-1] + head * np.array([-forward + 0.5 * outward, np.zeros(3), -forward - 0.5 * outward])
+    return np.array([at - reach, at + reach]), circle, arrow
+
+
+def _across(along: Array) -> Array:
+    """A unit vector across a direction."""
+    side = np.cross(along, np.eye(3)[int(np.abs(along).argmin())])
+    unit: Array = side / np.linalg.norm(side)
+    return unit

@@ -1,0 +1,217 @@
+"""Section 1: whether to use the poses, how far off a point is, what to do, and the poses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from gtsam_rwhec.calibration.verdict import Finding, Verdict, findings_of
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.report.advice import Advice
+from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS, MARK
+from gtsam_rwhec.report.report_blocks import Block, Folded, Listing, Paragraph, Section, Table, Tone, Words, significant
+from gtsam_rwhec.report.shown_result import ShownResult
+
+TONES: dict[Verdict, Tone] = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
+#: The words in a reason between facts and advice.
+BETWEEN = ". What to do: "
+#: So many sensors have a large figure each; of more, the worst one has.
+FEW_SENSORS = 4
+POINTS = (
+    "This is the error of the calibration alone, where each sensor typically saw its targets; the noise of one new "
+    "measurement comes on top, and averages out over several. Section Uncertainty has other distances."
+)
+NOTHING_TO_DO = "Nothing has to be done first: copy the poses from the last section, Inputs and versions."
+NO_NOISE_STATED = "Look at the residuals, in mm and degrees, before you trust the poses: no noise was stated."
+
+
+def verdict_section(shown: ShownResult) -> Section:
+    """The verdict with its grounds, how far off a point is, what to do; then the poses."""
+    verdict = Verdict(shown.tree["verdict"])
+    facts, _, cure = shown.tree["verdict_reason"].partition(BETWEEN)
+    blocks: list[Block] = [Paragraph(f"{verdict.words}: {facts}.", TONES[verdict])]
+    points = list(_points(shown))
+    blocks += [block for block in points if isinstance(block, Paragraph)]
+    todo = list(_todo(shown, cure))
+    if todo:
+        blocks += [Paragraph("What to do next", "lead"), Listing(tuple(todo))]
+    else:
+        blocks.append(Paragraph(NOTHING_TO_DO))
+    findings = _findings(shown)
+    if len(findings) > 1:
+        grounds = Listing(tuple(f"{_sentence(one.words)} {_sentence(one.ground.advice)}" for one in findings))
+        blocks.append(Folded("The grounds of this verdict one by one, the most serious first", (grounds,)))
+    blocks += [block for block in points if not isinstance(block, Paragraph)]
+    blocks += pose_blocks(shown)
+    return Section("verdict", "Verdict", tuple(blocks))
+
+
+def _todo(shown: ShownResult, cure: str) -> Iterator[str]:
+    """What to do: the advice of the verdict, and what the terminal says below it."""
+    numbered = re.split(r"(?:^|; )\(\d+\) ", cure)
+    yield from (_sentence(one) for one in numbered if one)
+    result = shown.result
+    if result is None:
+        return
+    if result.calibration is None and result.solution.is_relative:
+        yield NO_NOISE_STATED
+    free = () if result.refined is None else result.refined.free_directions
+    free = free or result.solution.identifiability.free_directions
+    yield from Advice.of(free, result.log, result.judgement).sentences
+
+
+def _findings(shown: ShownResult) -> list[Finding]:
+    """The findings behind the verdict, in the order of its grounds, each once."""
+    result = shown.result
+    if result is None:
+        return []
+    found = findings_of(result.solution, result.refined)
+    if result.calibration is not None:
+        found += result.calibration.findings
+    grounds = list(result.judgement.grounds)
+    counted = dict.fromkeys(one for one in found if one.ground in grounds)
+    return sorted(counted, key=lambda one: grounds.index(one.ground))
+
+
+def _sentence(words: str) -> str:
+    """Words with a capital and a full stop; a name at the beginning stays as it is."""
+    first = words.split(" ", 1)[0]
+    begun = words[:1].upper() + words[1:] if first.isalpha() and first.islower() else words
+    return begun if begun.endswith((".", "!", "?")) else f"{begun}."
+
+
+def _points(shown: ShownResult) -> Iterator[Block]:
+    """How far off a point is where the targets were seen."""
+    points = shown.tree.get("calibration", {}).get("points", [])
+    if not points:
+        return
+    title = "How far off a point is where the targets were seen"
+    which = range(len(points))
+    if len(points) > FEW_SENSORS:
+        radii = [float("inf") if point["radius_mm"] is None else point["radius_mm"] for point in points]
+        which = range(worst := max(which, key=radii.__getitem__), worst + 1)
+        title += ": the worst sensor"
+    yield Paragraph(f"{title}:")
+    for i in which:
+        radius = significant(shown.number("calibration", "points", i, "radius_mm"), 2)
+        level = shown.number("calibration", "points", i, "level", times=100.0, spec="g", unit="%")
+        if radius.value is None:
+            yield Paragraph(f"{points[i]['frame']}: not determined", "lead")
+        else:
+            yield Paragraph((f"{points[i]['frame']}: ", radius, " mm with ", level, " probability"), "lead")
+    rows = tuple(
+        (
+            point["frame"],
+            point["seen_from"],
+            shown.number("calibration", "points", i, "level", times=100.0, spec="g"),
+            significant(shown.number("calibration", "points", i, "radius_mm"), 3),
+            "-"
+            if point.get("measurement_mm") is None
+            else significant(shown.number("calibration", "points", i, "measurement_mm"), 3),
+        )
+        for i, point in enumerate(points)
+    )
+    headings = ("sensor", "expressed in", "probability %", "within mm", "one new measurement adds mm")
+    yield Table("How far off a point is", headings, rows, POINTS)
+
+
+TRANSLATION = ("x m", "y m", "z m")
+ANGLES = ("roll°", "pitch°", "yaw°")
+QUATERNION = ("qw", "qx", "qy", "qz")
+LEGEND = (
+    "±: one standard deviation, along and about the axes of the frame itself; free: infinite, because the measurements "
+    "leave a direction free."
+)
+LEGEND_ANGLES = "Roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll). "
+SCALARS = {"scale": "scale", "time_offset": "clock offset"}
+SCALARS_LEGEND = (
+    "Scale: measured length / true length. Clock offset: a stamp of the sensor + this = the carriers' time. ±: one "
+    "standard deviation."
+)
+FIXED = "fixed"
+
+
+def pose_blocks(shown: ShownResult) -> Iterator[Block]:
+    """A table of the sensors' poses, and one of the targets'; a word on those that are not to be used."""
+    tree = shown.tree
+    sides = (("Sensors", "sensor", "sensors"), ("Targets", "target", "targets"))
+    if not any(tree.get(side) for *_, side in sides):
+        yield Paragraph("There are no poses: the calibration has no answer.")
+        return
+    wrong = [row["child"] for *_, side in sides for row in tree[side] if row.get("contradicted")]
+    for title, kind, side in sides:
+        if tree[side]:
+            yield _table(shown, f"{title} in the frame {tree[side][0]['parent']}", kind, side)
+    yield from _scalars(shown)
+    if wrong:
+        names = ", ".join(sorted(wrong, key=natural_key))
+        yield Paragraph(f"{MARK}: do not use this pose, because its own measurements contradict it: {names}.", "bad")
+
+
+def _scalars(shown: ShownResult) -> Iterator[Block]:
+    """Scales and clock offsets that were estimated; without evidence, without their deviations."""
+    known = (shown.evidence_tree.get("derived") or {}).get("scalars", ())
+    rows: list[tuple[Words, ...]] = []
+    for i, scalar in enumerate(known):
+        times, spec, unit = (1.0, ".6f", "") if scalar["kind"] == "scale" else (1e3, "+.3f", "ms")
+        deviation_spec = spec.removeprefix("+")
+        rows.append(
+            (
+                SCALARS[scalar["kind"]] + (f" of {scalar['owner']}" if scalar["owner"] else ""),
+                shown.evident("derived", "scalars", i, "value", times=times, spec=spec),
+                shown.evident("derived", "scalars", i, "deviation", times=times, spec=deviation_spec),
+                unit,
+            )
+        )
+    if not known and shown.tree.get("scale_mode") != "known":
+        scale = shown.tree.get("scale")
+        names = list(scale) if isinstance(scale, dict) else []
+        rows += [(f"scale of {name}", shown.number("scale", name, spec=".6f"), "-", "") for name in names]
+        if isinstance(scale, float):
+            rows.append(("scale", shown.number("scale", spec=".6f"), "-", ""))
+    if rows:
+        yield Table("Scales and clocks", ("of", "value", "±", "unit"), tuple(rows), SCALARS_LEGEND)
+
+
+def _table(shown: ShownResult, title: str, kind: str, side: str) -> Table:
+    rows = shown.tree[side]
+    order = sorted(range(len(rows)), key=lambda i: natural_key(rows[i]["child"]))
+    angles = angles_of(shown)
+    has_angles = all(row["child"] in angles for row in rows)
+    frames = (shown.tree.get("refined") or {}).get("frames", {})
+    deviations = DEVIATION_HEADINGS if frames else ()
+    cells = []
+    for i in order:
+        name = rows[i]["child"]
+        row: list[Words] = [f"{name} {MARK}" if rows[i].get("contradicted") else name]
+        row += [shown.number(side, i, "translation_m", k, spec="z.4f") for k in range(3)]
+        if has_angles:
+            row += [shown.evident("derived", "angles", angles[name], "rpy_deg", k, spec="z.2f") for k in range(3)]
+        else:
+            row += [shown.number(side, i, "quaternion_wxyz", k, spec="z.5f") for k in range(4)]
+        if frames:
+            row += deviation_cells(shown, name)
+        cells.append(tuple(row))
+    headings = (kind, *TRANSLATION, *(ANGLES if has_angles else QUATERNION), *deviations)
+    legend = (LEGEND_ANGLES if has_angles else "") + (LEGEND if frames else "")
+    return Table(title, headings, tuple(cells), legend.strip())
+
+
+def deviation_cells(shown: ShownResult, name: str) -> list[Words]:
+    """Standard deviations of a frame: along x, y, z in millimetres, then about them in degrees."""
+    if name not in known_unknowns(shown):
+        return [FIXED] * 6
+    at = ("refined", "frames", name)
+    along: list[Words] = [shown.number(*at, "standard_deviations_mm", k, spec=".2f") for k in range(3)]
+    return along + [shown.number(*at, "standard_deviations_deg", k, spec=".3f") for k in range(3)]
+
+
+def known_unknowns(shown: ShownResult) -> frozenset[str]:
+    """The names of all that was estimated; a frame that is not among them was stated."""
+    return frozenset(shown.tree["refined"]["joint"]["slots"])
+
+
+def angles_of(shown: ShownResult) -> dict[str, int]:
+    """Where the evidence has roll, pitch and yaw of each frame; empty without evidence."""
+    derived = shown.evidence_tree.get("derived") or {}
+    return {row["frame"]: i for i, row in enumerate(derived.get("angles", ()))}

@@ -1,0 +1,70 @@
+"""Figures of a page: of the page's colour in it, black on white as files, and each with ids of its own."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.report.figures import FILE_DPI, svg_figure, write_figures
+from gtsam_rwhec.report.html_page import page_html
+from gtsam_rwhec.report.report_blocks import Chart, Drawing, Folded, Page, Section
+
+
+def points(figure: Figure) -> None:
+    axes = figure.subplots()
+    axes.plot([0.0, 1.0, 2.0], [1.0, 0.0, 1.0], "o-", label="cam_0")
+    axes.set(xlabel="time, s", ylabel="residual, mm")
+    axes.legend()
+
+
+def page() -> Page:
+    svg = svg_figure(points, 2.0, 3.0)
+    folded = Folded("More", (Chart("second", "Second", "It shows the same.", svg),))
+    drawing = Drawing("rig", "Rig", "It shows a rig.", (), {}, svg)
+    chart = Chart("first", "First", "It shows points.", svg)
+    return Page("A page", "good", (Section("a", "A", (chart, folded, drawing)),), "by hand")
+
+
+def test_figures_take_the_colour_of_the_page_and_equal_ones_are_equal() -> None:
+    svg = svg_figure(points)
+    assert svg == svg_figure(points)
+    assert "currentColor" in svg
+    assert "#010203" not in svg
+
+
+def test_ids_of_figures_are_their_own_and_lead_somewhere() -> None:
+    text = page_html(page())
+    ids = re.findall(r' id="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+    used = re.findall(r'(?:xlink:href="#|url\(#)([^")]+)', text)
+    assert len(used) > 6
+    assert set(used) <= set(ids)
+
+
+def test_every_figure_is_written_as_svg_and_png(tmp_path: Path) -> None:
+    written = write_figures(page(), tmp_path / "new" / "figures")
+    assert [path.name for path in written] == [
+        f"{name}.{kind}" for name in ("first", "second", "rig") for kind in ("svg", "png")
+    ]
+    svg, png = (path.read_bytes() for path in written[:2])
+    assert ElementTree.fromstring(svg).attrib["width"] == "216pt"
+    assert b"currentColor" not in svg
+    with Image.open(io.BytesIO(png)) as image:
+        assert image.size == (3 * FILE_DPI, 2 * FILE_DPI)
+        pixels = np.asarray(image.convert("RGB"))
+    assert tuple(pixels[0, 0]) == (255, 255, 255)
+    assert pixels.min() < 30
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(rw.errors.FileFormatError, match="cannot be made a folder"):
+        write_figures(page(), tmp_path / "file")

@@ -1,0 +1,221 @@
+"""The sections of numbers: verdict, who determines whom, proof, uncertainty, inputs; of results of all kinds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from places import REPOSITORY
+from refinement_problems import rig
+from shown_numbers import numbers_of, wrong_numbers
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.report.determined_section import determines_section
+from gtsam_rwhec.report.inputs_section import inputs_section
+from gtsam_rwhec.report.proof_section import proof_section
+from gtsam_rwhec.report.report_blocks import Block, Chart, CopyText, Section, Table
+from gtsam_rwhec.report.report_page import read_shown
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.report.uncertainty_section import uncertainty_section
+from gtsam_rwhec.report.verdict_section import verdict_section
+
+GOLDEN = REPOSITORY / "tests" / "golden"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration of a small rig from a program: result, evidence and report."""
+    folder = tmp_path_factory.mktemp("numbers")
+    problem = rig(targets=2, sensors=2).problem
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(sizes="known"))
+    rw.write_calibration(calibration, folder / "result.json")
+    rw.results.write_evidence(rw.results.evidence_of(problem, calibration), folder / "evidence.json")
+    rw.report.write_html(folder, folder / "report.html")
+    return folder
+
+
+MADE_BY = {
+    "verdict": verdict_section,
+    "determines": determines_section,
+    "proof": proof_section,
+    "uncertainty": uncertainty_section,
+    "inputs": inputs_section,
+}
+
+
+def section(shown: ShownResult, name: str) -> Section:
+    """One section alone: charts of the others take time."""
+    return MADE_BY[name](shown)
+
+
+def tables(blocks: tuple[Block, ...]) -> dict[str, Table]:
+    return {block.caption: block for block in blocks if isinstance(block, Table)}
+
+
+def texts(blocks: tuple[Block, ...]) -> dict[str, str]:
+    return {block.name: block.text for block in blocks if isinstance(block, CopyText)}
+
+
+def test_every_number_is_that_of_the_json(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    files = {name: json.loads((folder / name).read_text(encoding="utf-8")) for name in ("result.json", "evidence.json")}
+    assert len(numbers_of(page)) > 50
+    assert list(wrong_numbers(page, files)) == []
+
+
+def test_poses_are_shown_in_metres_and_degrees(folder: Path) -> None:
+    shown = read_shown(folder)
+    assert shown.result is not None
+    (of_sensors,) = (
+        table for title, table in tables(section(shown, "verdict").blocks).items() if title.startswith("Sensors")
+    )
+    assert of_sensors.headings[:7] == ("sensor", "x m", "y m", "z m", "roll°", "pitch°", "yaw°")
+    assert shown.result.refined is not None
+    for name, *cells in of_sensors.rows:
+        pose = shown.result.refined.Y[str(name)]
+        written = [float(cell.text) for cell in cells[:6]]  # type: ignore[union-attr]
+        assert written[:3] == pytest.approx(pose.translation(), abs=6e-5)
+        assert written[3:] == pytest.approx(np.degrees(pose.rotation().rpy()), abs=6e-3)
+
+
+def test_without_evidence_poses_have_quaternions_and_inputs_say_why(folder: Path) -> None:
+    shown = ShownResult.of((folder / "result.json").read_bytes(), None)
+    (heading,) = {
+        table.headings[4:8]
+        for title, table in tables(section(shown, "verdict").blocks).items()
+        if "in the frame" in title
+    }
+    assert heading == ("qw", "qx", "qy", "qz")
+    assert any("no evidence.json" in str(block) for block in section(shown, "inputs").blocks)
+
+
+def test_copied_python_is_the_pose_to_the_last_bit(folder: Path) -> None:
+    shown = read_shown(folder)
+    assert shown.result is not None
+    assert shown.result.refined is not None
+    found: dict[str, dict[tuple[str, str], np.ndarray]] = {}
+    exec(texts(section(shown, "inputs").blocks)["poses"], found)
+    for name, pose in shown.result.refined.Y.items():
+        assert gtsam.Pose3(found["POSES"]["sensorcarrier", name]).equals(pose, 0.0)
+
+
+def test_copied_texts_of_poses_that_are_not_to_be_used_say_so(folder: Path) -> None:
+    tree = json.loads((GOLDEN / "result_version_7.json").read_bytes())
+    shown = ShownResult(tree | {"verdict": "do_not_use", "verdict_reason": "they are\nmade up"}, None, None, "x")
+    from_file = ShownResult.of((GOLDEN / "result_version_7.json").read_bytes(), None)
+    texts_of = texts(section(ShownResult(shown.tree, from_file.result, None, "x"), "inputs").blocks)
+    assert len(texts_of) == 4
+    for text in texts_of.values():
+        head = text[:200]
+        assert "Do not use these poses: they are" in head
+        assert "\nmade up" not in head
+
+
+def test_names_that_other_programs_cannot_read_are_said(folder: Path) -> None:
+    tree = json.loads((folder / "result.json").read_bytes())
+    tree["sensors"][0]["child"] = "<script>alert(1)</script>"
+    shown = ShownResult(tree, read_shown(folder).result, None, "x")
+    found = section(shown, "inputs")
+    assert texts(found.blocks) == {}
+    assert "other programs cannot read them: '<script>alert(1)</script>' cannot be" in str(found)
+
+
+def test_options_that_are_not_the_default_and_seeds_are_shown(folder: Path) -> None:
+    found = tables(section(read_shown(folder), "inputs").blocks)
+    assert found["Options that are not the default"].rows == (("sizes", "'known'"),)
+    assert "Seeds of random numbers" in found
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in GOLDEN.glob("result_version_*.json")))
+def test_results_of_all_versions_have_all_sections(name: str) -> None:
+    shown = read_shown(GOLDEN / f"{name}.json")
+    for each in MADE_BY:
+        made = section(shown, each)
+        assert made.name == each
+        assert made.blocks or made.missing
+    assert any("in the frame" in title for title in tables(section(shown, "verdict").blocks))
+
+
+def test_a_calibration_without_an_answer_is_shown() -> None:
+    tree = {
+        "format": "gtsam-rwhec result",
+        "format_version": 7,
+        "written_by": "gtsam-rwhec 0.1.0",
+        "verdict": "do_not_use",
+        "verdict_reason": "there is no answer with a positive scale. What to do: look at A",
+        "verdict_grounds": ["no_scale"],
+        "sensors": [],
+        "targets": [],
+        "conventions": {},
+        "calibration": {"findings": [], "choices": [], "points": [], "noise": "", "outliers": "", "notes": []},
+    }
+    shown = ShownResult.of(json.dumps(tree).encode(), None)
+    assert "Look at A." in str(section(shown, "verdict"))
+    for each in MADE_BY:
+        assert section(shown, each).blocks or section(shown, each).missing
+
+
+def test_a_file_that_is_no_result_is_refused() -> None:
+    for content in (b"{", b"[]", b'{"verdict": "do_not_use", "verdict_reason": "x"}'):
+        with pytest.raises(rw.errors.FileFormatError, match="is not a result"):
+            ShownResult.of(content, None)
+
+
+def test_the_grid_counts_measurements_and_tells_how_each_pair_is_determined(folder: Path) -> None:
+    shown = read_shown(folder)
+    (grid,) = (table for title, table in tables(section(shown, "determines").blocks).items() if "Figure 8" in title)
+    assert shown.result is not None
+    alone = shown.result.solution.identifiability.pairs
+    targets = grid.headings[1:]
+    for sensor, *cells in grid.rows:
+        for target, cell in zip(targets, cells, strict=True):
+            pair = alone[rw.Pair(target, str(sensor))]
+            assert isinstance(cell, tuple)
+            assert str(cell[0]).startswith("■" if pair.is_unique else "□")
+            assert cell[1].value == pair.number_of_measurements  # type: ignore[union-attr]
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
+def test_a_free_direction_is_said_with_the_motion_that_settles_it(tmp_path: Path) -> None:
+    problem = rig(targets=1, sensors=1).problem
+    (pair,) = problem.pairs
+    raw = problem.measurements(*pair)
+    still = rw.Problem()
+    A = np.tile(raw.A[0], (10, 1, 1))
+    A[:, :3, 3] += np.random.default_rng(0).standard_normal((10, 3))
+    still.add(*pair, A, A, 0.01, 1e4)
+    calibration = rw.calibrate(still)
+    rw.write_calibration(calibration, tmp_path / "result.json")
+    rw.results.write_evidence(rw.results.evidence_of(still, calibration), tmp_path / "evidence.json")
+    shown = read_shown(tmp_path / "result.json")
+    said = str(section(shown, "determines"))
+    assert "the motion did not turn. Turn the carriers" in said
+    assert "Not determined" in str(section(shown, "verdict"))
+    assert "No frame has a finite" in str(section(shown, "uncertainty"))
+
+
+def test_uncertainty_has_charts_and_points_and_says_what_is_missing(folder: Path) -> None:
+    found = section(read_shown(folder), "uncertainty")
+    assert {"deviations", "correlation"} <= {block.name for block in found.blocks if isinstance(block, Chart)}
+    points = tables(found.blocks)["How far off a point is, mm, by its distance"]
+    assert points.headings == ("sensor", "expressed in", "0.5 m", "1 m", "2 m", "targets at m", "there")
+    assert len(points.rows) == 2
+    said = str(found.blocks)
+    assert "no clock offset was estimated" in said
+    assert "the answer is not from corners" in said
+
+
+def test_what_intrinsics_would_do_names_the_frame_that_moves_most() -> None:
+    found = section(read_shown(GOLDEN / "result_version_7.json"), "uncertainty")
+    table = tables(found.blocks)["What intrinsics would do"]
+    consequences = json.loads((GOLDEN / "result_version_7.json").read_bytes())["refined"]["reprojection"][
+        "consequences"
+    ]
+    assert consequences
+    for cause, frame, millimetres, *_ in table.rows:
+        most = max((row for row in consequences if row["cause"] == cause), key=lambda row: row["translation_mm"])
+        assert frame == most["frame"]
+        assert millimetres.value == most["translation_mm"]  # type: ignore[union-attr]

@@ -1,0 +1,85 @@
+"""The sections of residuals and of what each image contributed: their numbers, words and charts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from refinement_problems import rig
+from shown_numbers import numbers_of, wrong_numbers
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.report.contribution_section import contribution_section
+from gtsam_rwhec.report.html_page import page_html
+from gtsam_rwhec.report.report_blocks import Chart, Page
+from gtsam_rwhec.report.residual_section import image_figure, residuals_section
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.evidence import evidence_json
+from gtsam_rwhec.results.result_file import calibration_json
+
+
+@pytest.fixture(scope="module")
+def shown() -> ShownResult:
+    problem = rig().problem
+    calibration = rw.calibrate(problem)
+    return ShownResult.of(calibration_json(calibration), rw.results.evidence_of(problem, calibration))
+
+
+def test_every_number_is_that_of_the_evidence(shown: ShownResult) -> None:
+    assert shown.evidence is not None
+    page = page_html(Page("A page", "good", (residuals_section(shown), contribution_section(shown)), "by hand"))
+    files = {"result.json": shown.tree, "evidence.json": json.loads(evidence_json(shown.evidence))}
+    assert len(numbers_of(page)) > 100
+    assert list(wrong_numbers(page, files)) == []
+    assert "They are not" not in page
+    assert "as large as the noise that was found" in page
+    assert "could be left out" in page
+
+
+def test_each_question_has_its_chart(shown: ShownResult) -> None:
+    blocks = (*residuals_section(shown).blocks, *contribution_section(shown).blocks)
+    charts = {block.name for block in blocks if isinstance(block, Chart)}
+    assert charts == {
+        "residuals-by-pair",
+        "residuals-by-time",
+        "residuals-by-configuration",
+        "residuals-against-noise",
+        "contribution-curve",
+    }
+
+
+def test_without_evidence_the_sections_say_why(shown: ShownResult) -> None:
+    bare = ShownResult.of(json.dumps(shown.tree).encode(), None)
+    for section in (residuals_section(bare), contribution_section(bare)):
+        assert section.missing == "the result has no evidence.json beside it."
+        assert not section.blocks
+
+
+def test_arrows_over_the_image_point_where_corners_are_off() -> None:
+    from gtsam_rwhec.results.image_errors import SeenCamera
+
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(0.0, 640.0, 400), rng.uniform(0.0, 480.0, 400)
+    camera = SeenCamera(
+        sensor="cam", width=640, height=480, images=4, corners=400, cells=((400,),), share=1.0, rms_px=1.0,
+        noise_px=0.1, at_optimum=True, x=tuple(x), y=tuple(y), dx=tuple(np.full(400, 0.25)), dy=tuple(np.zeros(400)),
+    )  # fmt: skip
+    assert "cam: longest 0.25 px" in image_figure((camera,))
+
+
+def test_evidence_of_numbers_without_bounds_is_refused(shown: ShownResult, tmp_path: Path) -> None:
+    """Found by damaging a file: 1e308 was read, and the page ended in a ValueError of its chart."""
+    assert shown.evidence is not None
+    tree = json.loads(evidence_json(shown.evidence))
+    path = tmp_path / "evidence.json"
+    for value, is_refused in ((1e308, True), (1e59, False)):
+        tree["residuals"]["pairs"][0]["normalised"][0][0] = value
+        path.write_text(json.dumps(tree), encoding="utf-8")
+        if is_refused:
+            with pytest.raises(rw.errors.FileFormatError, match="normalised"):
+                rw.results.read_evidence(path)
+        else:
+            of = ShownResult.of(json.dumps(shown.tree).encode(), rw.results.read_evidence(path))
+            assert residuals_section(of).blocks
