@@ -130,7 +130,7 @@ def test_a_page_is_of_a_result_its_own_evidence_and_a_file_of_its_own(folder: Pa
     with pytest.raises(rw.errors.OptionError, match="evidence is of another calibration"):
         rw.report.write_html(folder / "result.json", page, own)
     for wrong in (5, "evidence.json"):
-        with pytest.raises(rw.errors.OptionError, match=r"give what rw\.evidence\.evidence_of"):
+        with pytest.raises(rw.errors.OptionError, match=r"give what rw\.results\.evidence_of"):
             rw.report.write_html(other, page, wrong)  # type: ignore[arg-type]
     for wrong in (None, other.solution, b"result.json"):
         with pytest.raises(rw.errors.OptionError, match=r"give what rw\.calibrate returned"):

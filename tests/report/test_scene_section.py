@@ -46,7 +46,7 @@ def shown() -> ShownResult:
     rows = rw.results.measured_rows(problem, calibration)
     scene = scene_of(calibration, rows, ("hand", "base"), cameras, targets)
     evidence = rw.results.evidence_of(problem, calibration).model_copy(update={"scene": scene})
-    return ShownResult.of(rw.results.written_result.calibration_json(calibration), evidence)
+    return ShownResult.of(rw.results.result_file.calibration_json(calibration), evidence)
 
 
 def drawing(section: Section) -> Drawing:
@@ -174,7 +174,7 @@ def test_free_directions_are_drawn_where_nothing_is_known() -> None:
     problem = rig(motion=Motion("planar")).problem
     calibration = rw.calibrate(problem)
     evidence = rw.results.evidence_of(problem, calibration)
-    shown = ShownResult.of(rw.results.written_result.calibration_json(calibration), evidence)
+    shown = ShownResult.of(rw.results.result_file.calibration_json(calibration), evidence)
     section = scene_section(shown)
     block = drawing(section)
     free = [dict(trace) for trace in block.traces if trace["meta"] == "directions" and trace["name"] == "free"]
