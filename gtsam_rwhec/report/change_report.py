@@ -13,7 +13,6 @@ from gtsam_rwhec.results.common_quantities import Movement
 from gtsam_rwhec.results.difference import Difference
 from gtsam_rwhec.results.difference import share_words
 from pathlib import Path
-from gtsam_rwhec.calibration.prediction_errors import PredictionError
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.report.html_page import write_page
@@ -24,6 +23,7 @@ from gtsam_rwhec.report.report_blocks import Paragraph
 from gtsam_rwhec.report.report_blocks import Section
 from gtsam_rwhec.report.report_blocks import Table
 from gtsam_rwhec.results.verification import Verification
+from gtsam_rwhec.calibration.cross_validation import PredictionError
 
 MOVED_HEADINGS = ("mm", "°", "deviations", "chance", "changed")
 NUMBER_HEADINGS = ("old", "new", "deviations", "chance", "changed")

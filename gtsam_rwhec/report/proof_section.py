@@ -1,32 +1,18 @@
 """Section 5: bound, cost, gap, cause, spectrum of Z and path, each with what it means and what it does not."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
-from typing import Any
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
-from gtsam_rwhec.report.sentences import limits_of
-from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.certificate import Status
-from typing import TYPE_CHECKING
+
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.figures import BLUE
-from gtsam_rwhec.report.figures import GREY
-from gtsam_rwhec.report.figures import INK
-from gtsam_rwhec.report.figures import ORANGE
-from gtsam_rwhec.report.figures import VERMILLION
-from gtsam_rwhec.report.figures import SvgFigure
-from gtsam_rwhec.report.figures import svg_figure
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Chart
-from gtsam_rwhec.report.report_blocks import Folded
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.report_blocks import Tone
-from gtsam_rwhec.report.report_blocks import Words
+from gtsam_rwhec.report.figures import BLUE, GREY, INK, ORANGE, VERMILLION, SvgFigure, svg_figure
+from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Listing, Paragraph, Section, Table, Tone, Words
+from gtsam_rwhec.report.sentences import limits_of
 from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.solver.certificate import Certificate, Status
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,10 +10,10 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import SHARE, FreeDirection
 from gtsam_rwhec.report.figures import round_down
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.scene_evidence import SceneEvidence
+from gtsam_rwhec.solver.free_directions import SHARE, FreeDirection
 
 Kind = Literal["carrier", "sensor", "target"]
 #: Axes of frames have at most and at least this share of the scene, and this share of the distance between neighbours.

@@ -1,37 +1,34 @@
 """The evidence of a calibration from a log, gathered: what its report shows beside the result."""
 
 from __future__ import annotations
+
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from os.path import commonpath
 from pathlib import Path
+
+from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs.mcap_reader import Log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results import Evidence
 from gtsam_rwhec.results.contribution import contribution_of
 from gtsam_rwhec.results.derived import derived_of
-from gtsam_rwhec.results.evidence import Inputs
-from gtsam_rwhec.results.evidence import input_files
-from gtsam_rwhec.results.evidence import versions
-from gtsam_rwhec.results.linear_model import LinearModel
-from gtsam_rwhec.results.linear_model import MeasuredRows
+from gtsam_rwhec.results.evidence import Inputs, input_files, versions
+from gtsam_rwhec.results.linear_model import LinearModel, MeasuredRows
 from gtsam_rwhec.results.proof_spectrum import proof_of
 from gtsam_rwhec.results.residual_evidence import residuals_of
-from gtsam_rwhec.results.scene_evidence import SceneEvidence
-from gtsam_rwhec.results.scene_evidence import scene_of
+from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
 from gtsam_rwhec.results.weak_poses import weak_directions
 from gtsam_rwhec.rig import rig_text
-from gtsam_rwhec.runs.seen_in_log import Pictures
-from gtsam_rwhec.runs.seen_in_log import seen_in_log
-from gtsam_rwhec.runs.solution_frames import frames_of
-from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.solving_stage import Solved
-from dataclasses import replace
-from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.logs.mcap_reader import Log
 from gtsam_rwhec.runs.corner_answer import with_intrinsics
 from gtsam_rwhec.runs.log_corners import LogCorners
+from gtsam_rwhec.runs.seen_in_log import Pictures, seen_in_log
+from gtsam_rwhec.runs.solution_frames import frames_of
+from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
+
 
 def evidence_of_log(
     calibrated: Calibrated, log_path: str | Path, sources: Sequence[Path], pictures: Pictures | None = None

@@ -1,6 +1,7 @@
 """The wheel that users install: the demo works from it, far away from any checkout."""
 
 from __future__ import annotations
+
 import json
 import os
 import subprocess
@@ -8,10 +9,12 @@ import sys
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
+
 import gtsam
 import numpy as np
 import pytest
 from places import REPOSITORY
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.intrinsics_files import read_cameras
 

@@ -1,34 +1,28 @@
 """The rig in space: what is drawn stands where the JSON has it, with the covariances' axes and the cameras' views."""
 
 from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 import pytest
 from places import REPOSITORY
 from refinement_problems import rig
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import AprilGrid
-from gtsam_rwhec.cameras.targets import Charuco
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Tag
+from gtsam_rwhec.cameras.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag
 from gtsam_rwhec.fitting.reprojection_record import BoardShape
-from gtsam_rwhec.results.scene_evidence import drawn_board
-from gtsam_rwhec.results.scene_evidence import rim_of
-from gtsam_rwhec.results.scene_evidence import scene_of
-from gtsam_rwhec.results.scene_evidence import standing_carrier
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.report.report_blocks import Drawing
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Drawing, Listing, Section
 from gtsam_rwhec.report.report_page import read_shown
 from gtsam_rwhec.report.scene_model import scene_of_rig
 from gtsam_rwhec.report.scene_section import scene_section
 from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.scene_evidence import drawn_board, rim_of, scene_of, standing_carrier
+from gtsam_rwhec.simulate import Motion
 
 CAMERA = Camera.of(640, 480, "radtan", [[500, 0, 320], [0, 510, 235], [0, 0, 1]], [-0.2, 0.05, 0, 0], "CAMERA")
 FISHEYE = Camera.of(640, 480, "equidistant", [[280, 0, 320], [0, 280, 240], [0, 0, 1]], [0.01, 0, 0, 0], "FISHEYE")

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from refined_corners import two_cameras
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.corner_residuals import pixel_errors
 from gtsam_rwhec.fitting.reprojection_record import BoardShape, Reprojection
 from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 from gtsam_rwhec.results.image_errors import CornerErrors, SeenView, board_of, errors_at_optimum
-from gtsam_rwhec.vision.camera import Camera
 
 
 def views_of(sensor: str) -> list[SeenView]:
