@@ -1,7 +1,6 @@
 """Mistakes of a first user, each as it is made on the command line: exit status not 0, the fault and its cure in words.
 
-The cells are small: a board that is drawn into images of 320 x 240 pixels, and a log of detections. What a run draws
-(plots, contact sheet) is left out: it takes as long as all the rest, and has tests of its own.
+The cells are small: a board that is drawn into images of 320 x 240 pixels, and a log of detections.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 import rendered
-import synthetic_logs as made
 from given_commands import command
 from places import REPOSITORY
 from scipy.spatial.transform import Rotation
@@ -24,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from gtsam_rwhec.cameras.targets import Checkerboard, Tag
 
 sys.path.append(str(REPOSITORY / "tests" / "runs"))
+import synthetic_logs as made
 
 IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"
