@@ -1,43 +1,43 @@
 """``gtsam-rwhec calibrate``: calibrate from a log, or from a folder of CSV files."""
 
 from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
-from typing import Literal
+from typing import Annotated, Literal
+
 import typer
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import ExitStatus
-from gtsam_rwhec.cli.failures import check_output
-from gtsam_rwhec.cli.failures import exit_status
-from gtsam_rwhec.cli.failures import said_in_the_report
+from gtsam_rwhec.cli.failures import ExitStatus, check_output, exit_status, said_in_the_report
 from gtsam_rwhec.cli.report_command import report_path
-from gtsam_rwhec.cli.shared_options import CHOICES_PANEL
-from gtsam_rwhec.cli.shared_options import CSV_PANEL
-from gtsam_rwhec.cli.shared_options import FOLDER_OF_CSV
-from gtsam_rwhec.cli.shared_options import LOG_PANEL
-from gtsam_rwhec.cli.shared_options import WHOLE
-from gtsam_rwhec.cli.shared_options import AnywayOption
-from gtsam_rwhec.cli.shared_options import ImagesOption
-from gtsam_rwhec.cli.shared_options import KappaOption
-from gtsam_rwhec.cli.shared_options import NoReportImagesOption
-from gtsam_rwhec.cli.shared_options import RigOption
-from gtsam_rwhec.cli.shared_options import ScaleOption
-from gtsam_rwhec.cli.shared_options import SensorsOption
-from gtsam_rwhec.cli.shared_options import SigmaOption
-from gtsam_rwhec.cli.shared_options import TargetsOption
-from gtsam_rwhec.cli.shared_options import VerboseOption
-from gtsam_rwhec.cli.shared_options import WorkersOption
-from gtsam_rwhec.cli.shared_options import command_of
-from gtsam_rwhec.cli.shared_options import exported
-from gtsam_rwhec.cli.shared_options import refuse
-from gtsam_rwhec.cli.shared_options import show
-from gtsam_rwhec.cli.shared_options import show_odometries
+from gtsam_rwhec.cli.shared_options import (
+    CHOICES_PANEL,
+    CSV_PANEL,
+    FOLDER_OF_CSV,
+    LOG_PANEL,
+    WHOLE,
+    AnywayOption,
+    ImagesOption,
+    KappaOption,
+    NoReportImagesOption,
+    RigOption,
+    ScaleOption,
+    SensorsOption,
+    SigmaOption,
+    TargetsOption,
+    VerboseOption,
+    WorkersOption,
+    command_of,
+    exported,
+    refuse,
+    show,
+    show_odometries,
+)
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.files.terminal_text import say
-from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Method = Literal["auto", "sdp", "local"]
 Noise = Literal["auto", "given", "estimate"]

@@ -1,39 +1,28 @@
 """The summary page over all robots of a fleet: how many may be used, which may not and why, and what it cost."""
 
 from __future__ import annotations
+
 import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
+
 import numpy as np
+
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.receipts import below
 from gtsam_rwhec.fleet.rows import RobotRow
 from gtsam_rwhec.fleet.stores import write_once
-from gtsam_rwhec.fleet.summary_charts import cost_chart
-from gtsam_rwhec.fleet.summary_charts import uncertainty_chart
+from gtsam_rwhec.fleet.summary_charts import cost_chart, uncertainty_chart
 from gtsam_rwhec.fleet.watch_events import day_text
-from gtsam_rwhec.fleet.watch_page import alarm_table
-from gtsam_rwhec.fleet.watch_page import drift_charts
-from gtsam_rwhec.fleet.watch_words import remarks
-from gtsam_rwhec.fleet.watch_words import verdict
-from gtsam_rwhec.fleet.watching import Watched
-from gtsam_rwhec.fleet.watching import watch
-from gtsam_rwhec.report.html_page import page_html
-from gtsam_rwhec.report.html_page import write_page
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Chart
-from gtsam_rwhec.report.report_blocks import Link
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Number
-from gtsam_rwhec.report.report_blocks import Page
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.report_blocks import Words
+from gtsam_rwhec.fleet.watch_page import alarm_table, drift_charts
+from gtsam_rwhec.fleet.watch_words import remarks, verdict
+from gtsam_rwhec.fleet.watching import Watched, watch
+from gtsam_rwhec.report.html_page import page_html, write_page
+from gtsam_rwhec.report.report_blocks import Block, Chart, Link, Listing, Number, Page, Paragraph, Section, Table, Words
 
 #: Robots that are named one by one, and reasons that are.
 WORST, REASONS = 10, 12

@@ -1,30 +1,21 @@
 """The page of control charts: what moved on which robot and when, with a small chart of each robot that changed."""
 
 from __future__ import annotations
+
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
+
 import numpy as np
+
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.files.whole_files import checked_path
-from gtsam_rwhec.fleet.watch_events import AlarmEvent
-from gtsam_rwhec.fleet.watch_events import day_text
-from gtsam_rwhec.fleet.watch_words import remarks
-from gtsam_rwhec.fleet.watch_words import verdict
-from gtsam_rwhec.fleet.watching import DAY_NS
-from gtsam_rwhec.fleet.watching import RobotChart
-from gtsam_rwhec.fleet.watching import Watched
-from gtsam_rwhec.report.figures import INK
-from gtsam_rwhec.report.figures import shortened
-from gtsam_rwhec.report.figures import svg_figure
+from gtsam_rwhec.fleet.watch_events import AlarmEvent, day_text
+from gtsam_rwhec.fleet.watch_words import remarks, verdict
+from gtsam_rwhec.fleet.watching import DAY_NS, RobotChart, Watched
+from gtsam_rwhec.report.figures import INK, shortened, svg_figure
 from gtsam_rwhec.report.html_page import write_page
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Chart
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Page
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.report_blocks import Block, Chart, Listing, Page, Paragraph, Section, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

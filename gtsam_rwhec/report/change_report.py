@@ -1,29 +1,20 @@
 """What changed between two calibrations, on the terminal: the verdict, a table, and what to keep in mind."""
 
 from __future__ import annotations
-from gtsam_rwhec.files.terminal_text import rounded
+
+from pathlib import Path
+
+from gtsam_rwhec.calibration.cross_validation import PredictionError
+from gtsam_rwhec.files.terminal_text import rounded, shown
+from gtsam_rwhec.files.whole_files import checked_path
+from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading
-from gtsam_rwhec.report.printing import print_list
-from gtsam_rwhec.report.printing import print_sentence
-from gtsam_rwhec.report.printing import print_tables
-from gtsam_rwhec.report.printing import report_console
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
+from gtsam_rwhec.report.report_blocks import Block, Listing, Page, Paragraph, Section, Table
 from gtsam_rwhec.results.change_test import ChangeTest
 from gtsam_rwhec.results.common_quantities import Movement
-from gtsam_rwhec.results.difference import Difference
-from gtsam_rwhec.results.difference import share_words
-from pathlib import Path
-from gtsam_rwhec.files.paths import checked_path
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.report.html_page import write_page
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Page
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.results.difference import Difference, share_words
 from gtsam_rwhec.results.verification import Verification
-from gtsam_rwhec.calibration.cross_validation import PredictionError
 
 MOVED_HEADINGS = ("mm", "°", "deviations", "chance", "changed")
 NUMBER_HEADINGS = ("old", "new", "deviations", "chance", "changed")

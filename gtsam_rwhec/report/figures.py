@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.report.report_blocks import Chart, Drawing, Page, every
 
 if TYPE_CHECKING:

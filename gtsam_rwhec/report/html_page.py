@@ -1,6 +1,7 @@
 """A page as HTML: one file that needs nothing else, from disk and without network."""
 
 from __future__ import annotations
+
 import base64
 import gzip
 import hashlib
@@ -11,13 +12,10 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+
 from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.report.report_blocks import Link
-from gtsam_rwhec.report.report_blocks import Number
-from gtsam_rwhec.report.report_blocks import Page
-from gtsam_rwhec.report.report_blocks import Piece
-from gtsam_rwhec.report.report_blocks import Words
-from gtsam_rwhec.report.report_blocks import every
+from gtsam_rwhec.report.report_blocks import Link, Number, Page, Piece, Words, every
+
 
 def write_page(page: Page, path: str | Path) -> None:
     """Write a page.

@@ -1,28 +1,20 @@
 """``write_html``: the report of a calibration as one HTML file."""
 
 from __future__ import annotations
+
 import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import EvidenceWarning
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import EvidenceWarning, FileFormatError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.whole_files import checked_path
-from gtsam_rwhec.files.whole_files import is_one_of
-from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.results import Evidence
-from gtsam_rwhec.results import evidence_path
-from gtsam_rwhec.results import read_evidence
-from gtsam_rwhec.results.evidence import checksum
-from gtsam_rwhec.results.json_tree import MOST_BYTES
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_file import calibration_json
+from gtsam_rwhec.files.whole_files import checked_path, is_one_of, read_whole
 from gtsam_rwhec.report.contribution_section import contribution_section
 from gtsam_rwhec.report.detections_section import seen_section
 from gtsam_rwhec.report.determined_section import determines_section
@@ -30,13 +22,17 @@ from gtsam_rwhec.report.figures import write_figures
 from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.inputs_section import inputs_section
 from gtsam_rwhec.report.proof_section import proof_section
-from gtsam_rwhec.report.report_blocks import Page
-from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Page, Section
 from gtsam_rwhec.report.residual_section import residuals_section
 from gtsam_rwhec.report.scene_section import scene_section
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.report.uncertainty_section import uncertainty_section
 from gtsam_rwhec.report.verdict_section import verdict_section
+from gtsam_rwhec.results import Evidence, evidence_path, read_evidence
+from gtsam_rwhec.results.evidence import checksum
+from gtsam_rwhec.results.json_tree import MOST_BYTES
+from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.result_file import calibration_json
 
 #: The name of a result in an output folder.
 RESULT_FILE = "result.json"

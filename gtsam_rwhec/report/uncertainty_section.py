@@ -1,37 +1,21 @@
 """Section 7: how well poses are known: deviations, correlation, points at several distances, intrinsics and clocks."""
 
 from __future__ import annotations
-from collections.abc import Callable
-from collections.abc import Iterator
-from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
+
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
+
 import numpy as np
+
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.figures import AXIS_COLOURS
-from gtsam_rwhec.report.figures import AXIS_NAMES
-from gtsam_rwhec.report.figures import INK
-from gtsam_rwhec.report.figures import plain_decades
-from gtsam_rwhec.report.figures import shortened
-from gtsam_rwhec.report.figures import svg_figure
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Chart
-from gtsam_rwhec.report.report_blocks import Folded
-from gtsam_rwhec.report.report_blocks import Number
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.report_blocks import Words
-from gtsam_rwhec.report.report_blocks import significant
+from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
+from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, INK, plain_decades, shortened, svg_figure
+from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Number, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.report.verdict_section import ANGLES
-from gtsam_rwhec.report.verdict_section import LEGEND
-from gtsam_rwhec.report.verdict_section import TRANSLATION
-from gtsam_rwhec.report.verdict_section import deviation_cells
-from gtsam_rwhec.report.verdict_section import known_unknowns
+from gtsam_rwhec.report.verdict_section import ANGLES, LEGEND, TRANSLATION, deviation_cells, known_unknowns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from gtsam_rwhec.calibration.verdict import Finding, Verdict, findings_of
-from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.report.advice import Advice
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS, MARK
 from gtsam_rwhec.report.report_blocks import Block, Folded, Listing, Paragraph, Section, Table, Tone, Words, significant

@@ -11,31 +11,24 @@ programs do not say what they are from. One rule serves ``calibrate``, ``demo`` 
 """
 
 from __future__ import annotations
+
 import hashlib
 import os
 import re
-from collections.abc import Collection
-from collections.abc import Iterable
-from collections.abc import Iterator
-from collections.abc import Sequence
-from contextlib import contextmanager
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
-from typing import TypeAlias
-from pydantic import BaseModel
-from pydantic import ConfigDict
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import RwhecError
+from typing import Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict
+
+from gtsam_rwhec.errors import LogError, RwhecError
+from gtsam_rwhec.export.files import FOLDERS
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.runs.detection_inputs import differences
-from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.kept_detections import kept_inputs
-from gtsam_rwhec.runs.log_contract import DETECTED_LOG
-from gtsam_rwhec.runs.log_contract import RECORDED_LOG
-from gtsam_rwhec.runs.output_paths import is_written
-from gtsam_rwhec.runs.output_paths import made_output_folder
-from gtsam_rwhec.export.files import FOLDERS
+from gtsam_rwhec.runs.kept_detections import KeptDetections, kept_inputs
+from gtsam_rwhec.runs.log_contract import DETECTED_LOG, RECORDED_LOG
+from gtsam_rwhec.runs.output_paths import is_written, made_output_folder
 
 try:
     import fcntl

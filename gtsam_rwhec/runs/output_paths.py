@@ -1,20 +1,15 @@
 """Checks of the files and folders that a stage will write, before it begins its work."""
 
 from __future__ import annotations
+
 import os
 from pathlib import Path
+
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.export.files import FILES
-from gtsam_rwhec.export.files import FOLDERS
-from gtsam_rwhec.export.files import SUFFIX
+from gtsam_rwhec.export.files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.files.whole_files import why_not_writable
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.runs.log_contract import CLEAN_LOG
-from gtsam_rwhec.runs.log_contract import DETECTED_LOG
-from gtsam_rwhec.runs.log_contract import EVIDENCE_FILE
-from gtsam_rwhec.runs.log_contract import REPORT_FILE
-from gtsam_rwhec.runs.log_contract import RESULT_FILE
-from gtsam_rwhec.runs.log_contract import SEEN_SHEET
+from gtsam_rwhec.runs.log_contract import CLEAN_LOG, DETECTED_LOG, EVIDENCE_FILE, REPORT_FILE, RESULT_FILE, SEEN_SHEET
 
 #: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
 LEFT = (CLEAN_LOG, REPORT_FILE, RESULT_FILE, EVIDENCE_FILE, *FILES, SEEN_SHEET)

@@ -8,27 +8,25 @@ A test spoils the messages, or the rig file's text, before they are written or p
 """
 
 from __future__ import annotations
+
 import json
-from collections.abc import Iterable
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
+
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.mcap_writer import json_schema
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.rig import read_rig
+from gtsam_rwhec.rig import Rig, parse_rig, read_rig
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.solving_stage import solve_log
+from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
 
 BEGIN_NS = 1_700_000_000_000_000_000
 SIZE_M = 0.12
