@@ -25,7 +25,7 @@ from utias_log import rig_text, write_utias_log
 import gtsam_rwhec as rw
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import parse_rig, read_rig
-from gtsam_rwhec.runs.all_stages import calibrate_log
+from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 CELL = TESTS.parent / "data" / "cell"

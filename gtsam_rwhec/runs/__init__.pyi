@@ -1,31 +1,30 @@
 # All stages in a row.
-from .all_stages import OUTPUTS as OUTPUTS
-from .all_stages import calibrate_log as calibrate_log
+from .whole_runs import OUTPUTS as OUTPUTS
+from .whole_runs import calibrate_log as calibrate_log
 from .verified_log import verify_log as verify_log
 
 # What cleaning does to tracks.
 from .pair_consensus import Consensus as Consensus
 from .pair_consensus import ConsensusOptions as ConsensusOptions
 from .pair_consensus import find_consensus as find_consensus
-from .synchronised_tracks import synchronise as synchronise
-from .synchronised_tracks import thin as thin
-from .synchronised_tracks import without_fast as without_fast
+from .cleaning_stage import synchronise as synchronise
+from .cleaning_stage import thin as thin
+from .cleaning_stage import without_fast as without_fast
 
 # Stage by stage.
-from .all_stages import export_solved as export_solved
-from .all_stages import solve_into as solve_into
+from .whole_runs import export_solved as export_solved
+from .whole_runs import solve_into as solve_into
 from .cleaning_stage import clean_log as clean_log
-from .detected_source import detect_source as detect_source
-from .detected_source import sheet_beside as sheet_beside
+from .detection_stage import detect_source as detect_source
+from .detection_stage import sheet_beside as sheet_beside
 from .detection_stage import detect_log as detect_log
-from .detections_in_images import draw_log as draw_log
-from .folder_log import is_folder_of_images as is_folder_of_images
-from .folder_log import write_folder_log as write_folder_log
+from .recorded_logs import is_folder_of_images as is_folder_of_images
+from .recorded_logs import write_folder_log as write_folder_log
 
-from .samples_log import is_file_of_samples as is_file_of_samples
-from .samples_log import samples_of_rig as samples_of_rig
-from .samples_log import samples_problem as samples_problem
-from .samples_log import write_samples_log as write_samples_log
+from .recorded_logs import is_file_of_samples as is_file_of_samples
+from .recorded_logs import samples_of_rig as samples_of_rig
+from .recorded_logs import samples_problem as samples_problem
+from .recorded_logs import write_samples_log as write_samples_log
 
 # Sensors that know only their own motion.
 from .odometry_road import calibrate_odometry_log as calibrate_odometry_log
@@ -38,15 +37,14 @@ from .odometry_solving import solve_odometries_into as solve_odometries_into
 from .odometry_tracks import read_odometry as read_odometry
 
 # What comes out, and what a log that a stage wrote holds.
-from .earlier_output import earlier_run as earlier_run
-from .image_options import check_drawable as check_drawable
-from .log_contract import CLEAN_LOG as CLEAN_LOG
-from .log_contract import REPORT_FILE as REPORT_FILE
-from .log_contract import RESULT_FILE as RESULT_FILE
+from .output_folder import earlier_run as earlier_run
+from .run_log import CLEAN_LOG as CLEAN_LOG
+from .run_log import REPORT_FILE as REPORT_FILE
+from .run_log import RESULT_FILE as RESULT_FILE
 from .log_corners import read_corners as read_corners
-from .log_metadata import LogMetadata as LogMetadata
-from .log_metadata import read_cameras as read_cameras
-from .log_metadata import read_metadata as read_metadata
+from .run_log import LogMetadata as LogMetadata
+from .run_log import read_cameras as read_cameras
+from .run_log import read_metadata as read_metadata
 from .measured_pairs import MeasuredPairs as MeasuredPairs
 from .measured_pairs import read_pairs as read_pairs
 from .solved_log import read_solved as read_solved

@@ -9,7 +9,7 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.runs.log_metadata import read_embedded_rig
+from gtsam_rwhec.runs.run_log import read_embedded_rig
 
 #: Detection depends on these keys of a sensor's section.
 DETECTED_BY = ("images", "detections", "intrinsics")

@@ -1,41 +1,79 @@
 """The first stage: from images, or from the detections of a driver, to a log with the poses of the targets."""
 
 from __future__ import annotations
-
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-
 import numpy as np
-
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, open_log
+from gtsam_rwhec.logs import DetectionRecord
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import LogWriter
+from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.blurred_images import blurred_images
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.detections_in_images import draw_images
 from gtsam_rwhec.runs.driver_detections import read_driver_detections
-from gtsam_rwhec.runs.estimated_intrinsics import estimate_intrinsics, in_words, refuse_not_estimated
-from gtsam_rwhec.runs.image_detections import check_usable, detect_in_log
-from gtsam_rwhec.runs.image_names import image_names
-from gtsam_rwhec.runs.image_options import check_drawable, check_image_options
-from gtsam_rwhec.runs.intrinsics import read_intrinsics
+from gtsam_rwhec.runs.image_detections import check_usable
+from gtsam_rwhec.runs.image_detections import detect_in_log
 from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.likely_causes import likely_causes
-from gtsam_rwhec.runs.log_contract import annotations_topic, detections_topic, poses_topic, raw_topics
-from gtsam_rwhec.runs.log_metadata import LogMetadata
-from gtsam_rwhec.runs.no_detections import no_detections
 from gtsam_rwhec.runs.odometry_tracks import write_files
-from gtsam_rwhec.runs.output_paths import check_is_not_read, check_writable
-from gtsam_rwhec.runs.seen_sheet import write_contact_sheet
-from gtsam_rwhec.runs.sensor_detections import detection_report
 from gtsam_rwhec.runs.topics_of_rig import check_topics
+from tempfile import TemporaryDirectory
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.runs.image_detections import detection_report
+from gtsam_rwhec.runs.image_pictures import check_drawable
+from gtsam_rwhec.runs.image_pictures import draw_images
+from gtsam_rwhec.runs.image_pictures import has_images
+from gtsam_rwhec.runs.image_pictures import write_contact_sheet
+from gtsam_rwhec.runs.output_folder import check_is_not_read
+from gtsam_rwhec.runs.output_folder import check_writable
+from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder
+from gtsam_rwhec.runs.recorded_logs import is_folder_of_images
+from gtsam_rwhec.runs.recorded_logs import write_folder_log
+from gtsam_rwhec.runs.run_log import RECORDED_LOG
+from gtsam_rwhec.runs.run_log import LogMetadata
+from gtsam_rwhec.runs.run_log import annotations_topic
+from gtsam_rwhec.runs.run_log import detections_topic
+from gtsam_rwhec.runs.run_log import image_names
+from gtsam_rwhec.runs.run_log import poses_topic
+from gtsam_rwhec.runs.run_log import raw_topics
+from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics
+from gtsam_rwhec.runs.sensor_intrinsics import in_words
+from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
+from gtsam_rwhec.runs.sensor_intrinsics import refuse_not_estimated
+from gtsam_rwhec.runs.unread_targets import blurred_images
+from gtsam_rwhec.runs.unread_targets import likely_causes
+from gtsam_rwhec.runs.unread_targets import no_detections
+
+def check_image_options(log: Log, rig: Rig | None, *, images: Images, workers: int | None) -> None:
+    """Raise `OptionError` for workers that would search no image, or for images to copy from a log that has none.
+
+    `rig` is the rig file that detection will work with; None if the detections are already in the log.
+    """
+    path = log.files[0].path
+    if workers is not None and rig is None:
+        raise OptionError(
+            f"workers={workers} (--workers) counts only in detection, and the detections are already in {path}: leave "
+            "the option out, or give the raw log"
+        )
+    if workers is not None and rig is not None and not has_images(rig):
+        raise OptionError(
+            f"workers={workers} (--workers) counts only for images, and no sensor of the rig file has images: leave "
+            "the option out"
+        )
+    if images == "copy" and not any(topic.has_images for topic in log.topics()):
+        other = "the raw log, if it has images" if rig is None else "a log with images"
+        raise OptionError(
+            f'images="copy" (--images): {path} has no images to copy. Leave the option out, or give {other}'
+        )
 
 
 @one_blas_thread()
@@ -143,3 +181,55 @@ def _write_detections(out: LogWriter, sensor: str, records: list[DetectionRecord
         used = [r.T_camera_tag for r in seen if r.T_camera_tag is not None and not r.reason]
         if used:
             out.poses(poses_topic(sensor), stamp, seen[0].frame, np.array(used))
+
+
+def sheet_beside(out_path: str | Path) -> Path:
+    """The contact sheet beside a log of detections: ``detected.seen.png`` for ``detected.mcap``."""
+    return Path(out_path).with_suffix(".seen.png")
+
+
+def detect_source(
+    source: str | Path,
+    rig: Rig,
+    out_path: str | Path,
+    *,
+    images: Images = "leave_out",
+    workers: int | None = None,
+    draw: str | Path | None = None,
+    progress: Progress | None = None,
+) -> DetectionReport:
+    """As `detect_log`, for a log or for a folder of images, with a contact sheet beside the written log.
+
+    Parameters
+    ----------
+    source
+        As for ``open_log``; or a folder of images, for a rig file with poses in files (``frames``), whose paths then
+        start from this folder.
+    rig : Rig
+    out_path
+        The MCAP file to write. The sheet (`sheet_beside`) is written where images are, also if no target was detected.
+    images, workers, draw, progress
+        As for `detect_log`.
+
+    Raises
+    ------
+    RwhecError
+        As `detect_log` and `write_folder_log` do.
+    """
+    sheet = sheet_beside(out_path)
+    check_writable(out_path)
+    check_writable(sheet)
+    sheet.unlink(missing_ok=True)  # one of an earlier run would be taken for this run's
+    check_is_no_other_folder(source, rig)
+    if not is_folder_of_images(source, rig):
+        return detect_log(
+            source, rig, out_path, images=images, workers=workers, sheet=sheet, draw=draw, progress=progress
+        )
+    folder = Path(source)
+    rig = rig.model_copy(update={"folder": folder})
+    with TemporaryDirectory(prefix=".images-", dir=Path(out_path).resolve().parent) as temporary:
+        recorded = Path(temporary) / f"{folder.resolve().name}{RECORDED_LOG}"
+        write_folder_log(folder, rig, recorded, progress=progress)
+        return detect_log(
+            recorded, rig, out_path, images=images, workers=workers, sheet=sheet, draw=draw, progress=progress
+        )

@@ -1,30 +1,94 @@
 """Detection in the images of all cameras; a detection gets the one of its two poses that its whole track supports."""
 
 from __future__ import annotations
-
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections import defaultdict
+from collections.abc import Iterator
+from collections.abc import Mapping
 from functools import partial
-
 import numpy as np
-
-from gtsam_rwhec.cameras.board_turns import Turns, choose_turns, turn_between
+from gtsam_rwhec.cameras.board_turns import Turns
+from gtsam_rwhec.cameras.board_turns import choose_turns
+from gtsam_rwhec.cameras.board_turns import turn_between
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
-from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target
-from gtsam_rwhec.detect.detections import Rejection, layouts_over_track, turned_detection
-from gtsam_rwhec.detect.detector import Detection, Detector
-from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images, measured_corner_px
+from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.cameras.targets import CircleGrid
+from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.detect.detections import layouts_over_track
+from gtsam_rwhec.detect.detections import turned_detection
+from gtsam_rwhec.detect.detector import Detection
+from gtsam_rwhec.detect.detector import Detector
+from gtsam_rwhec.detect.many_images import DetectedImage
+from gtsam_rwhec.detect.many_images import detect_in_images
+from gtsam_rwhec.detect.many_images import measured_corner_px
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Counted, Progress, Remark
+from gtsam_rwhec.files.progress import Counted
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import Remark
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.logs import DetectionRecord
+from gtsam_rwhec.logs import ImageRecord
+from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
-from gtsam_rwhec.runs.causes_in_words import of_size
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion
+from gtsam_rwhec.runs.carrier_motion import check_order
 from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.log_contract import IMAGES_METADATA, detections_topic, image_key
-from gtsam_rwhec.runs.sensor_detections import LookedAt, SensorDetections
+import re
+from dataclasses import dataclass
+from dataclasses import field
+from gtsam_rwhec.results.log_history import DetectionReport
+from gtsam_rwhec.results.log_history import TrackCount
+from gtsam_rwhec.runs.run_log import IMAGES_METADATA
+from gtsam_rwhec.runs.run_log import detections_topic
+from gtsam_rwhec.runs.run_log import image_key
+
+@dataclass(frozen=True)
+class LookedAt:
+    """One image that was searched for targets."""
+
+    logged_ns: int  #: its log time, by which it is found again
+    fault: str = ""  #: why it could not be used; empty if it could
+
+
+@dataclass(frozen=True, eq=False)
+class SensorDetections:
+    """The detections of one sensor."""
+
+    records: list[DetectionRecord]  #: detections of the targets; one that is not used has a reason
+    count: int  #: number of images, or of messages of the driver, in the log
+    strangers: Counter[tuple[str, str]]  #: how often each tag that belongs to no target was seen, by family and id
+    faults: tuple[str, ...] = ()  #: one sentence for each image that could not be used
+    #: Measured standard deviation of a corner along each axis, pixels, by target/sensor.
+    corner_px: Mapping[str, float] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()  #: what was found out about targets
+    images: Mapping[int, LookedAt] = field(default_factory=dict)  #: every image, by stamp; none of a driver's
+
+
+def detection_report(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> DetectionReport:
+    """The report on the detections of all sensors."""
+    strangers = sum((of_sensor.strangers for of_sensor in found.values()), Counter[tuple[str, str]]())
+    seen = {record.id for of_sensor in found.values() for record in of_sensor.records}
+    return DetectionReport(
+        sources=tuple(file.path.name for file in log.files),
+        images={sensor: of_sensor.count for sensor, of_sensor in found.items()},
+        undecoded={sensor: of_sensor.faults for sensor, of_sensor in found.items() if of_sensor.faults},
+        tracks=tuple(count for sensor, of_sensor in found.items() for count in _counts(sensor, of_sensor.records)),
+        strangers={f"{family} {number}": count for (family, number), count in sorted(strangers.items())},
+        unseen=tuple(name for name in rig.targets if name not in seen),
+        remarks=tuple(dict.fromkeys(remark for of_sensor in found.values() for remark in of_sensor.remarks)),
+        corner_px={key: value for of_sensor in found.values() for key, value in of_sensor.corner_px.items()},
+    )
+
+
+def _counts(sensor: str, records: list[DetectionRecord]) -> Iterator[TrackCount]:
+    reasons: dict[str, Counter[str]] = defaultdict(Counter)
+    for record in records:
+        reasons[record.id][record.reason] += 1
+    for target, removed in sorted(reasons.items()):
+        yield TrackCount(target=target, sensor=sensor, used=removed.pop("", 0), removed=dict(removed))
+
 
 #: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
@@ -114,6 +178,27 @@ def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> N
                 f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
                 f"be used; {why}{of_size(rig, sensor, why)}"
             )
+
+
+def of_size(rig: Rig, sensor: str, fault: str) -> str:
+    """What to do where images have another size than the intrinsics are for; empty for another fault."""
+    sizes = re.search(r"(\d+) x (\d+) pixels, but the intrinsics are for (\d+) x (\d+)", fault)
+    if sizes is None:
+        return ""
+    width, height, of_width, of_height = map(int, sizes.groups())
+    place = rig.source.place(("sensors", sensor, "intrinsics"))
+    if abs(width * of_height - height * of_width) <= max(of_width, of_height):
+        return (
+            f". If these images are the whole view in another resolution, multiply fx, fy, cx and cy by "
+            f"{width / of_width:.6g} and write size: [{width}, {height}]; if they were cut out, or are of another "
+            f"camera, give the intrinsics of these images ({place})"
+        )
+    if abs(width * of_width - height * of_height) <= max(of_width, of_height):
+        return (
+            f". Width and height are exchanged: the images were turned by a quarter, or size is written the wrong way "
+            f"round. Give images as the camera takes them, and size: [width, height] ({place})"
+        )
+    return f". Give the intrinsics of these images ({place}): what was cut out of an image has another centre"
 
 
 def detections_of_sensor(

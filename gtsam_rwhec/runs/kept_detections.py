@@ -6,22 +6,100 @@ has no right checksum: it is dropped, and its images are detected again. Arrays 
 """
 
 from __future__ import annotations
-
 import base64
 import json
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
+from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, BinaryIO
-
+from typing import Any
+from typing import BinaryIO
 import numpy as np
-
-from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
+from gtsam_rwhec.detect.detections import Detection
+from gtsam_rwhec.detect.detections import ImageDetections
+from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.whole_files import appending_stream, write_atomically
+from gtsam_rwhec.files.whole_files import appending_stream
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.logs import ImageRecord
+import dataclasses
+import os
+from importlib.metadata import version
+import cv2
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.run_log import IMAGES_METADATA
+from gtsam_rwhec.vision.camera import Camera
+
+#: A message says at most this many differences, each value with at most this many characters.
+MOST_SAID, LONGEST = 5, 80
+#: Before the name of a file, and between its state and its stamp.
+_FILE, _STAMP = "file ", ", stamp "
+
+
+def inputs_of(log: Log, rig: Rig, cameras: Mapping[str, Camera], folder: Path | None = None) -> dict[str, str]:
+    """What the detections depend on: values by their names in messages.
+
+    Files count by name, size and time of change. `folder` is the one whose images the log has; then its images count
+    in place of the log.
+    """
+    inputs = {"gtsam-rwhec": version("gtsam-rwhec"), "OpenCV": cv2.__version__}
+    if folder is None:
+        parents = os.path.commonpath([file.path.absolute().parent for file in log.files])
+        inputs |= {_FILE + os.path.relpath(file.path, parents): _state(file.path) for file in log.files}
+    else:
+        of_image = log.metadata().get(IMAGES_METADATA, {})
+        inputs |= {_FILE + name: f"{_state(folder / name)}{_STAMP}{key}" for key, name in of_image.items()}
+    for name, sensor in rig.sensors.items():
+        if sensor.images is not None:
+            camera, place = cameras[name], f"sensors.{name}"
+            inputs[f"{place}.images"] = sensor.images
+            inputs[f"{place}.intrinsics"] = f"{camera.model} {camera.K.tolist()} {camera.D.tolist()}"
+            inputs[f"{place}.size"] = f"{camera.width} x {camera.height}"
+    for name, section in rig.targets.items():
+        inputs |= {f"targets.{name}.{key}": repr(value) for key, value in section.model_dump().items()}
+    return inputs | _values("detection", rig.detection_options)
+
+
+def differences(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """In words: what was other before, and what it is now; empty if nothing is."""
+    other = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    said = [_difference(name, before.get(name), now.get(name)) for name in other[:MOST_SAID]]
+    if len(other) > MOST_SAID:
+        said.append(f"{len(other) - MOST_SAID} others")
+    return "; ".join(said)
+
+
+def _difference(name: str, before: str | None, now: str | None) -> str:
+    words = name.removeprefix(_FILE)
+    if before is None or now is None:
+        return f"{words} is {'new' if before is None else 'gone'}"
+    if words == name:
+        return f"{name} was {_short(before)} and is {_short(now)}"
+    is_same = before.partition(_STAMP)[0] == now.partition(_STAMP)[0]
+    return f"{words} {'has another pose, or another place in its folder' if is_same else 'was changed'}"
+
+
+def _short(words: str) -> str:
+    return words if len(words) <= LONGEST else f"{words[: LONGEST - 3]}..."
+
+
+def _state(path: Path) -> str:
+    try:
+        status = path.stat()
+    except OSError as error:
+        return error.strerror or "cannot be read"
+    return f"{status.st_size} bytes, changed at {status.st_mtime_ns} ns"
+
+
+def _values(place: str, of: object) -> dict[str, str]:
+    """The fields of a dataclass."""
+    values = dataclasses.asdict(of)  # type: ignore[call-overload]
+    return {f"{place}.{name}": repr(value) for name, value in values.items()}
+
 
 #: The kinds of objects that a line has, by the names that it has for them.
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection)}

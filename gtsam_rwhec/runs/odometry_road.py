@@ -15,9 +15,6 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.earlier_output import list_written, log_name, output_folder
-from gtsam_rwhec.runs.log_contract import CLEAN_LOG, CLEANING_METADATA, DETECTED_LOG, RECORDED_LOG, is_from_stage
-from gtsam_rwhec.runs.log_metadata import read_embedded_rig, read_metadata
 from gtsam_rwhec.runs.odometry_solving import (
     OdometrySolved,
     frames_of_odometries,
@@ -25,7 +22,16 @@ from gtsam_rwhec.runs.odometry_solving import (
     solve_odometries_into,
 )
 from gtsam_rwhec.runs.odometry_tracks import files_of, write_files
-from gtsam_rwhec.runs.output_paths import check_is_not_read, made_folder
+from gtsam_rwhec.runs.output_folder import check_is_not_read, list_written, log_name, made_folder, output_folder
+from gtsam_rwhec.runs.run_log import (
+    CLEAN_LOG,
+    CLEANING_METADATA,
+    DETECTED_LOG,
+    RECORDED_LOG,
+    is_from_stage,
+    read_embedded_rig,
+    read_metadata,
+)
 
 
 def is_of_odometries(rig: Rig | None, source: str | Path | None = None) -> bool:

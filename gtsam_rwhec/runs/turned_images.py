@@ -5,19 +5,18 @@ are then turned by 180 degrees about the optical axis, which no wrong corner and
 """
 
 from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
-
 import numpy as np
-from rwhec_factors.se3 import inverse, so3_logmap
-
-from gtsam_rwhec.calibration.verdict import Finding, Ground
+from rwhec_factors.se3 import inverse
+from rwhec_factors.se3 import so3_logmap
+from gtsam_rwhec.calibration.verdict import Finding
+from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.image_names import image_name
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
+from gtsam_rwhec.runs.run_log import image_name
 
 #: A pose is turned by half a turn about the optical axis, up to this angle: the principal point is not quite the
 #: middle of the image, so the turned image has the target some pixels off.

@@ -1,22 +1,21 @@
 """Mistakes of a first user with logs, CSV files and samples: exit status not 0, the fault and its cure in words."""
 
 from __future__ import annotations
-
 import dataclasses
 import re
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-
 import numpy as np
 import pytest
 from given_commands import command
-from places import DEMO, REPOSITORY
+from places import DEMO
+from places import REPOSITORY
 from scipy.spatial.transform import Rotation
+import synthetic_logs as made
 
 sys.path.insert(0, str(REPOSITORY / "tests" / "runs"))
-import synthetic_logs as made
 
 Change = Callable[[Path], object]
 

@@ -1,13 +1,12 @@
 """Boards in images of a lens that nobody calibrated: bent as no pinhole sees them, and read all the same."""
 
 from __future__ import annotations
-
 from pathlib import Path
-
 import cv2
 import pytest
-from rendered import pose, printed, render
-
+from rendered import pose
+from rendered import printed
+from rendered import render
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.detect.detections import Rejection
@@ -15,8 +14,8 @@ from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.estimated_intrinsics import estimate_intrinsics
-from gtsam_rwhec.runs.folder_log import write_folder_log
+from gtsam_rwhec.runs.recorded_logs import write_folder_log
+from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics
 
 RIG = """\
 carriers: {sensors: hand, targets: base, poses: {frames: [base, hand]}}

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogError, OptionError
 from gtsam_rwhec.logs import ImageRecord, LogWriter, open_log
-from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, draw_log
+from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log
 
 
 @pytest.fixture(scope="module", params=["detected.mcap", "clean.mcap"])
@@ -69,11 +69,6 @@ def test_a_drivers_detections_cannot_be_drawn(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "(--draw): no sensor of the rig file has images" in " ".join(done.stderr.split())
     assert {path.name for path in tmp_path.iterdir()} == {"raw.mcap", "rig.yaml"}
-
-    detect_log(raw, made.rig(), tmp_path / "d.mcap")
-    with pytest.raises(OptionError, match="--draw"):
-        draw_log(raw, tmp_path / "d.mcap", tmp_path / "pics")
-    assert not (tmp_path / "pics").exists()
 
 
 def test_several_files_of_which_a_stage_wrote_one_are_refused(stage_log: Path, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from bad_logs import MOVING, RECORDED, SEEN, WITH_IMAGES, images, linked, pictur
 from synthetic_logs import BEGIN_NS
 
 from gtsam_rwhec.errors import LogError, LogWarning, TransformError
-from gtsam_rwhec.runs.all_stages import calibrate_log
 from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 # Files
 

@@ -23,8 +23,8 @@ from places import DEMO
 import gtsam_rwhec as rw
 from gtsam_rwhec.export.files import export_all
 from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.runs.earlier_output import LIST_FILE
-from gtsam_rwhec.runs.log_contract import SEEN_SHEET
+from gtsam_rwhec.runs.output_folder import LIST_FILE
+from gtsam_rwhec.runs.run_log import SEEN_SHEET
 
 #: Clears the screen, changes its title, moves up a line, and looks like rich's markup; C1 codes; text backwards.
 STEERING = "\x1b[2J\x1b]0;owned\x07\x1b[1A[bold red]x[/bold red][/]\x9b31m\u202eevil"

@@ -18,7 +18,7 @@ from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogWarning
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
 from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.runs.intrinsics import read_intrinsics
+from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
 
 COUNT = 4
 RNG = np.random.default_rng(11)

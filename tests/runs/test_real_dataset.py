@@ -11,9 +11,9 @@ from utias_log import rig_text, write_utias_log
 import gtsam_rwhec as rw
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.all_stages import solve_into
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.whole_runs import solve_into
 
 SIGMA_M, ROTATION_DEG = 0.005, 0.5
 

@@ -11,9 +11,9 @@ import pytest
 from ros2_twin import CELL, write_twins
 
 from gtsam_rwhec.rig import Rig, parse_rig
-from gtsam_rwhec.runs.all_stages import calibrate_log, export_solved, solve_into
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.whole_runs import calibrate_log, export_solved, solve_into
 
 
 def text_of(path: Path) -> str:

@@ -14,7 +14,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.runs.samples_log import samples_problem
+from gtsam_rwhec.runs.recorded_logs import samples_problem
 
 RIG = """\
 carriers: {{sensors: {sensors}, targets: {targets}, poses: {{frames: [base, hand]}}}}

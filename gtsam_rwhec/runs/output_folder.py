@@ -1,34 +1,104 @@
-"""What an output folder has before a calibration: an unfinished run, a finished one, or files of somebody else.
-
-The folder has a list of the files that were written into it, with a checksum of each: pictures and files for other
-programs do not say what they are from. One rule serves ``calibrate``, ``demo`` and Python:
-
-- A file that is not on the list, or was changed since, is never replaced.
-- A finished calibration is replaced only on request. An unfinished run is gone on with; one that ended with an error is
-  too, or begun anew where its inputs are other ones: they were mended.
-- Other files beside ours are refused, since the folder may be meant for something else; with a request to replace a
-  calibration that is there, they stay as they are.
-"""
+"""Checks of the files and folders that a stage will write, before it begins its work."""
 
 from __future__ import annotations
-
 import hashlib
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection
+from collections.abc import Iterable
+from collections.abc import Iterator
+from collections.abc import Sequence
+from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from typing import Literal, TypeAlias
-
-from pydantic import BaseModel, ConfigDict
-
-from gtsam_rwhec.errors import LogError, RwhecError
+from typing import Literal
+from typing import TypeAlias
+from pydantic import BaseModel
+from pydantic import ConfigDict
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.export.files import FOLDERS
 from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.runs.detection_inputs import differences
-from gtsam_rwhec.runs.kept_detections import KeptDetections, kept_inputs
-from gtsam_rwhec.runs.log_contract import DETECTED_LOG, RECORDED_LOG
-from gtsam_rwhec.runs.output_paths import is_written, made_output_folder
+from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.kept_detections import kept_inputs
+from gtsam_rwhec.export.files import FILES
+from gtsam_rwhec.export.files import SUFFIX
+from gtsam_rwhec.files.atomic_write import why_not_writable
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.runs.kept_detections import differences
+from gtsam_rwhec.runs.run_log import CLEAN_LOG
+from gtsam_rwhec.runs.run_log import DETECTED_LOG
+from gtsam_rwhec.runs.run_log import EVIDENCE_FILE
+from gtsam_rwhec.runs.run_log import PLOTS_FOLDER
+from gtsam_rwhec.runs.run_log import RECORDED_LOG
+from gtsam_rwhec.runs.run_log import REPORT_FILE
+from gtsam_rwhec.runs.run_log import RESULT_FILE
+from gtsam_rwhec.runs.run_log import SEEN_SHEET
+from gtsam_rwhec.runs.solution_plots import COVERAGE
+from gtsam_rwhec.runs.solution_plots import DEVIATIONS
+from gtsam_rwhec.runs.solution_plots import FRAMES
+from gtsam_rwhec.runs.solution_plots import INTRINSICS
+from gtsam_rwhec.runs.solution_plots import RESIDUALS
+
+#: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
+LEFT = (
+    CLEAN_LOG,
+    REPORT_FILE,
+    RESULT_FILE,
+    EVIDENCE_FILE,
+    *FILES,
+    SEEN_SHEET,
+    *(f"{PLOTS_FOLDER}/{name}" for name in (FRAMES, RESIDUALS, COVERAGE, DEVIATIONS, INTRINSICS)),
+)
+#: With the log that it has during the work.
+WRITTEN = (*LEFT, DETECTED_LOG)
+#: Folders in the output folder. Those of the export have one file a camera.
+INSIDE = (PLOTS_FOLDER, *FOLDERS)
+
+
+def is_written(name: str) -> bool:
+    """Whether a calibration writes a file of this name, relative to its folder."""
+    folder, _, file = name.rpartition("/")
+    return name in WRITTEN or (folder in FOLDERS and file.endswith(SUFFIX) and not file.startswith("."))
+
+
+def check_writable(path: str | Path) -> None:
+    """Raise `LogError` if a file cannot be written: its folder is missing or not writable, or a folder has its name."""
+    why = why_not_writable(path)
+    if why:
+        raise LogError(f"{path} cannot be written: {why}.")
+
+
+def check_is_not_read(log: Log, path: str | Path) -> None:
+    """Raise `LogError` if a file is one of those from which the log is read."""
+    if any(os.path.realpath(path) == os.path.realpath(file.path) for file in log.files):
+        raise LogError(f"{path} is the raw log, and a raw log is never changed; give another file or folder.")
+
+
+def made_folder(path: str | Path) -> Path:
+    """Return the folder, made if it does not exist. Raise `LogError` if files cannot be written into it."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogError(f"{path} cannot be made a folder: {error.strerror}.") from error
+    check_writable(path / CLEAN_LOG)
+    return path
+
+
+def made_output_folder(path: str | Path) -> Path:
+    """As `made_folder`, for all files of a calibration: whatever could not be replaced at its end is told before it."""
+    path = made_folder(path)
+    for name in WRITTEN:
+        if "/" not in name:
+            check_writable(path / name)
+    for inside in (path / name for name in INSIDE):
+        if inside.is_dir():
+            check_writable(inside / CLEAN_LOG)
+        elif os.path.lexists(inside):
+            raise LogError(f"{inside} cannot be made a folder: it is a file.")
+    return path
+
 
 try:
     import fcntl

@@ -1,24 +1,42 @@
 """A contact sheet of a run: some of each sensor's images, with what was found, rejected, not seen, or not usable."""
 
 from __future__ import annotations
-
-from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections import defaultdict
+from collections.abc import Mapping
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-
 import cv2
 import numpy as np
-
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.detect.contact_sheet import WIDTH, Band, Detail, Outcome, Outline, Tile, contact_sheet, detail_of
-from gtsam_rwhec.detect.images import Gray, decode_small
+from gtsam_rwhec.detect.contact_sheet import WIDTH
+from gtsam_rwhec.detect.contact_sheet import Band
+from gtsam_rwhec.detect.contact_sheet import Detail
+from gtsam_rwhec.detect.contact_sheet import Outcome
+from gtsam_rwhec.detect.contact_sheet import Outline
+from gtsam_rwhec.detect.contact_sheet import Tile
+from gtsam_rwhec.detect.contact_sheet import contact_sheet
+from gtsam_rwhec.detect.contact_sheet import detail_of
+from gtsam_rwhec.detect.images import Gray
+from gtsam_rwhec.detect.images import decode_small
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.logs import DetectionRecord
+from gtsam_rwhec.logs import ImageRecord
+from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.image_names import image_name, image_names
-from gtsam_rwhec.runs.sensor_detections import SensorDetections
+from collections.abc import Iterable
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.progress import Counted
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.runs.image_detections import SensorDetections
+from gtsam_rwhec.runs.output_folder import made_folder
+from gtsam_rwhec.runs.run_log import image_name
+from gtsam_rwhec.runs.run_log import image_names
+from gtsam_rwhec.runs.run_log import picture_file
+from gtsam_rwhec.vision.drawn_detections import draw
+from gtsam_rwhec.vision.images import decode_gray
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4
@@ -176,3 +194,65 @@ def _counts(outcomes: Mapping[int, tuple[Outcome, str]], shown: int) -> str:
         parts.append(words)
     some = "all shown" if shown == len(outcomes) else f"{shown} shown"
     return f"{len(outcomes)} images ({some}): {' | '.join(parts)}"
+
+
+def check_drawable(rig: Rig, folder: str | Path) -> None:
+    """Raise `OptionError` if no sensor has images in which detections can be drawn."""
+    if not has_images(rig):
+        raise OptionError(
+            f"{folder} (--draw): no sensor of the rig file has images in which detections can be drawn. Leave the "
+            "option out"
+        )
+
+
+def has_images(rig: Rig) -> bool:
+    """Whether a sensor of the rig file has images."""
+    return any(source.images is not None for source in rig.sensors.values())
+
+
+def draw_images(
+    log: Log,
+    rig: Rig,
+    cameras: Mapping[str, Camera],
+    records: Mapping[str, Iterable[DetectionRecord]],
+    folder: str | Path,
+    tell: Progress,
+) -> int:
+    """Draw the detections in every image that can be decoded, without any too; return how many pictures there are.
+
+    They are ``<sensor>_<name>.png``, where the name is that of the image's file, or its stamp.
+    """
+    check_drawable(rig, folder)
+    folder = made_folder(folder)
+    names = image_names(log)
+    drawn = {sensor: source.images for sensor, source in rig.sensors.items() if source.images is not None}
+    total = sum(topic.count for topic in log.topics() if topic.name in drawn.values())
+    count, taken = 0, set[str]()
+    for sensor, topic in drawn.items():
+        of_stamp: dict[int, list[DetectionRecord]] = defaultdict(list)
+        for record in records[sensor]:
+            of_stamp[record.stamp_ns].append(record)
+        for image in log.records([topic]):
+            if not isinstance(image, ImageRecord):
+                continue
+            try:
+                gray = decode_gray(image, (cameras[sensor].width, cameras[sensor].height))
+            except ImageError:
+                continue  # the report of detection names it
+            seen, name = of_stamp[image.stamp_ns], image_name(names, topic, image.stamp_ns)
+            file = picture_file(sensor, name)
+            if file in taken:  # two names that differ in their endings, or in characters that files should not have
+                file = picture_file(sensor, f"{name} {image.stamp_ns}.")
+            taken.add(file)
+            picture = draw(gray, seen, cameras[sensor], f"{sensor}, {name}: {_in_words(seen)}")
+            is_written, data = cv2.imencode(".png", picture)
+            assert is_written
+            write_atomically(folder / file, data.tobytes())
+            count += 1
+            tell(Counted("drawing: image", count, total))
+    return count
+
+
+def _in_words(records: Iterable[DetectionRecord]) -> str:
+    said = [f"{record.id} {f'rejected, {record.reason}' if record.reason else 'found'}" for record in records]
+    return "; ".join(said) or "nothing seen"

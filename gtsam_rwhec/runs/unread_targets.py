@@ -1,0 +1,420 @@
+"""Why targets are not read, where most are not: what some of the images say, with what to write in the rig file.
+
+Each cause was tried on images (`vision.clues`) and is named with how many of them show it. Where nothing that was tried
+explains it, that is said.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.results.log_history import DetectionReport
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.image_detections import SensorDetections
+from gtsam_rwhec.runs.run_log import RECORDED_LOG
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.clues import About, Clue, clues
+from gtsam_rwhec.vision.image_quality import edge_blur_px, motion_blur_px
+from gtsam_rwhec.vision.images import Gray, decode_gray
+from gtsam_rwhec.vision.rejection import Rejection
+from gtsam_rwhec.vision.targets import FAMILIES, Checkerboard, CircleGrid, Tag, Target, is_same_print
+
+#: At most this number of images is looked at, of several targets at least `LEAST` for each; nothing more is tried after
+#: this number of seconds of the processor.
+MOST, LEAST, SECONDS = 12, 4, 5.0
+#: At most this number of targets is looked for, and at most this number of others is named.
+MOST_TARGETS, MOST_NAMED = 4, 10
+#: A cause is named if at least this share of the images shows it, and at least two, where there are three or more.
+SHARE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What some images say about a target: how many there were, and the clues of each."""
+
+    looked_at: int
+    of_image: Sequence[Sequence[Clue]]
+
+
+def likely_causes(
+    log: Log, rig: Rig, cameras: Mapping[str, Camera], found: Mapping[str, SensorDetections]
+) -> tuple[str, ...]:
+    """A sentence or two for each target of which most detections were rejected, or that was not seen at all."""
+    sensors = [sensor for sensor, of_sensor in found.items() if of_sensor.images]
+    doubted = [target for target in rig.target_list if _is_doubted(target, found)]
+    if not sensors or not doubted:
+        return ()
+    until_s = time.thread_time() + SECONDS
+    images = {
+        sensor: _some_images(log, str(rig.sensors[sensor].images), cameras[sensor], found[sensor], MOST // len(sensors))
+        for sensor in sensors
+    }
+    said: list[str] = []
+    unexplained: list[Target] = []
+    is_any_used = any(not record.reason for of_sensor in found.values() for record in of_sensor.records)
+    examined = doubted[:MOST_TARGETS]
+    for number, target in enumerate(examined):
+        now_s = time.thread_time()
+        ends_s = now_s + (until_s - now_s) / (len(examined) - number)
+        causes = of_rejections(rig, target, found, images)
+        if not causes:
+            seen = _look(rig, target, cameras, found, images, max(LEAST, MOST // len(examined)), ends_s)
+            causes = _of_clues(rig, target, seen)
+            if not causes and (not is_any_used or _records_of(target, found)):
+                unexplained.append(target)  # else it may not be in the images: it is among those that no sensor saw
+        said += causes
+    if unexplained:
+        said.append(nothing_explains(unexplained, found))
+    if len(doubted) > MOST_TARGETS:
+        others = [target.name for target in doubted[MOST_TARGETS : MOST_TARGETS + MOST_NAMED]]
+        said.append(f"{len(doubted) - MOST_TARGETS} other targets are as badly seen ({', '.join(others)})")
+    return tuple(cause if cause.endswith("?") else f"{cause}." for cause in said)
+
+
+def _records_of(target: Target, found: Mapping[str, SensorDetections]) -> list[DetectionRecord]:
+    return [record for of_sensor in found.values() for record in of_sensor.records if record.id == target.name]
+
+
+def _is_doubted(target: Target, found: Mapping[str, SensorDetections]) -> bool:
+    """Whether more of a target's detections were rejected than not, or there are none."""
+    reasons = [record.reason for record in _records_of(target, found)]
+    return 2 * sum(not reason for reason in reasons) < len(reasons) or not reasons
+
+
+def _some_images(log: Log, topic: str, camera: Camera, of_sensor: SensorDetections, most: int) -> dict[int, Gray]:
+    """Images by stamp: those with rejected detections first, then those without any, each spread over time."""
+    rejected = {record.stamp_ns for record in of_sensor.records if record.reason}
+    used = {record.stamp_ns for record in of_sensor.records if not record.reason}
+    whole = [stamp for stamp, image in sorted(of_sensor.images.items()) if not image.fault]
+    chosen: list[int] = []
+    for members in ([s for s in whole if s in rejected - used], [s for s in whole if s not in rejected | used]):
+        count = min(len(members), max(most, 2) - len(chosen))
+        if count > 0:
+            places = np.linspace(0, len(members) - 1, count + 2)[1:-1] if count < len(members) else np.arange(count)
+            chosen += [members[i] for i in places.round().astype(int).tolist()]
+    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in chosen}
+    images = {}
+    for record in log.records_logged_at([topic], wanted.values()):
+        if isinstance(record, ImageRecord) and record.stamp_ns in wanted:
+            try:
+                images[record.stamp_ns] = decode_gray(record, (camera.width, camera.height))
+            except ImageError:
+                continue  # its fault is in the report
+    return {stamp: images[stamp] for stamp in chosen if stamp in images}
+
+
+def _look(
+    rig: Rig,
+    target: Target,
+    cameras: Mapping[str, Camera],
+    found: Mapping[str, SensorDetections],
+    images: Mapping[str, Mapping[int, Gray]],
+    most: int,
+    until_s: float,
+) -> _Seen:
+    """The clues about a target in the images in which it was not read, one of each sensor in turn."""
+
+    def is_late() -> bool:
+        return time.thread_time() > until_s
+
+    used = {
+        (sensor, record.stamp_ns)
+        for sensor, of_sensor in found.items()
+        for record in of_sensor.records
+        if record.id == target.name and not record.reason
+    }
+    others = {(t.family, i) for t in rig.target_list if t.name != target.name for i in t.ids}
+    of_image: list[list[Clue]] = []
+    turns = [
+        (place, sensor, gray)
+        for sensor, of_sensor in images.items()
+        for place, (stamp, gray) in enumerate(of_sensor.items())
+        if (sensor, stamp) not in used
+    ]
+    for _, sensor, gray in sorted(turns, key=lambda turn: turn[0])[:most]:
+        if is_late():
+            break
+        seen = clues(gray, target, cameras[sensor], rig.detection_options, is_late)
+        of_image.append([c for c in seen if c.about is not About.ID or (target.family, c.value) not in others])
+    return _Seen(len(of_image), of_image)
+
+
+def _of_clues(rig: Rig, target: Target, seen: _Seen) -> list[str]:
+    """The causes that enough images show, the commonest first."""
+    figures: dict[tuple[About, object], list[float]] = defaultdict(list)
+    for of_image in seen.of_image:
+        for clue in set(of_image):
+            figures[clue.about, clue.value].append(clue.figure)
+    enough = max(2 if seen.looked_at > 2 else 1, SHARE * seen.looked_at)
+    common = sorted((key for key in figures if len(figures[key]) >= enough), key=lambda key: -len(figures[key]))
+    return [
+        sentence(rig, target, about, value, figures[about, value], seen.looked_at)
+        for number, (about, value) in enumerate(common)
+        if about not in [before for before, _ in common[:number]]  # of one thing, only the commonest value
+    ]
+
+
+#: A reason for rejections is a cause if it is that of at least this share of a target's detections.
+MOSTLY = 0.3
+_SHARPER = "Focus the lens, stand still for each image, or expose for a shorter time"
+
+
+def sentence(rig: Rig, target: Target, about: About, value: object, figures: Sequence[float], looked_at: int) -> str:
+    """What images show, and what to do."""
+    name, of = target.name, f"{len(figures)} of {looked_at} images"
+    figure = float(np.median(figures))
+
+    def write(key: str, text: object, old: str = "") -> str:
+        place = rig.source.place(("targets", name, key))
+        return f"write {key}: {text}{f' in place of {old}' if old else ''} ({place})"
+
+    match about:
+        case About.COUNTS:
+            assert isinstance(value, tuple)
+            assert isinstance(target, (Checkerboard, CircleGrid))
+            key = "inner_corners" if isinstance(target, Checkerboard) else "circles"
+            things = "inner corners" if isinstance(target, Checkerboard) else "circles"
+            stated = (target.columns, target.rows)
+            why = ""
+            if isinstance(target, Checkerboard) and stated == (value[0] + 1, value[1] + 1):
+                why = " (it counts squares; inner corners are where four squares meet)"
+            elif stated == value[::-1]:
+                why = ": columns and rows are exchanged"
+                if isinstance(target, CircleGrid) and target.larger_dot:
+                    return (
+                        f"{name}: {of} show a board of {value[0]} x {value[1]} circles, or its larger dot at another "
+                        f"corner than the {target.corner.replace('_', ' ')}: {write(key, list(value))}, or larger_dot: "
+                        f"{_beside(target.corner)}"
+                    )
+            return (
+                f"{name}: {of} show a board of {value[0]} x {value[1]} {things}, and the rig file says {stated[0]} x "
+                f"{stated[1]}{why}: {write(key, list(value))}"
+            )
+        case About.DOT:
+            shown = f"with its larger dot at the {str(value).replace('_', ' ')}" if value else "without a larger dot"
+            return f"{name}: {of} show the grid {shown}: {write('larger_dot', value or 'false')}"
+        case About.FAMILY:
+            family = _family_of(str(value), target)
+            return f"{name}: {of} show tags of {family} and none of {target.family}: {write('family', family)}"
+        case About.ID:
+            return f"{name}: {of} show the tag {value} of {target.family}, and none shows {target.ids[0]}: " + write(
+                "id", value
+            )
+        case About.BORDER:
+            lines = "a single black border, which Kalibr's AprilGrids do not have" if value == 1 else "a double border"
+            return (
+                f"{name}: {of} show its tags with {lines}. Change the type of the target "
+                f"({rig.source.place(('targets', name, 'type'))})"
+            )
+        case About.MARGIN:
+            return (
+                f"{name}: in {of} it is read once the ground around it is made lighter: a tag needs a white margin "
+                "around its black square, one module wide and more. Print it with one, or put white paper behind it"
+            )
+        case About.SMALL:
+            return (
+                f"{name}: in {of} it is read only when the image is enlarged: its shortest side is about {figure:.0f} "
+                "pixels long there. Go nearer, take a larger one, or images of more pixels"
+            )
+        case About.BLURRED:
+            return (
+                f"{name}: in {of} it is read only when the image is made smaller: edges are blurred by about "
+                f"{figure:.1f} pixels (standard deviation; sharp ones by less than 1). {_SHARPER}"
+            )
+        case About.DARK:
+            return (
+                f"{name}: in {of} it is read only when the image is brightened: the brightest pixels have a gray value "
+                f"of about {figure:.0f} of 255. More light, or a longer exposure while the robot stands still"
+            )
+        case About.BRIGHT:
+            return (
+                f"{name}: {of} are overexposed: {100.0 * figure:.0f} % of the pixels are saturated. Expose for a "
+                "shorter time"
+            )
+
+
+def _beside(corner: str) -> str:
+    """The corner to the right or to the left of a corner."""
+    return corner.replace("left", "right") if "left" in corner else corner.replace("right", "left")
+
+
+def _family_of(family: str, target: Target) -> str:
+    """The smallest dictionary with the print of a family that has all of the target's ids."""
+    same = [name for name in FAMILIES if is_same_print(name, family) and FAMILIES[name] > max(target.ids)]
+    return min(same, key=lambda name: FAMILIES[name]) if same else family
+
+
+def of_rejections(
+    rig: Rig, target: Target, found: Mapping[str, SensorDetections], images: Mapping[str, Mapping[int, Gray]]
+) -> list[str]:
+    """What the rejected detections say themselves, with their figures and limits."""
+    records = [(sensor, r) for sensor, of in found.items() for r in of.records if r.id == target.name]
+    options, name = rig.detection_options, target.name
+
+    def with_reason(reason: Rejection) -> list[tuple[str, DetectionRecord]]:
+        those = [(sensor, r) for sensor, r in records if r.reason == reason]
+        return those if len(those) >= MOSTLY * len(records) else []
+
+    causes = []
+    small = [_side_px(target, r.corners_px) for _, r in with_reason(Rejection.SMALL) if r.corners_px is not None]
+    if small:
+        causes.append(
+            f"{name}: {len(small)} of {len(records)} detections are small: a side of about {np.median(small):.0f} "
+            f"pixels, and at least {options.min_side_px:g} are wanted. Go nearer, take a larger target, or images of "
+            "more pixels; or write detection: {min_side_px: ...}"
+        )
+    blurred = with_reason(Rejection.BLURRED)
+    if blurred:
+        widths = [edge_blur_px(images[s][r.stamp_ns]) for s, r in blurred if r.stamp_ns in images.get(s, {})]
+        much = f": the images' edges have a blur of about {np.median(widths):.1f} pixels" if widths else ""
+        causes.append(
+            f"{name}: {len(blurred)} of {len(records)} detections are blurred{much}, and at most "
+            f"{options.max_blur_px:g} (standard deviation) is wanted. {_SHARPER}"
+        )
+    off = [r.reprojection_px for _, r in with_reason(Rejection.REPROJECTION) if r.reprojection_px is not None]
+    if off:
+        sensors = dict.fromkeys(sensor for sensor, _ in with_reason(Rejection.REPROJECTION))
+        places = "; ".join(rig.source.place(("sensors", sensor, "intrinsics")) for sensor in sensors)
+        causes.append(
+            f"{name}: in {len(off)} of {len(records)} detections the corners are {np.median(off):.1f} pixels off those "
+            f"of a plane that this camera sees. Are the intrinsics those of these images ({places}), and is the target "
+            "flat?"
+        )
+    layouts = Counter(r.reason for _, r in records if r.reason.startswith(Rejection.LAYOUT))
+    if layouts and layouts.total() >= MOSTLY * len(records):
+        reason = layouts.most_common(1)[0][0]
+        causes.append(
+            f"{name}: in {layouts.total()} of {len(records)} detections the {reason} "
+            f"({rig.source.place(('targets', name))})"
+        )
+    unsure = len(with_reason(Rejection.AMBIGUOUS))
+    if unsure:
+        causes.append(
+            f"{name}: {unsure} of {len(records)} detections are ambiguous: two of its poses look alike, and the motion "
+            "does not tell which is right. Turn the carriers further between images, about different axes; look at the "
+            "target obliquely and from nearer"
+        )
+    return causes
+
+
+def nothing_explains(targets: Sequence[Target], found: Mapping[str, SensorDetections]) -> str:
+    """What is said where nothing that was tried explains why targets are not read."""
+    names = [target.name for target in targets]
+    tried = ["other families, ids and borders"] * any(target.ids for target in targets)
+    tried += ["other numbers of columns and rows"] * any(not target.ids for target in targets)
+    reasons = Counter(r.reason for of in found.values() for r in of.records if r.id in names and r.reason)
+    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+    rejected = f" Rejected: {counts}." if reasons else ""
+    them = "it" if len(targets) == 1 else "them"
+    return (
+        f"{', '.join(names)}: some images were searched for {them} with {' and '.join(tried)}, enlarged, brightened "
+        f"and made smaller, and that did not help.{rejected} Does an image show {them}, whole and in focus?"
+    )
+
+
+def _side_px(target: Target, corners: np.ndarray) -> float:
+    if isinstance(target, Tag):
+        return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
+    return float(np.ptp(corners, axis=0).min())
+
+
+#: A message names at most this many tags that belong to no target.
+MOST_STRANGERS = 20
+
+
+def no_detections(log: Log, report: DetectionReport) -> str:
+    """The message: what is likely, how much was searched, why detections were rejected, which other tags there are."""
+    looked_at = [f"{count} images or messages of {sensor}" for sensor, count in report.images.items()]
+    said = [f"looked at {', '.join(looked_at)}"]
+    said += [
+        f"{len(faults)} of {sensor} not decoded, the first: {faults[0]}" for sensor, faults in report.undecoded.items()
+    ]
+    said += map(str, report.tracks)
+    if report.strangers:
+        said.append(f"tags that belong to no target were seen: {_named(report.strangers)}")
+    else:
+        said.append("no other tags of the targets' families were seen either")
+    likely = "".join(f"\n- {cause}" for cause in report.likely)
+    path = log.files[0].path
+    where = path.name.removesuffix(RECORDED_LOG) if path.name.endswith(RECORDED_LOG) else str(path)  # or a folder
+    return (
+        f"{where}: no usable detection of a target of the rig file.{likely}\n{'; '.join(said)}. "
+        "Are the families, ids and topics in the rig file right? (gtsam-rwhec init LOG names the tags that it finds)"
+    )
+
+
+def _named(tags: dict[str, int]) -> str:
+    some = [f"{name} ({count} times)" for name, count in list(tags.items())[:MOST_STRANGERS]]
+    return ", ".join(some) + (f" and {len(tags) - MOST_STRANGERS} others" if len(tags) > MOST_STRANGERS else "")
+
+
+#: So many images of a sensor, and this share of them, have no target that is used.
+FEWEST, UNREAD = 3, 0.15
+#: At most so many of them are looked at.
+LOOKED_AT = 8
+#: Edges across the motion have a blur of so many pixels at least, and of so many times that of edges along it; sharp
+#: ones have less than one.
+WIDE_PX, WIDER = 1.6, 1.5
+#: The same for images in which targets are read all the same: their poses are of no one instant.
+WIDE_AND_READ_PX = 2.2
+#: This share of those that were looked at is blurred.
+BLURRED_SHARE = 0.6
+
+
+def blurred_images(
+    log: Log, rig: Rig, cameras: Mapping[str, Camera], found: Mapping[str, SensorDetections]
+) -> tuple[str, ...]:
+    """A sentence, without a full stop, for each sensor of which many images are blurred by motion."""
+    said = []
+    for sensor, of_sensor in found.items():
+        used = {record.stamp_ns for record in of_sensor.records if not record.reason}
+        whole = [stamp for stamp, image in sorted(of_sensor.images.items()) if not image.fault]
+        unread = [stamp for stamp in whole if stamp not in used]
+        hides = len(unread) >= max(FEWEST, UNREAD * of_sensor.count)
+        looked_at = _spread(unread if hides else whole)
+        if len(looked_at) < FEWEST:
+            continue
+        blur = [motion_blur_px(gray) for gray in _images(log, rig, sensor, cameras[sensor], of_sensor, looked_at)]
+        least_px = WIDE_PX if hides else WIDE_AND_READ_PX
+        moved = [(wide, narrow) for wide, narrow in blur if wide > least_px and wide > WIDER * narrow]
+        if len(moved) >= max(2, BLURRED_SHARE * len(blur)):
+            wide_px, narrow_px = np.median(moved, axis=0)
+            what = (
+                f"no target is read in {len(unread)} of {of_sensor.count} images of {sensor}, and motion blur hides "
+                f"it: {len(moved)} of {len(blur)} of them that were looked at"
+                if hides
+                else f"motion blur is in {len(moved)} of {len(blur)} images of {sensor} that were looked at: they"
+            )
+            widths = f"{wide_px:.1f} pixels across the motion and {narrow_px:.1f} along it"
+            said.append(f"{what} have edges with a blur of {widths}")
+    return tuple(said)
+
+
+def _spread(stamps: list[int]) -> list[int]:
+    """At most `LOOKED_AT` of some stamps."""
+    if not stamps:
+        return []
+    places = np.unique(np.linspace(0, len(stamps) - 1, LOOKED_AT).round().astype(int))
+    return [stamps[place] for place in places.tolist()]
+
+
+def _images(
+    log: Log, rig: Rig, sensor: str, camera: Camera, of_sensor: SensorDetections, stamps: list[int]
+) -> list[Gray]:
+    """The images of some stamps that can be decoded."""
+    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in stamps}
+    images = []
+    for record in log.records_logged_at([str(rig.sensors[sensor].images)], wanted.values()):
+        if isinstance(record, ImageRecord) and record.stamp_ns in wanted:
+            try:
+                images.append(decode_gray(record, (camera.width, camera.height)))
+            except ImageError:
+                continue  # its fault is in the report
+    return images
