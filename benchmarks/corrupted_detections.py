@@ -7,29 +7,25 @@ are against the truth: root mean square over all frames, positions and rotations
 """
 
 from __future__ import annotations
+
 import json
 import sys
 import tempfile
 import warnings
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+
 import gtsam
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
+
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.solving_stage import solve_log
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import read_metadata
+from gtsam_rwhec.runs.run_log import detections_topic, read_metadata
+from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
 
 CELL = Path(__file__).resolve().parents[1] / "data" / "cell"
 BAR = 1.2

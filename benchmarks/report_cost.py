@@ -25,7 +25,7 @@ from places import CELL
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.runs import all_stages, log_report
+from gtsam_rwhec.runs import log_report, whole_runs
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -53,7 +53,7 @@ class Timed:
 def demo(folder: Path, timed: Timed) -> None:
     """Calibrate the demo's log; its report is timed."""
     timed.function = log_report.write_report
-    all_stages.write_report = timed  # type: ignore[assignment]
+    whole_runs.write_report = timed  # type: ignore[assignment]
     rw.calibrate_log(CELL / "robot_cell.mcap", rw.rig.read_rig(CELL / "rig.yaml"), folder)
 
 

@@ -7,25 +7,20 @@ does: transforms (raw and calibrated), the cameras' intrinsics, an image and its
 """
 
 from __future__ import annotations
+
 import json
 import tempfile
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
-from figures import BLUE
-from figures import GREEN
-from figures import GREY
-from figures import ORANGE
-from figures import VERMILLION
-from figures import arguments_of
-from figures import save
+from figures import BLUE, GREEN, GREY, ORANGE, VERMILLION, arguments_of, save
 from matplotlib.figure import Figure
 from mcap.reader import make_reader
+
 from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import TfBuffer
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import ImageRecord, TfBuffer, open_log
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.runs.run_log import read_cameras
 from gtsam_rwhec.runs.whole_runs import calibrate_log

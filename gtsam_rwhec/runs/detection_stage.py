@@ -1,57 +1,44 @@
 """The first stage: from images, or from the detections of a driver, to a log with the poses of the targets."""
 
 from __future__ import annotations
+
 from collections import defaultdict
-from collections.abc import Callable
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.errors import LogError, OptionError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.driver_detections import read_driver_detections
-from gtsam_rwhec.runs.image_detections import check_usable
-from gtsam_rwhec.runs.image_detections import detect_in_log
+from gtsam_rwhec.runs.image_detections import check_usable, detect_in_log, detection_report
+from gtsam_rwhec.runs.image_pictures import check_drawable, draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.odometry_tracks import write_files
+from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
+from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
+from gtsam_rwhec.runs.run_log import (
+    RECORDED_LOG,
+    LogMetadata,
+    annotations_topic,
+    detections_topic,
+    image_names,
+    poses_topic,
+    raw_topics,
+)
+from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics, in_words, read_intrinsics, refuse_not_estimated
 from gtsam_rwhec.runs.topics_of_rig import check_topics
-from tempfile import TemporaryDirectory
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.runs.image_detections import detection_report
-from gtsam_rwhec.runs.image_pictures import check_drawable
-from gtsam_rwhec.runs.image_pictures import draw_images
-from gtsam_rwhec.runs.image_pictures import has_images
-from gtsam_rwhec.runs.image_pictures import write_contact_sheet
-from gtsam_rwhec.runs.output_folder import check_is_not_read
-from gtsam_rwhec.runs.output_folder import check_writable
-from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder
-from gtsam_rwhec.runs.recorded_logs import is_folder_of_images
-from gtsam_rwhec.runs.recorded_logs import write_folder_log
-from gtsam_rwhec.runs.run_log import RECORDED_LOG
-from gtsam_rwhec.runs.run_log import LogMetadata
-from gtsam_rwhec.runs.run_log import annotations_topic
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import image_names
-from gtsam_rwhec.runs.run_log import poses_topic
-from gtsam_rwhec.runs.run_log import raw_topics
-from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics
-from gtsam_rwhec.runs.sensor_intrinsics import in_words
-from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
-from gtsam_rwhec.runs.sensor_intrinsics import refuse_not_estimated
-from gtsam_rwhec.runs.unread_targets import blurred_images
-from gtsam_rwhec.runs.unread_targets import likely_causes
-from gtsam_rwhec.runs.unread_targets import no_detections
+from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_detections
+
 
 def check_image_options(log: Log, rig: Rig | None, *, images: Images, workers: int | None) -> None:
     """Raise `OptionError` for workers that would search no image, or for images to copy from a log that has none.

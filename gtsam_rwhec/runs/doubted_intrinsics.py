@@ -1,15 +1,14 @@
 """Stated intrinsics that the corners of a log's boards contradict: named before a size, an arm or a clock is blamed."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
+
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.intrinsics_evidence import LEAST_CORNERS
-from gtsam_rwhec.cameras.intrinsics_evidence import IntrinsicsEvidence
-from gtsam_rwhec.cameras.intrinsics_evidence import View
-from gtsam_rwhec.cameras.intrinsics_evidence import evidence_of_intrinsics
+from gtsam_rwhec.cameras.intrinsics_evidence import LEAST_CORNERS, IntrinsicsEvidence, View, evidence_of_intrinsics
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import seen_corners

@@ -1,27 +1,27 @@
 """Boards whose tags are not where the rig file has them, or of which a part is never seen, by the corners of a log."""
 
 from __future__ import annotations
-from collections.abc import Mapping
-from collections.abc import Sequence
+
+from collections.abc import Mapping, Sequence
+
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.shape_evidence import LEAST_IMAGES
-from gtsam_rwhec.cameras.shape_evidence import BoardView
-from gtsam_rwhec.cameras.shape_evidence import Key
-from gtsam_rwhec.cameras.shape_evidence import ShapeEvidence
-from gtsam_rwhec.cameras.shape_evidence import evidence_of_shape
-from gtsam_rwhec.cameras.shape_evidence import never_seen
-from gtsam_rwhec.cameras.targets import AprilGrid
-from gtsam_rwhec.cameras.targets import Bundle
-from gtsam_rwhec.cameras.targets import Charuco
-from gtsam_rwhec.cameras.targets import TagGrid
-from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.cameras.shape_evidence import (
+    LEAST_IMAGES,
+    BoardView,
+    Key,
+    ShapeEvidence,
+    evidence_of_shape,
+    never_seen,
+)
+from gtsam_rwhec.cameras.targets import AprilGrid, Bundle, Charuco, TagGrid, Target
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import seen_corners
+
 
 def doubted_shapes(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[Finding, ...]:
     """What the corners of the detections in a log say against the shape of the rig file's boards of tags."""

@@ -1,23 +1,23 @@
 """The detections of a driver. Poses come from its corners and the rig file's sizes, or from the driver."""
 
 from __future__ import annotations
+
 from collections import Counter
 from dataclasses import replace
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.target_poses import plane_poses
 from gtsam_rwhec.cameras.targets import Target
 from gtsam_rwhec.detect.detections import Rejection
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import CameraError, LogError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import check_order
-from gtsam_rwhec.runs.image_detections import message_count
+from gtsam_rwhec.runs.image_detections import SensorDetections, message_count
 from gtsam_rwhec.runs.tracks import target_of
-from gtsam_rwhec.runs.image_detections import SensorDetections
 
 #: A driver's corners are assumed to have this standard deviation (pixels), which drivers do not state. If the noise is
 #: estimated, only the proportions between covariances count.

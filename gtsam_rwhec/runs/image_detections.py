@@ -1,48 +1,32 @@
 """Detection in the images of all cameras; a detection gets the one of its two poses that its whole track supports."""
 
 from __future__ import annotations
-from collections import Counter
-from collections import defaultdict
-from collections.abc import Iterator
-from collections.abc import Mapping
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import partial
+
 import numpy as np
-from gtsam_rwhec.cameras.board_turns import Turns
-from gtsam_rwhec.cameras.board_turns import choose_turns
-from gtsam_rwhec.cameras.board_turns import turn_between
+
+from gtsam_rwhec.cameras.board_turns import Turns, choose_turns, turn_between
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Target
-from gtsam_rwhec.detect.detections import Rejection
-from gtsam_rwhec.detect.detections import layouts_over_track
-from gtsam_rwhec.detect.detections import turned_detection
-from gtsam_rwhec.detect.detector import Detection
-from gtsam_rwhec.detect.detector import Detector
-from gtsam_rwhec.detect.many_images import DetectedImage
-from gtsam_rwhec.detect.many_images import detect_in_images
-from gtsam_rwhec.detect.many_images import measured_corner_px
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target
+from gtsam_rwhec.detect.detections import Rejection, layouts_over_track, turned_detection
+from gtsam_rwhec.detect.detector import Detection, Detector
+from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Counted
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import Remark
+from gtsam_rwhec.files.progress import Counted, Progress, Remark
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.results.log_history import DetectionReport, TrackCount
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.carrier_motion import check_order
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.runs.kept_detections import KeptDetections
-import re
-from dataclasses import dataclass
-from dataclasses import field
-from gtsam_rwhec.results.log_history import DetectionReport
-from gtsam_rwhec.results.log_history import TrackCount
-from gtsam_rwhec.runs.run_log import IMAGES_METADATA
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import image_key
+from gtsam_rwhec.runs.run_log import IMAGES_METADATA, detections_topic, image_key
+
 
 @dataclass(frozen=True)
 class LookedAt:

@@ -35,8 +35,8 @@ from gtsam_rwhec.runs.output_folder import made_folder
 from gtsam_rwhec.runs.run_log import image_name
 from gtsam_rwhec.runs.run_log import image_names
 from gtsam_rwhec.runs.run_log import picture_file
-from gtsam_rwhec.vision.drawn_detections import draw
-from gtsam_rwhec.vision.images import decode_gray
+from gtsam_rwhec.detect.images import decode_gray
+from gtsam_rwhec.detect.pictures import draw
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4

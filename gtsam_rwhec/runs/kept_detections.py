@@ -32,7 +32,7 @@ import cv2
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA
-from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.cameras.camera import Camera
 
 #: A message says at most this many differences, each value with at most this many characters.
 MOST_SAID, LONGEST = 5, 80

@@ -19,12 +19,12 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, Record
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig, parse_rig, rig_text
-from gtsam_rwhec.vision.camera import Camera
 
 Kind = TypeVar("Kind", bound=Record)
 

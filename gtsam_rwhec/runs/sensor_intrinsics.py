@@ -1,53 +1,36 @@
 """The intrinsics of each sensor, from the topic, file or numbers that the rig file names."""
 
 from __future__ import annotations
+
 import warnings
 from collections import Counter
-from collections.abc import Iterator
-from collections.abc import Mapping
-from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_files import read_cameras
 from gtsam_rwhec.cameras.targets import Target
-from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
-from gtsam_rwhec.cameras.unknown_intrinsics import ENOUGH
-from gtsam_rwhec.cameras.unknown_intrinsics import EstimatedIntrinsics
-from gtsam_rwhec.cameras.unknown_intrinsics import Lens
-from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
+from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS, ENOUGH, EstimatedIntrinsics, Lens, estimated_intrinsics
 from gtsam_rwhec.detect.board_layout import plane_coordinates
-from gtsam_rwhec.detect.detections import Detection
-from gtsam_rwhec.detect.detections import Rejection
-from gtsam_rwhec.detect.detections import layouts_over_track
+from gtsam_rwhec.detect.detections import Detection, Rejection, layouts_over_track
 from gtsam_rwhec.detect.detector import Detector
-from gtsam_rwhec.detect.images import Size
-from gtsam_rwhec.detect.images import stated_size
-from gtsam_rwhec.detect.many_images import DetectedImage
-from gtsam_rwhec.detect.many_images import detect_in_images
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.files.progress import Counted
-from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.detect.images import Size, stated_size
+from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images
+from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogError, LogWarning
+from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.image_detections import check_usable
-from gtsam_rwhec.runs.image_detections import detections_of_sensor
-from gtsam_rwhec.runs.image_detections import message_count
-from gtsam_rwhec.errors import CameraWarning
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.logs import IntrinsicsRecord
+from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, Log
 from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
+from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion
+from gtsam_rwhec.runs.image_detections import check_usable, detections_of_sensor, message_count
 from gtsam_rwhec.runs.image_pictures import write_contact_sheet
 from gtsam_rwhec.runs.unread_targets import likely_causes
-from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
 #: Lens models without rays for more than this share of the image are warned of.
 FOLDED = 0.01

@@ -1,30 +1,26 @@
 """Tracks: all measurements of one target by one sensor, in order of time, with the reason if one is not used."""
 
 from __future__ import annotations
-from collections import Counter
-from collections import defaultdict
+
+from collections import Counter, defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Self
+
 import numpy as np
-from gtsam_rwhec.cameras.targets import Bundle
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.cameras.targets import Target
-from gtsam_rwhec.cameras.targets import is_same_print
+
+from gtsam_rwhec.cameras.targets import Bundle, Tag, Target, is_same_print
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.results.log_history import TrackCount
-from gtsam_rwhec.results.removed_measurements import Kept
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import check_order
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import records_of
+from gtsam_rwhec.runs.run_log import detections_topic, records_of
+
 
 @dataclass(frozen=True, eq=False)
 class Track:

@@ -13,18 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, CircleGrid, Tag, Target, is_same_print
+from gtsam_rwhec.detect.clues import About, Clue, clues, edge_blur_px, motion_blur_px
+from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.image_detections import SensorDetections
 from gtsam_rwhec.runs.run_log import RECORDED_LOG
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.clues import About, Clue, clues
-from gtsam_rwhec.vision.image_quality import edge_blur_px, motion_blur_px
-from gtsam_rwhec.vision.images import Gray, decode_gray
-from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import FAMILIES, Checkerboard, CircleGrid, Tag, Target, is_same_print
 
 #: At most this number of images is looked at, of several targets at least `LEAST` for each; nothing more is tried after
 #: this number of seconds of the processor.

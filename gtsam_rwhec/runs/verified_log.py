@@ -1,57 +1,48 @@
 """Whether an old calibration still holds on a new log: detect, clean, and test, without calibrating anew."""
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.errors import FrameError, LogError, LogWarning, StampError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.results.change_test import LEVEL
-from gtsam_rwhec.results.change_test import checked_level
+from gtsam_rwhec.results.change_test import LEVEL, checked_level
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.results.result_file import Result
-from gtsam_rwhec.results.verification import Verification
-from gtsam_rwhec.results.verification import verify
+from gtsam_rwhec.results.verification import Verification, verify
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.changed_rig import rig_for_cleaning
-from gtsam_rwhec.runs.changed_rig import rig_for_solving
+from gtsam_rwhec.runs.changed_rig import rig_for_cleaning, rig_for_solving
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.corner_answer import with_intrinsics
 from gtsam_rwhec.runs.detection_stage import detect_log
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.measured_pairs import problem_of
-from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.old_calibration import OldCalibration
-from gtsam_rwhec.runs.old_calibration import with_cameras
-from gtsam_rwhec.runs.solving_rounds import Pairs
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import without_outlier_marks
-from gtsam_rwhec.runs.recorded_logs import is_file_of_samples
-from gtsam_rwhec.runs.recorded_logs import is_folder_of_images
-from gtsam_rwhec.runs.recorded_logs import write_folder_log
-from gtsam_rwhec.runs.recorded_logs import write_samples_log
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import CLEANING_METADATA
-from gtsam_rwhec.runs.run_log import DETECTED_LOG
-from gtsam_rwhec.runs.run_log import RECORDED_LOG
-from gtsam_rwhec.runs.run_log import is_from_stage
-from gtsam_rwhec.runs.run_log import read_cleaning_report
-from gtsam_rwhec.runs.run_log import read_metadata
+from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
+from gtsam_rwhec.runs.old_calibration import OldCalibration, with_cameras
+from gtsam_rwhec.runs.recorded_logs import is_file_of_samples, is_folder_of_images, write_folder_log, write_samples_log
+from gtsam_rwhec.runs.run_log import (
+    CLEAN_LOG,
+    CLEANING_METADATA,
+    DETECTED_LOG,
+    RECORDED_LOG,
+    is_from_stage,
+    read_cleaning_report,
+    read_metadata,
+)
+from gtsam_rwhec.runs.solving_rounds import Pairs, SolvingRounds, without_outlier_marks
 
 #: Standard deviation of a corner along each axis where the old calibration is not from corners, pixels: what detection
 #: takes before it has measured it. The test finds the noise of poses itself.

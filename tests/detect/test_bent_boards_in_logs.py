@@ -1,12 +1,13 @@
 """Boards in images of a lens that nobody calibrated: bent as no pinhole sees them, and read all the same."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import pytest
-from rendered import pose
-from rendered import printed
-from rendered import render
+from rendered import pose, printed, render
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.detect.detections import Rejection

@@ -1,27 +1,24 @@
 """The causes that are named where most targets are not read: which, with how many images, with the rig file's line."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
-from rendered import pose
-from rendered import printed
-from rendered import render
+from rendered import pose, printed, render
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.cameras.targets import Target
+from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Tag, Target
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import DetectionRecord
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.detection_stage import detect_source
-from gtsam_rwhec.runs.image_detections import SensorDetections
-from gtsam_rwhec.runs.image_detections import of_size
+from gtsam_rwhec.runs.image_detections import SensorDetections, of_size
 from gtsam_rwhec.runs.unread_targets import of_rejections
 
 CAMERA = Camera.of(640, 480, "", [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], (), "test")

@@ -1,20 +1,19 @@
 """A board that looks the same turned has one frame in all images of all cameras, or the run says which are unsure."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
-from rendered import PINHOLE
-from rendered import pose
-from rendered import printed
-from rendered import render
+from rendered import PINHOLE, pose, printed, render
 from rwhec_factors import se3
+
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.image_detections import detect_in_log

@@ -1,17 +1,18 @@
 """Cameras of which many images are blurred by motion are named; sharp ones in which there is no target are not."""
 
 from __future__ import annotations
+
 from collections import Counter
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.image_detections import LookedAt
-from gtsam_rwhec.runs.image_detections import SensorDetections
+from gtsam_rwhec.runs.image_detections import LookedAt, SensorDetections
 from gtsam_rwhec.runs.unread_targets import blurred_images
 
 RIG = parse_rig(

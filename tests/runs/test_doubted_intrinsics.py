@@ -1,21 +1,17 @@
 """Intrinsics that a log's corners contradict are named with their line; those that fit, and single tags, are not."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
-from gtsam_rwhec.runs.doubted_intrinsics import finding_against
+from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
+from gtsam_rwhec.rig import Rig, parse_rig
+from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
 from gtsam_rwhec.runs.run_log import detections_topic
 
 RIG = """\

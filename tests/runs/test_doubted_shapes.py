@@ -1,22 +1,18 @@
 """Boards of a rig file that a log's corners contradict are named with the line; right ones are not."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.doubted_shapes import continued_boards
-from gtsam_rwhec.runs.doubted_shapes import doubted_shapes
+from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
+from gtsam_rwhec.rig import Rig, parse_rig
+from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.run_log import detections_topic
 
 RIG = """\

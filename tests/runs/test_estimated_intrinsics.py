@@ -1,20 +1,21 @@
 """Logs of a camera that nobody calibrated: intrinsics from its images, and what is said where they do not tell."""
 
 from __future__ import annotations
+
 import json
 import re
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
-from cells_of_others import CIRCLES
-from cells_of_others import WORKCELL
+from cells_of_others import CIRCLES, WORKCELL
 from places import CELL
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.detect.images import Gray
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import LogWarning
+from gtsam_rwhec.errors import CameraError, LogWarning
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.rig import parse_rig
@@ -22,8 +23,7 @@ from gtsam_rwhec.runs import detect_source
 from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
 from gtsam_rwhec.runs.kept_detections import inputs_of
 from gtsam_rwhec.runs.recorded_logs import write_folder_log
-from gtsam_rwhec.runs.run_log import read_cameras
-from gtsam_rwhec.runs.run_log import read_embedded_rig
+from gtsam_rwhec.runs.run_log import read_cameras, read_embedded_rig
 from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics
 
 UNKNOWN = CIRCLES.replace("{K: [550, 550, 320, 240], size: [640, 480]}", "estimate")

@@ -1,23 +1,20 @@
 """Which camera of which file is a sensor's; what is missing is said with its line, before anything is copied."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
-from intrinsics_samples import CAMCHAIN
-from intrinsics_samples import ROS
+from intrinsics_samples import CAMCHAIN, ROS
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import CameraWarning
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, RwhecError
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.runs.solution_frames import BOARDS_ALONE
-from gtsam_rwhec.runs.solution_frames import origins_before_corners
 from gtsam_rwhec.runs.recorded_logs import write_folder_log
-from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files
-from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
+from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files, read_intrinsics
+from gtsam_rwhec.runs.solution_frames import BOARDS_ALONE, origins_before_corners
 
 FILES = {
     "chain.yaml": CAMCHAIN,

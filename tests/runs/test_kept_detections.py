@@ -1,19 +1,18 @@
 """Detections on disk: every bit comes back, a torn line costs its own batch, and other inputs are told."""
 
 from __future__ import annotations
+
 from dataclasses import fields
 from pathlib import Path
+
 import numpy as np
 import pytest
-from gtsam_rwhec.detect.detections import Detection
-from gtsam_rwhec.detect.detections import ImageDetections
-from gtsam_rwhec.detect.detections import Rejection
+
+from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.kept_detections import kept_inputs
-from gtsam_rwhec.runs.kept_detections import differences
+from gtsam_rwhec.runs.kept_detections import KeptDetections, differences, kept_inputs
 
 INPUTS = {"file run.mcap": "12 bytes, changed at 5 ns"}
 

@@ -1,16 +1,17 @@
 """What stages write is told from what the raw log has; a driver's words for a family are the rig file's."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import numpy as np
 import pytest
 import synthetic_logs as made
+
 from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.runs.tracks import target_of
+from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.runs import run_log as log_contract
+from gtsam_rwhec.runs.tracks import target_of
 
 OF_DETECTION = {
     log_contract.detections_topic("rig/cam_0"),

@@ -1,27 +1,22 @@
 """What was seen in a run: the sample of a contact sheet, pictures of a folder's images, and both without any target."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import synthetic_logs as made
-from bad_logs import MOVING
-from bad_logs import WITH_IMAGES
-from bad_logs import images
-from bad_logs import picture
+from bad_logs import MOVING, WITH_IMAGES, images, picture
+
 from gtsam_rwhec.detect.contact_sheet import Outcome
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import DetectionRecord, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.runs.detection_stage import detect_source
-from gtsam_rwhec.runs.detection_stage import sheet_beside
-from gtsam_rwhec.runs.image_pictures import outcome_of
-from gtsam_rwhec.runs.image_pictures import sample
-from gtsam_rwhec.runs.run_log import image_key
-from gtsam_rwhec.runs.run_log import image_name
-from gtsam_rwhec.runs.run_log import picture_file
+from gtsam_rwhec.runs.detection_stage import detect_source, sheet_beside
+from gtsam_rwhec.runs.image_pictures import outcome_of, sample
+from gtsam_rwhec.runs.run_log import image_key, image_name, picture_file
 
 FOUND, NOTHING = (Outcome.FOUND, "board"), (Outcome.NOTHING, "")
 SMALL, BLURRED = (Outcome.REJECTED, "board: small"), (Outcome.REJECTED, "board: blurred")
