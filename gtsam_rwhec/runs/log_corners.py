@@ -1,31 +1,31 @@
 """The corners of a cleaned or solved log as observations, with A at each image: what ``rw.refine_corners`` takes."""
 
 from __future__ import annotations
-from collections.abc import Iterable
-from collections.abc import Mapping
+
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import DetectionRecord, Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.result_file import parse_result
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import read_cameras
-from gtsam_rwhec.runs.run_log import read_cleaning_report
-from gtsam_rwhec.runs.run_log import read_embedded_rig
-from gtsam_rwhec.runs.run_log import records_of
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, read_pairs
+from gtsam_rwhec.runs.run_log import (
+    RESULT_FILE,
+    detections_topic,
+    read_cameras,
+    read_cleaning_report,
+    read_embedded_rig,
+    records_of,
+)
 
 #: Fewer corners than this determine no pose.
 FEWEST = 4

@@ -1,26 +1,23 @@
 """Measured pairs (A, B): written into a cleaned log, read back as arrays, and stated as a problem."""
 
 from __future__ import annotations
+
 from collections import defaultdict
-from collections.abc import Collection
-from collections.abc import Iterable
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+
 import numpy as np
+
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import PairRecord
+from gtsam_rwhec.logs import Log, LogWriter, PairRecord
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.run_log import pairs_topic, records_of
 from gtsam_rwhec.runs.tracks import Track
-from gtsam_rwhec.runs.run_log import pairs_topic
-from gtsam_rwhec.runs.run_log import records_of
 
 #: Noise of a target's poses where nothing is known yet: 5 mm and half a degree. It is estimated from there.
 BEFORE_ESTIMATE = {"sigma": 0.005, "kappa": 1.0 / (2.0 * np.radians(0.5) ** 2)}

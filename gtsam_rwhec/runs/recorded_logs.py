@@ -49,7 +49,7 @@ from gtsam_rwhec.logs.records import DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA
 from gtsam_rwhec.runs.run_log import image_key
-from gtsam_rwhec.solving import solve
+from gtsam_rwhec.solver.certified_solution import solve
 
 #: Images that were taken at rest have stamps this far apart, nanoseconds: further than poses are interpolated.
 APART_NS = 10**9

@@ -1,46 +1,37 @@
 """What was seen in a log: its measurements, corners, and pictures of the images."""
 
 from __future__ import annotations
+
 import warnings
 from collections import defaultdict
-from collections.abc import Mapping
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
+
 import cv2
 import numpy as np
+
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.detect.pictures import draw_errors
-from gtsam_rwhec.detect.pictures import jpeg_of
-from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.detect.pictures import draw_errors, jpeg_of
+from gtsam_rwhec.errors import ImageError, LogError, LogWarning
+from gtsam_rwhec.logs import ImageRecord, Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.results.detection_evidence import PIECES
-from gtsam_rwhec.results.detection_evidence import RemovedCount
-from gtsam_rwhec.results.detection_evidence import SeenEvidence
-from gtsam_rwhec.results.detection_evidence import counts_of
-from gtsam_rwhec.results.detection_evidence import removed_list
-from gtsam_rwhec.results.detection_evidence import span_of
-from gtsam_rwhec.results.detection_evidence import tracks_of
-from gtsam_rwhec.results.image_errors import RatedView
-from gtsam_rwhec.results.image_errors import WorstImage
-from gtsam_rwhec.results.image_errors import rated_views
-from gtsam_rwhec.results.image_errors import seen_cameras
-from gtsam_rwhec.results.image_errors import worst_image
-from gtsam_rwhec.results.image_errors import worst_views
+from gtsam_rwhec.results.detection_evidence import (
+    PIECES,
+    RemovedCount,
+    SeenEvidence,
+    counts_of,
+    removed_list,
+    span_of,
+    tracks_of,
+)
+from gtsam_rwhec.results.image_errors import RatedView, WorstImage, rated_views, seen_cameras, worst_image, worst_views
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.plotted_corners import camera_of
-from gtsam_rwhec.runs.plotted_corners import seen_views
+from gtsam_rwhec.runs.plotted_corners import camera_of, seen_views
+from gtsam_rwhec.runs.run_log import image_name, image_names
 from gtsam_rwhec.runs.solving_stage import Solved
-from gtsam_rwhec.runs.run_log import image_name
-from gtsam_rwhec.runs.run_log import image_names
 
 #: A contact sheet of the page is so wide, pixels; it, and each picture of an image, has at most so many bytes.
 SHEET_WIDTH, SHEET_BYTES, PICTURE_BYTES = 1200, 500_000, 90_000

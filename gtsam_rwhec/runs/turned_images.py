@@ -5,13 +5,14 @@ are then turned by 180 degrees about the optical axis, which no wrong corner and
 """
 
 from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Mapping
+
 import numpy as np
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import so3_logmap
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+from rwhec_factors.se3 import inverse, so3_logmap
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.rig import Rig

@@ -1,36 +1,31 @@
 """Corners of cleaned logs, from the images of other people, refined from with everything free."""
 
 from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
 import pytest
-from cells_of_others import CIRCLES
-from cells_of_others import WORKCELL
+from cells_of_others import CIRCLES, WORKCELL
 from rwhec_factors import se3
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
+from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.fitting import held_out_errors
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.runs import clean_log
-from gtsam_rwhec.runs import detect_log
-from gtsam_rwhec.runs import read_corners
-from gtsam_rwhec.runs import solve_log
-from gtsam_rwhec.runs import write_folder_log
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs import clean_log, detect_log, read_corners, solve_log, write_folder_log
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.corner_answer import corner_answer
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.measured_pairs import read_pairs
+from gtsam_rwhec.runs.run_log import read_cameras, read_embedded_rig
 from gtsam_rwhec.runs.settled_poses import SettledPoses
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import SynchronisedPairs
-from gtsam_rwhec.runs.run_log import read_cameras
-from gtsam_rwhec.runs.run_log import read_embedded_rig
+from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
+
 
 def corners_of(folder: Path, text: str, out: Path) -> rw.Observations:
     rig = parse_rig(text, "rig.yaml", folder)
