@@ -14,6 +14,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+sys.path.insert(0, str(TESTS))
+
 import gtsam
 import numpy as np
 from bars import Row, benchmark_parser, print_rows
@@ -27,9 +30,7 @@ from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import parse_rig, read_rig
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
 CELL = TESTS.parent / "data" / "cell"
-sys.path[:0] = [str(TESTS), str(TESTS / "runs")]
 
 SIGMA_M, ROTATION_DEG = 0.005, 0.5
 

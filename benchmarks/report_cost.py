@@ -19,6 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
 from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from places import CELL
@@ -26,8 +28,6 @@ from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.runs import log_report, whole_runs
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 SECONDS, MEGABYTES = 3.0, 5.0
 

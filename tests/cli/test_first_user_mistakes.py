@@ -6,7 +6,6 @@ The cells are small: a board that is drawn into images of 320 x 240 pixels, and 
 from __future__ import annotations
 import dataclasses
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 import cv2
@@ -14,13 +13,10 @@ import numpy as np
 import pytest
 import rendered
 from given_commands import command
-from places import REPOSITORY
 from scipy.spatial.transform import Rotation
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.cameras.targets import Tag
 import synthetic_logs as made
-
-sys.path.append(str(REPOSITORY / "tests" / "runs"))
 
 IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"

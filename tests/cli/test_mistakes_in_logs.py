@@ -4,18 +4,14 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 import numpy as np
 import pytest
 from given_commands import command
 from places import DEMO
-from places import REPOSITORY
 from scipy.spatial.transform import Rotation
 import synthetic_logs as made
-
-sys.path.insert(0, str(REPOSITORY / "tests" / "runs"))
 
 Change = Callable[[Path], object]
 
