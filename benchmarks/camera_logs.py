@@ -14,8 +14,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
-sys.path.insert(0, str(TESTS))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import gtsam
 import numpy as np
@@ -30,7 +29,7 @@ from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import parse_rig, read_rig
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
-CELL = TESTS.parent / "data" / "cell"
+CELL = Path(__file__).resolve().parents[1] / "data" / "cell"
 
 SIGMA_M, ROTATION_DEG = 0.005, 0.5
 

@@ -1,70 +1,47 @@
 """The map: one log becomes one partial result, by the stages that ``calibrate`` runs, in a folder of the worker."""
 
 from __future__ import annotations
+
 import hashlib
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import StoreInterruptedError
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, StoreInterruptedError
 from gtsam_rwhec.fleet.container import FORMAT_VERSION
-from gtsam_rwhec.fleet.log_facts import LogFacts
-from gtsam_rwhec.fleet.log_facts import Weighting
-from gtsam_rwhec.fleet.log_facts import camera_fields
+from gtsam_rwhec.fleet.log_facts import LogFacts, Weighting, camera_fields
 from gtsam_rwhec.fleet.log_parts import local_copy_of_topics
 from gtsam_rwhec.fleet.measured_task import measured_task
 from gtsam_rwhec.fleet.pair_moments import PairMoments
-from gtsam_rwhec.fleet.partial import FOLDER
-from gtsam_rwhec.fleet.partial import KeptLog
-from gtsam_rwhec.fleet.partial import KeptPair
-from gtsam_rwhec.fleet.partial import Partial
-from gtsam_rwhec.fleet.partial import checksum
-from gtsam_rwhec.fleet.partial import in_single
-from gtsam_rwhec.fleet.receipts import below
-from gtsam_rwhec.fleet.receipts import keep_receipt
-from gtsam_rwhec.fleet.receipts import kept_receipt
+from gtsam_rwhec.fleet.partial import FOLDER, KeptLog, KeptPair, Partial, checksum, in_single
+from gtsam_rwhec.fleet.receipts import below, keep_receipt, kept_receipt
 from gtsam_rwhec.fleet.rig_source import RigSource
-from gtsam_rwhec.fleet.stores import stamp_of
-from gtsam_rwhec.fleet.stores import write_once
+from gtsam_rwhec.fleet.stores import stamp_of, write_once
 from gtsam_rwhec.fleet.tasks import Receipt
 from gtsam_rwhec.fleet.without_secrets import shown
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_sections import OdometrySensor
 from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.clocks_by_turning import late_clocks
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
-from gtsam_rwhec.runs.doubted_intrinsics import finding_against
-from gtsam_rwhec.runs.doubted_shapes import continued_boards
-from gtsam_rwhec.runs.doubted_shapes import doubted_shapes
+from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
+from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.measured_pairs import poses_used
-from gtsam_rwhec.runs.measured_pairs import problem_of
-from gtsam_rwhec.runs.measured_pairs import read_pairs
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
+from gtsam_rwhec.runs.run_log import CLEAN_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata
 from gtsam_rwhec.runs.topics_of_rig import wanted_topics
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import DETECTED_LOG
-from gtsam_rwhec.runs.run_log import LogMetadata
-from gtsam_rwhec.runs.run_log import is_from_stage
-from gtsam_rwhec.runs.run_log import read_metadata
+
 
 @dataclass(frozen=True)
 class LogTask:

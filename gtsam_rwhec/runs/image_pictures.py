@@ -1,42 +1,27 @@
 """A contact sheet of a run: some of each sensor's images, with what was found, rejected, not seen, or not usable."""
 
 from __future__ import annotations
-from collections import Counter
-from collections import defaultdict
-from collections.abc import Mapping
-from collections.abc import Sequence
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
 import cv2
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.detect.contact_sheet import WIDTH
-from gtsam_rwhec.detect.contact_sheet import Band
-from gtsam_rwhec.detect.contact_sheet import Detail
-from gtsam_rwhec.detect.contact_sheet import Outcome
-from gtsam_rwhec.detect.contact_sheet import Outline
-from gtsam_rwhec.detect.contact_sheet import Tile
-from gtsam_rwhec.detect.contact_sheet import contact_sheet
-from gtsam_rwhec.detect.contact_sheet import detail_of
-from gtsam_rwhec.detect.images import Gray
-from gtsam_rwhec.detect.images import decode_small
-from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.detect.contact_sheet import WIDTH, Band, Detail, Outcome, Outline, Tile, contact_sheet, detail_of
+from gtsam_rwhec.detect.images import Gray, decode_gray, decode_small
+from gtsam_rwhec.detect.pictures import draw
+from gtsam_rwhec.errors import ImageError, OptionError
+from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.rig import Rig
-from collections.abc import Iterable
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.progress import Counted
-from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.runs.image_detections import SensorDetections
 from gtsam_rwhec.runs.output_folder import made_folder
-from gtsam_rwhec.runs.run_log import image_name
-from gtsam_rwhec.runs.run_log import image_names
-from gtsam_rwhec.runs.run_log import picture_file
-from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.detect.pictures import draw
+from gtsam_rwhec.runs.run_log import image_name, image_names, picture_file
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4

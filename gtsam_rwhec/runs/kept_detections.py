@@ -6,33 +6,29 @@ has no right checksum: it is dropped, and its images are detected again. Arrays 
 """
 
 from __future__ import annotations
+
 import base64
+import dataclasses
 import json
+import os
 import zlib
-from collections.abc import Iterator
-from collections.abc import Mapping
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import cv2
 import numpy as np
-from gtsam_rwhec.detect.detections import Detection
-from gtsam_rwhec.detect.detections import ImageDetections
-from gtsam_rwhec.detect.detections import Rejection
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.whole_files import appending_stream
-from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.logs import ImageRecord
-import dataclasses
-import os
-from importlib.metadata import version
-import cv2
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.files.whole_files import appending_stream, write_atomically
+from gtsam_rwhec.logs import ImageRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA
-from gtsam_rwhec.cameras.camera import Camera
 
 #: A message says at most this many differences, each value with at most this many characters.
 MOST_SAID, LONGEST = 5, 80

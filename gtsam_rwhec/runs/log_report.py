@@ -1,19 +1,18 @@
 """The report of a calibration from a log: its evidence and its page, written into the output folder."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.report.report_page import write_html
 from gtsam_rwhec.results import write_evidence
 from gtsam_rwhec.runs.log_evidence import evidence_of_log
+from gtsam_rwhec.runs.run_log import CLEAN_LOG, EVIDENCE_FILE, REPORT_FILE, RESULT_FILE
 from gtsam_rwhec.runs.seen_in_log import Pictures
 from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import EVIDENCE_FILE
-from gtsam_rwhec.runs.run_log import REPORT_FILE
-from gtsam_rwhec.runs.run_log import RESULT_FILE
+
 
 def write_report(
     calibrated: Calibrated, out: Path, sources: Sequence[Path], pictures: Pictures, progress: Progress | None = None

@@ -1,46 +1,49 @@
 """Solving of sensors that know only their own motion: from a cleaned log to the joint answer, and its files."""
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import replace
+
+from dataclasses import dataclass, replace
 from pathlib import Path
+
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import OptionError
+
+from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.errors import LogError, OptionError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.odometry import Given
-from gtsam_rwhec.odometry import Ground
-from gtsam_rwhec.odometry import KnownDirection
-from gtsam_rwhec.odometry import OdometryCalibration
-from gtsam_rwhec.odometry import OdometryOptions
-from gtsam_rwhec.odometry import OdometryTrack
-from gtsam_rwhec.odometry import calibrate_odometries
-from gtsam_rwhec.odometry.odometry_file import OdometryResult
-from gtsam_rwhec.odometry.odometry_file import parse_odometry_result
-from gtsam_rwhec.odometry.odometry_file import result_json
-from gtsam_rwhec.odometry.odometry_file import result_of
-from gtsam_rwhec.odometry.odometry_file import write_odometry_result
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.odometry import (
+    Given,
+    Ground,
+    KnownDirection,
+    OdometryCalibration,
+    OdometryOptions,
+    OdometryTrack,
+    calibrate_odometries,
+)
+from gtsam_rwhec.odometry.odometry_file import (
+    OdometryResult,
+    parse_odometry_result,
+    result_json,
+    result_of,
+    write_odometry_result,
+)
 from gtsam_rwhec.report.odometry_report import write_odometry_page
 from gtsam_rwhec.results.log_history import CleaningReport
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.rig import Rig, RigFrames
 from gtsam_rwhec.runs.changed_rig import rig_for_solving
-from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.measured_pairs import write_pairs
+from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
-from gtsam_rwhec.runs.output_folder import list_written
-from gtsam_rwhec.runs.output_folder import made_output_folder
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import REPORT_FILE
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import SOLUTION_TOPIC
-from gtsam_rwhec.runs.run_log import read_metadata
-from gtsam_rwhec.runs.run_log import topics_up_to_detection
+from gtsam_rwhec.runs.output_folder import list_written, made_output_folder
+from gtsam_rwhec.runs.run_log import (
+    CLEAN_LOG,
+    REPORT_FILE,
+    RESULT_FILE,
+    SOLUTION_TOPIC,
+    read_metadata,
+    topics_up_to_detection,
+)
+
 
 @dataclass(frozen=True, eq=False)
 class OdometrySolved:

@@ -1,22 +1,19 @@
 """An old calibration of a log as its output folder holds it: result, rig file and intrinsics."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.results.result_file import Result
-from gtsam_rwhec.results.result_file import parse_result
-from gtsam_rwhec.results.result_file import read_result
-from gtsam_rwhec.results.result_file import result_path
+from gtsam_rwhec.results.result_file import Result, parse_result, read_result, result_path
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.sections import Intrinsics
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import read_cameras
-from gtsam_rwhec.runs.run_log import read_embedded_rig
+from gtsam_rwhec.runs.run_log import CLEAN_LOG, RESULT_FILE, read_cameras, read_embedded_rig
+
 
 @dataclass(frozen=True, eq=False)
 class OldCalibration:

@@ -1,44 +1,34 @@
 """Checks of the files and folders that a stage will write, before it begins its work."""
 
 from __future__ import annotations
+
 import hashlib
 import os
 import re
-from collections.abc import Collection
-from collections.abc import Iterable
-from collections.abc import Iterator
-from collections.abc import Sequence
-from contextlib import contextmanager
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
-from typing import TypeAlias
-from pydantic import BaseModel
-from pydantic import ConfigDict
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.export.files import FOLDERS
-from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.kept_detections import kept_inputs
-from gtsam_rwhec.export.files import FILES
-from gtsam_rwhec.export.files import SUFFIX
-from gtsam_rwhec.files.atomic_write import why_not_writable
+from typing import Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict
+
+from gtsam_rwhec.errors import LogError, RwhecError
+from gtsam_rwhec.export.files import FILES, FOLDERS, SUFFIX
+from gtsam_rwhec.files.whole_files import why_not_writable, write_atomically
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.runs.kept_detections import differences
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import DETECTED_LOG
-from gtsam_rwhec.runs.run_log import EVIDENCE_FILE
-from gtsam_rwhec.runs.run_log import PLOTS_FOLDER
-from gtsam_rwhec.runs.run_log import RECORDED_LOG
-from gtsam_rwhec.runs.run_log import REPORT_FILE
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import SEEN_SHEET
-from gtsam_rwhec.runs.solution_plots import COVERAGE
-from gtsam_rwhec.runs.solution_plots import DEVIATIONS
-from gtsam_rwhec.runs.solution_plots import FRAMES
-from gtsam_rwhec.runs.solution_plots import INTRINSICS
-from gtsam_rwhec.runs.solution_plots import RESIDUALS
+from gtsam_rwhec.rig.folder_contents import INTRINSICS
+from gtsam_rwhec.runs.kept_detections import KeptDetections, differences, kept_inputs
+from gtsam_rwhec.runs.run_log import (
+    CLEAN_LOG,
+    DETECTED_LOG,
+    EVIDENCE_FILE,
+    PLOTS_FOLDER,
+    RECORDED_LOG,
+    REPORT_FILE,
+    RESULT_FILE,
+    SEEN_SHEET,
+)
+from gtsam_rwhec.runs.solution_plots import COVERAGE, DEVIATIONS, FRAMES, RESIDUALS
 
 #: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
 LEFT = (

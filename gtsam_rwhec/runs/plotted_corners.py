@@ -1,19 +1,20 @@
 """Corners of a solved log: where cameras saw them, and where the calibration has them."""
 
 from __future__ import annotations
+
 from collections import defaultdict
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.results.image_errors import SeenView
-from gtsam_rwhec.results.image_errors import board_of
+from gtsam_rwhec.results.image_errors import SeenView, board_of
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.run_log import detections_topic, records_of
 from gtsam_rwhec.runs.solving_stage import Solved
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import records_of
+
 
 def seen_views(solved: Solved, log: Log, *, left_out: bool = False) -> dict[str, list[SeenView]]:
     """The corners of used detections, with where the calibration has them, by camera.

@@ -10,45 +10,37 @@ same rig file serves for the folder and for the log. There are two kinds of fold
 """
 
 from __future__ import annotations
+
 import warnings
-from collections.abc import Iterator
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
 import numpy as np
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.files.progress import Counted
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+
+from gtsam_rwhec.errors import FileFormatError, LogError, LogWarning, NotUniqueWarning
+from gtsam_rwhec.files.progress import Counted, Progress, silent
 from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.files.whole_files import checked_path
-from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.logs.hand_eye_samples import is_samples_file
-from gtsam_rwhec.logs.image_folder import FORMATS
-from gtsam_rwhec.logs.image_folder import LARGEST_IMAGE
-from gtsam_rwhec.logs.image_folder import SAME_POSE
-from gtsam_rwhec.logs.image_folder import image_stamps
-from gtsam_rwhec.logs.image_folder import images_in
-from gtsam_rwhec.logs.image_folder import match
-from gtsam_rwhec.logs.image_folder import pose_stamps
-from gtsam_rwhec.logs.image_folder import read_poses
+from gtsam_rwhec.logs.hand_eye_samples import HandEyeSamples, is_samples_file, read_hand_eye_samples
+from gtsam_rwhec.logs.image_folder import (
+    FORMATS,
+    LARGEST_IMAGE,
+    SAME_POSE,
+    image_stamps,
+    images_in,
+    match,
+    pose_stamps,
+    read_poses,
+)
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_rows import NamedPoses
-from gtsam_rwhec.logs.pose_rows import PoseStatement
-from gtsam_rwhec.logs.pose_rows import stem_of
-from gtsam_rwhec.logs.records import Array
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.logs.hand_eye_samples import HandEyeSamples
-from gtsam_rwhec.logs.hand_eye_samples import read_hand_eye_samples
-from gtsam_rwhec.logs.records import DetectionRecord
+from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement, stem_of
+from gtsam_rwhec.logs.records import Array, DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.runs.run_log import IMAGES_METADATA
-from gtsam_rwhec.runs.run_log import image_key
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.run_log import IMAGES_METADATA, image_key
 from gtsam_rwhec.solver.certified_solution import solve
 
 #: Images that were taken at rest have stamps this far apart, nanoseconds: further than poses are interpolated.

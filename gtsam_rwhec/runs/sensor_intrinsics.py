@@ -24,9 +24,9 @@ from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogE
 from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, Log
-from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
+from gtsam_rwhec.logs.records import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig.intrinsics_section import Intrinsics
+from gtsam_rwhec.rig.sections import Intrinsics
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.image_detections import check_usable, detections_of_sensor, message_count
 from gtsam_rwhec.runs.image_pictures import write_contact_sheet

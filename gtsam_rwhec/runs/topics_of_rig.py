@@ -1,21 +1,17 @@
 """Whether the topics that a rig file names are in the log, and whether their messages are of the sensors named."""
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Iterator
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
+
+from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import IntrinsicsRecord
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs.records import TAG_DETECTIONS
-from gtsam_rwhec.logs.records import TF_TOPICS
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log
+from gtsam_rwhec.logs.records import TAG_DETECTIONS, TF_TOPICS
 from gtsam_rwhec.logs.ros2_messages import DETECTIONS
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import pairs_topic
+from gtsam_rwhec.runs.run_log import detections_topic, pairs_topic
 
 #: The types of messages that are read, by what the rig file takes from them.
 READ = {

@@ -4,19 +4,21 @@ The cells are small: a board that is drawn into images of 320 x 240 pixels, and 
 """
 
 from __future__ import annotations
+
 import dataclasses
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import rendered
+import synthetic_logs as made
 from given_commands import command
 from scipy.spatial.transform import Rotation
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import Tag
-import synthetic_logs as made
+
+from gtsam_rwhec.cameras.targets import Checkerboard, Tag
 
 IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"

@@ -1,17 +1,19 @@
 """Mistakes of a first user with logs, CSV files and samples: exit status not 0, the fault and its cure in words."""
 
 from __future__ import annotations
+
 import dataclasses
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+
 import numpy as np
 import pytest
+import synthetic_logs as made
 from given_commands import command
 from places import DEMO
 from scipy.spatial.transform import Rotation
-import synthetic_logs as made
 
 Change = Callable[[Path], object]
 

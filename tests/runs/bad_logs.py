@@ -1,22 +1,22 @@
 """Pieces of recordings to make bad logs of, and how a calibration of one is refused."""
 
 from __future__ import annotations
+
 import base64
 import re
-from collections.abc import Callable
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 import synthetic_logs as made
-from synthetic_logs import BEGIN_NS
-from synthetic_logs import Message
+from synthetic_logs import BEGIN_NS, Message
+
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.runs.output_folder import DETECTIONS
-from gtsam_rwhec.runs.output_folder import LIST_FILE
+from gtsam_rwhec.runs.output_folder import DETECTIONS, LIST_FILE
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 RECORDED = made.recording(4.0)

@@ -1,17 +1,21 @@
 """What is in an output folder before a run: which of it is gone on with, replaced, or refused."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import pytest
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import LogError
+
+from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.runs import output_folder as earlier_output
-from gtsam_rwhec.runs.output_folder import LIST_FILE
-from gtsam_rwhec.runs.output_folder import MOST_NAMED
-from gtsam_rwhec.runs.output_folder import earlier_run
-from gtsam_rwhec.runs.output_folder import list_written
-from gtsam_rwhec.runs.output_folder import output_folder
-from gtsam_rwhec.runs.output_folder import remove_unchanged
+from gtsam_rwhec.runs.output_folder import (
+    LIST_FILE,
+    MOST_NAMED,
+    earlier_run,
+    list_written,
+    output_folder,
+    remove_unchanged,
+)
 
 LOG = "run.mcap"
 ALL = (

@@ -1,29 +1,26 @@
 """Folders of images with poses beside them: which pose goes with which image, at which stamp, and what does not fit."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
-from cells_of_others import CIRCLES
-from cells_of_others import WORKCELL
+from cells_of_others import CIRCLES, WORKCELL
 from scipy.spatial.transform import Rotation
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import PoseRecord
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.errors import LogError, LogWarning, RigError
+from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
 from gtsam_rwhec.logs.image_folder import read_poses
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.log_findings import in_rig_file
-from gtsam_rwhec.runs.recorded_logs import is_folder_of_images
-from gtsam_rwhec.runs.recorded_logs import write_folder_log
+from gtsam_rwhec.runs.recorded_logs import is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG
 from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
 

@@ -1,6 +1,7 @@
 """A calibration that ends early leaves whole files or none."""
 
 from __future__ import annotations
+
 import errno
 import os
 import re
@@ -8,24 +9,20 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
 import cv2
 import pytest
 import synthetic_logs as made
-from bad_logs import MOVING
-from bad_logs import RECORDED
-from bad_logs import WRITTEN
-from bad_logs import calibrate
+from bad_logs import MOVING, RECORDED, WRITTEN, calibrate
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.output_folder import LIST_FILE
-from gtsam_rwhec.runs.output_folder import earlier_run
+from gtsam_rwhec.runs.output_folder import LIST_FILE, earlier_run
 from gtsam_rwhec.runs.run_log import DETECTION_METADATA
-from gtsam_rwhec.runs.whole_runs import calibrate_log
-from gtsam_rwhec.runs.whole_runs import solve_into
+from gtsam_rwhec.runs.whole_runs import calibrate_log, solve_into
 
 try:
     import resource

@@ -1,6 +1,7 @@
 """Runs that are killed, with SIGKILL, at several moments: the same command does the rest, and finds the same."""
 
 from __future__ import annotations
+
 import json
 import shutil
 import signal
@@ -8,14 +9,15 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 from cells_of_others import WORKCELL
+
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.output_folder import DETECTIONS
-from gtsam_rwhec.runs.output_folder import LIST_FILE
+from gtsam_rwhec.runs.output_folder import DETECTIONS, LIST_FILE
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 NUMBERS = (1, 43, 61, 94, 112, 121, 208, 221, 233, 242)

@@ -1,23 +1,23 @@
 """What a log's calibration says is wrong, with the line of the rig file to change."""
 
 from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
 import pytest
 import synthetic_logs as made
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.log_findings import in_rig_file
-from gtsam_rwhec.runs.log_findings import known_to_nothing
-from gtsam_rwhec.runs.log_findings import not_of_marked_outliers
+from gtsam_rwhec.runs.log_findings import in_rig_file, known_to_nothing, not_of_marked_outliers
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")

@@ -1,19 +1,20 @@
 """Names in rig files and logs never lead out of the folder of the results."""
 
 from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
 import pytest
 import synthetic_logs as made
-from bad_logs import RECORDED
-from bad_logs import WRITTEN
+from bad_logs import RECORDED, WRITTEN
 from synthetic_logs import BEGIN_NS
+
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.logs import LogWriter
 from gtsam_rwhec.runs.output_folder import LIST_FILE
-from gtsam_rwhec.runs.run_log import DETECTION_METADATA
-from gtsam_rwhec.runs.run_log import RIG_METADATA
+from gtsam_rwhec.runs.run_log import DETECTION_METADATA, RIG_METADATA
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 TAG = f"{{type: tag, family: tag36h11, id: 0, size_m: {made.SIZE_M}}}"

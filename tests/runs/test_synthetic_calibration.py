@@ -1,16 +1,20 @@
 """A made-up recording of detections, the whole way: what comes out is what was made up."""
 
 from __future__ import annotations
+
 import json
 import subprocess
 import sys
 from pathlib import Path
+
 import numpy as np
 import synthetic_logs as made
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.report.advice import log_advice
-from gtsam_rwhec.simulate import frame_distance
 from gtsam_rwhec.runs.whole_runs import calibrate_log
+from gtsam_rwhec.simulate import frame_distance
+
 
 def test_truth_comes_out(tmp_path: Path) -> None:
     log = made.write(tmp_path / "raw.mcap", made.recording())
