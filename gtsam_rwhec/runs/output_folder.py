@@ -16,34 +16,21 @@ from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.export.files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.files.whole_files import why_not_writable, write_atomically
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.rig.folder_contents import INTRINSICS
 from gtsam_rwhec.runs.kept_detections import KeptDetections, differences, kept_inputs
 from gtsam_rwhec.runs.run_log import (
     CLEAN_LOG,
     DETECTED_LOG,
     EVIDENCE_FILE,
-    PLOTS_FOLDER,
     RECORDED_LOG,
     REPORT_FILE,
     RESULT_FILE,
     SEEN_SHEET,
 )
-from gtsam_rwhec.runs.solution_plots import COVERAGE, DEVIATIONS, FRAMES, RESIDUALS
 
 #: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
-LEFT = (
-    CLEAN_LOG,
-    REPORT_FILE,
-    RESULT_FILE,
-    EVIDENCE_FILE,
-    *FILES,
-    SEEN_SHEET,
-    *(f"{PLOTS_FOLDER}/{name}" for name in (FRAMES, RESIDUALS, COVERAGE, DEVIATIONS, INTRINSICS)),
-)
+LEFT = (CLEAN_LOG, REPORT_FILE, RESULT_FILE, EVIDENCE_FILE, *FILES, SEEN_SHEET)
 #: With the log that it has during the work.
 WRITTEN = (*LEFT, DETECTED_LOG)
-#: Folders in the output folder. Those of the export have one file a camera.
-INSIDE = (PLOTS_FOLDER, *FOLDERS)
 
 
 def is_written(name: str) -> bool:
@@ -82,7 +69,7 @@ def made_output_folder(path: str | Path) -> Path:
     for name in WRITTEN:
         if "/" not in name:
             check_writable(path / name)
-    for inside in (path / name for name in INSIDE):
+    for inside in (path / name for name in FOLDERS):
         if inside.is_dir():
             check_writable(inside / CLEAN_LOG)
         elif os.path.lexists(inside):

@@ -62,8 +62,6 @@ EVIDENCE_FILE = "evidence.json"
 REPORT_FILE = "report.html"
 #: The contact sheet of the images in the output folder: what was found, and what was not.
 SEEN_SHEET = "seen.png"
-#: The pictures are in this folder of the output folder.
-PLOTS_FOLDER = "plots"
 
 
 def image_key(topic: str, stamp_ns: int) -> str:
