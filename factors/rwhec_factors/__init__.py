@@ -5,11 +5,21 @@ measured B = T_sensor_target. Tangents and covariances are GTSAM's, rotation fir
 1-vector s with t_B = s * (true length).
 """
 
-from rwhec_factors.batch import BatchResiduals, Linearization, robot_world_hand_eye_batch_factor
-from rwhec_factors.carrier_pose_variables import pose_robot_world_hand_eye_factor, two_pose_robot_world_hand_eye_factor
+from rwhec_factors.batch import (
+    BatchResiduals,
+    Linearization,
+    robot_world_hand_eye_batch_factor,
+    robot_world_hand_eye_effects_factor,
+    robot_world_hand_eye_effects_factors,
+)
 from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
-from rwhec_factors.hand_eye import hand_eye_factor, pose_hand_eye_factor
-from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor
+from rwhec_factors.measurement import (
+    hand_eye_factor,
+    pose_hand_eye_factor,
+    pose_robot_world_hand_eye_factor,
+    robot_world_hand_eye_factor,
+    two_pose_robot_world_hand_eye_factor,
+)
 from rwhec_factors.priors import (
     direction_prior_factor,
     dual_quaternion_prior_factor,
@@ -18,9 +28,8 @@ from rwhec_factors.priors import (
     position_along_prior_factor,
     position_prior_factor,
     rotation_prior_factor,
+    shifted_pose_prior_factor,
 )
-from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
-from rwhec_factors.with_effects import robot_world_hand_eye_effects_factor, robot_world_hand_eye_effects_factors
 
 __all__ = [
     "BatchResiduals",

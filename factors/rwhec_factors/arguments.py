@@ -1,4 +1,4 @@
-"""Checks of the factors' arguments: each refuses a bad argument with its name, its value and what to give."""
+"""Arguments and values, checked: an error names the argument or the key, its value, and what to give."""
 
 from __future__ import annotations
 
@@ -9,7 +9,47 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rwhec_factors.se3 import Array, stacked
-from rwhec_factors.values import name_of
+
+
+def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
+    """The Pose3 of a key. Raises KeyError if the key is missing, and TypeError if it holds another type."""
+    try:
+        return values.atPose3(key)
+    except RuntimeError as error:
+        raise _explained(values, key, f"{what}, a gtsam.Pose3", error) from error
+
+
+def number_of(values: gtsam.Values, key: int, what: str) -> float:
+    """The number in a key's 1-vector. Raises KeyError if the key is missing, and TypeError if it has another type."""
+    try:
+        vector = values.atVector(key)
+    except RuntimeError as error:
+        raise _explained(values, key, f"{what}, a 1-vector (numpy.array([...]), not a float)", error) from error
+    if vector.shape != (1,):
+        raise TypeError(f"{name_of(key)} should be {what}, a 1-vector; it is a vector of {len(vector)}")
+    return float(vector[0])
+
+
+def vector_of(values: gtsam.Values, key: int, dimension: int, what: str) -> Array:
+    """The vector of a key. Raises KeyError or TypeError like ``pose_of``, and TypeError for another length."""
+    try:
+        vector: Array = values.atVector(key)
+    except RuntimeError as error:
+        raise _explained(values, key, f"{what}, a {dimension}-vector", error) from error
+    if vector.shape != (dimension,):
+        raise TypeError(f"{name_of(key)} should be {what}, a {dimension}-vector; it is a vector of {len(vector)}")
+    return vector
+
+
+def name_of(key: int) -> str:
+    """A key as GTSAM prints it: "x3"."""
+    return str(gtsam.DefaultKeyFormatter(key))
+
+
+def _explained(values: gtsam.Values, key: int, what: str, error: RuntimeError) -> KeyError | TypeError:
+    if not values.exists(key):
+        return KeyError(f"{name_of(key)} is not in the values; it should be {what}")
+    return TypeError(f"{name_of(key)} should be {what}; it holds another type ({error})")
 
 
 def check_pose(pose: object, what: str) -> None:

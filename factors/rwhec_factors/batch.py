@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rwhec_factors import se3
-from rwhec_factors.arguments import check_keys, check_time_offset, checked_effect, checked_pairs, checked_twists
+from rwhec_factors.arguments import (
+    check_keys,
+    check_time_offset,
+    checked_effect,
+    checked_pairs,
+    checked_twists,
+    number_of,
+    pose_of,
+    vector_of,
+)
 from rwhec_factors.se3 import Array
-from rwhec_factors.values import number_of, pose_of, vector_of
 
 #: Some measurements, and their effects by key.
 Part = tuple[slice, Mapping[int, ArrayLike]]
@@ -251,3 +259,85 @@ def _whitening(sqrt_information: object, count: int) -> Array:
     if not (np.linalg.svd(root, compute_uv=False)[..., -1] > 0.0).all():
         raise ValueError("sqrt_information is singular: along some direction it holds no information; give full rank")
     return np.broadcast_to(root, (count, 6, 6))
+
+
+def robot_world_hand_eye_effects_factor(
+    target_key: int,
+    sensor_key: int,
+    A: Array,
+    B: Array,
+    sqrt_information: Array,
+    effects: Mapping[int, ArrayLike],
+    *,
+    scale_key: int | None = None,
+    time_offset_key: int | None = None,
+    twists: Array | None = None,
+) -> gtsam.CustomFactor:
+    """All measurements of one pair in one factor, with errors that are linear in further variables.
+
+    The residual of measurement n is Log(B_n^-1 S(Y^-1 A_n X)) - sum_k effects[k][n] x_k, S(R, t) = (R, scale t). What
+    several measurements have in common (the drift of a track, an error of the arm's kinematics, the noise of one A that
+    several sensors share) is an x_k; give it a prior, or tie it to its neighbours. The effects are of first order: take
+    the residual's derivatives near the answer (``BatchResiduals.linearize``).
+
+    Parameters
+    ----------
+    target_key, sensor_key, A, B, scale_key, time_offset_key, twists
+        As in ``robot_world_hand_eye_batch_factor``.
+    sqrt_information : (6, 6) or (N, 6, 6) array
+        W: W' W is the information of what is left of the residual, rotation first.
+    effects : dict of int to (N, 6, m) array
+        By the key of each x_k, an m-vector: the residual's derivative by it, with zeros for measurements that it does
+        not change. [rotation (rad), translation (m)] by the unit of x_k.
+
+    Returns
+    -------
+    gtsam.CustomFactor
+        6 N whitened rows with unit noise; keys in the order target, sensor, time offset, scale, effects.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the arrays' shapes do not agree, an effect is not finite, a weight is singular or not finite, or two keys are
+        equal.
+    """
+    (factor,) = factors_of_parts(
+        target_key, sensor_key, A, B, sqrt_information, [(slice(None), effects)], scale_key=scale_key,
+        time_offset_key=time_offset_key, twists=twists,
+    )  # fmt: skip
+    return factor
+
+
+def robot_world_hand_eye_effects_factors(
+    target_key: int,
+    sensor_key: int,
+    A: Array,
+    B: Array,
+    sqrt_information: Array,
+    parts: Sequence[Part],
+    *,
+    scale_key: int | None = None,
+    time_offset_key: int | None = None,
+    twists: Array | None = None,
+) -> list[gtsam.CustomFactor]:
+    """The measurements of one pair in several factors, each with effects of its own, evaluated at once.
+
+    For effects that belong to short times (drift), where one factor of all measurements would tie all of them together.
+    At each point the first of the factors that is asked computes the residuals of all.
+
+    Parameters
+    ----------
+    parts : sequence of (slice, dict of int to array)
+        Which measurements a factor has, and its effects by key: (n, 6, m) arrays for these n measurements.
+
+    The other parameters and the errors are those of ``robot_world_hand_eye_effects_factor``.
+
+    Returns
+    -------
+    list of gtsam.CustomFactor
+        One for each part.
+    """
+    return factors_of_parts(
+        target_key, sensor_key, A, B, sqrt_information, parts, scale_key=scale_key, time_offset_key=time_offset_key,
+        twists=twists,
+    )  # fmt: skip

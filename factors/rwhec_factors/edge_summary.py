@@ -17,9 +17,8 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rwhec_factors.arguments import check_keys, checked_pairs
+from rwhec_factors.arguments import check_keys, checked_pairs, number_of, pose_of
 from rwhec_factors.se3 import HATS, Array
-from rwhec_factors.values import number_of, pose_of
 
 #: This number of measurements is summed at once, which bounds the memory.
 BLOCK = 4096

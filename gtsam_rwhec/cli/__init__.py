@@ -1,9 +1,23 @@
 """The command ``gtsam-rwhec``. It parses, calls the library and prints.
 
-A subcommand is a module with the same name. The modules reach the library as any program does, by
-``import gtsam_rwhec as rw``: so a command imports only what it uses, and ``--help`` imports nothing.
+The modules reach the library as any program does, by ``import gtsam_rwhec as rw``: so a command imports only what it
+uses, and ``--help`` imports nothing.
 """
 
-from gtsam_rwhec.cli.app import main
+import sys
+
+from gtsam_rwhec.errors import MissingPackageError
+from gtsam_rwhec.files.optional_packages import extra_named
+
+
+def main() -> None:
+    """Run the command; without the extra ``cli`` it ends in the words that name it."""
+    try:
+        with extra_named():
+            from gtsam_rwhec.cli.app import main
+    except MissingPackageError as error:
+        sys.exit(f"Error: {error}")
+    main()
+
 
 __all__ = ["main"]

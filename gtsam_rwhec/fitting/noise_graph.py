@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from rwhec_factors.with_effects import robot_world_hand_eye_effects_factors
+from rwhec_factors.batch import robot_world_hand_eye_effects_factors
 
 from gtsam_rwhec.errors import NotConvergedWarning
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns

@@ -8,11 +8,9 @@ from typing import Any
 import gtsam
 import numpy as np
 from rwhec_factors.batch import robot_world_hand_eye_batch_factor
-from rwhec_factors.carrier_pose_variables import pose_robot_world_hand_eye_factor
 from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
-from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor
-from rwhec_factors.priors import position_prior_factor, rotation_prior_factor
-from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
+from rwhec_factors.measurement import pose_robot_world_hand_eye_factor, robot_world_hand_eye_factor
+from rwhec_factors.priors import position_prior_factor, rotation_prior_factor, shifted_pose_prior_factor
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.fitting.fit_options import ResidualKind, Robust
