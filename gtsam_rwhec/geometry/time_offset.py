@@ -549,6 +549,8 @@ def _check(best: RotationFit, others: list[RotationFit], cut: float, where: str,
     for other in others:
         if abs(other.offset_s - best.offset_s) < max(6.0 * best.sigma_s, 0.5 * GRID_S):
             continue
+        if abs(other.offset_s) > search_s + GRID_S:
+            continue  # a descent that left the search: few measurements overlap there, and the last digit sends it
         gain = np.minimum(other.squares, cut) - np.minimum(best.squares, cut)
         both = np.isfinite(gain)
         by_block = np.bincount(best.block[both], gain[both], BLOCKS)
