@@ -71,7 +71,7 @@ def speed(repetitions: int) -> list[Row]:
     """Times of "auto" and "sdp" against SCS on the same relaxation."""
     problem = real_problem("known")
     (part,) = parts_of(problem)
-    Q = PartForm.of(part).reduced.dense()
+    Q = PartForm.of(part).reduced.Q
     few = max(1, repetitions // 5)
     timed(problem, "auto")  # warms up
     auto = [timed(problem, "auto") for _ in range(repetitions)]

@@ -4,7 +4,8 @@
 
 Eight cameras that see one target, or one camera that sees eight targets: on the left the entries of Q', the cost with
 translations and scale eliminated. With many Y the elimination fills what was empty (vermillion); with many X it does
-not. This library keeps that fill as a product of few rows, so on the right both stars take time linear in the leaves.
+not. This library follows the graph of all variables where frames are many, so on the right both stars take time linear
+in the leaves.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from matplotlib.figure import Figure
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 
@@ -34,11 +34,12 @@ def star(leaves: int, side: str) -> rw.Problem:
 
 
 def draw_fill(axes: Axes, side: str) -> None:
-    """Entries of Q': there before the shared translations and the scale were eliminated, or filled by that."""
+    """Entries of Q': there before translations and the scale were eliminated, or filled by that."""
     (part,) = parts_of(star(8, side))
-    form = PartForm.of(part).reduced
-    before = np.abs(arrow.dense(form.D, form.C, form.E)) > 1e-9 * form.magnitude
-    after = np.abs(form.dense()) > 1e-9 * form.magnitude
+    forms = PartForm.of(part)
+    at = np.r_[(13 * np.arange(len(part.free))[:, None] + np.arange(4, 13)).ravel(), 13 * len(part.free) + 1]
+    before = np.abs(forms.full.dense()[np.ix_(at, at)]) > 1e-9 * forms.reduced.magnitude
+    after = np.abs(forms.reduced.Q) > 1e-9 * forms.reduced.magnitude
     picture = np.where(before, 1, np.where(after, 2, 0))
     axes.imshow(picture, cmap=ListedColormap(["white", BLUE, VERMILLION]), vmin=0, vmax=2, interpolation="nearest")
     borders = np.arange(9, len(picture), 9) - 0.5

@@ -31,11 +31,10 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
 from gtsam_rwhec.solver.answers import Answer, answer_of, rotations_as_variables, scales_of
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.search import MIRROR_COST, Search
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.start import unconstrained_start
+from gtsam_rwhec.solver.starts import mirrored, spectral_start, unconstrained_start
 
 #: So many Newton steps lead from a start to its optimum; three to ten are usual.
 MAX_DESCENT_STEPS = 50
@@ -114,7 +113,7 @@ def _solve(part: Part, previous: WeightedFit | None) -> Answer:
     """A part's answer: the lowest end of the descents, or its mirror image where only that has positive scales."""
     search = Search.of(part, SolveOptions())
     form = search.form
-    starts = search.whole.spectral_starts()
+    starts = spectral_start(part, search.whole.rotation)
     if previous is not None and all(name in previous.poses for name in part.free):
         before = np.array([previous.poses[name][:3, :3] for name in part.free]).reshape(-1, 3, 3)
         starts.append(rotations_as_variables(part, before))

@@ -18,8 +18,9 @@ from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.normal_equations import FREE, solve_scaled
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
-from gtsam_rwhec.problem.moments import Gauge, Moments, edge_forms
+from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.full_form import edge_forms
 from gtsam_rwhec.solver.parts import connected_components
 from gtsam_rwhec.solver.rotations import project
 
@@ -175,6 +176,6 @@ def plain_form(stack: Stack) -> Array:
     ones = np.ones(len(stack.A))
     moments = Moments.of(stack.A, stack.B, ones, ones, stack.gauge, False, "-".join([*stack.targets, *stack.sensors]))
     stacked = MomentStack.of([moments], [False])
-    translation, rotation = edge_forms(stacked.translation[:], stacked.rotation[:], stacked.kappa)
+    translation, rotation = edge_forms(stacked.translations(slice(None)), stacked.rotations(slice(None)), stacked.kappa)
     form: Array = translation[0] + rotation[0]
     return form

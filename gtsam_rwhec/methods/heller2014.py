@@ -72,7 +72,7 @@ def global_minimum(form: UnitForm, parameterisation: Parameterisation = "quatern
         certified = certified_rotations(form)
         R, cost, lower = certified.R, certified.cost, certified.lower_bound
     elif parameterisation == "quaternion":
-        relaxed = solve_moments(form.reduced.dense())
+        relaxed = solve_moments(form.reduced.Q)
         best = min((descend(form.reduced, start, STEPS) for start in relaxed.starts), key=lambda end: end.cost)
         R, cost, lower = best.R, best.cost, min(relaxed.lower_bound, best.cost)
     else:

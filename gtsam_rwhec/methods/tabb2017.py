@@ -71,7 +71,7 @@ def least(form: ReducedForm, R: Array, parameterisation: Parameterisation, max_i
             derivatives[9 * frame : 9 * frame + 9, k * frame : k * frame + k] = by_parameter[frame]
         return homogeneous(rotations), derivatives
 
-    found = descend_on_chart(form.dense(), point, to_parameters(R).ravel(), max_iterations)
+    found = descend_on_chart(form.Q, point, to_parameters(R).ravel(), max_iterations)
     return chart(found.reshape(n, k))[0]
 
 

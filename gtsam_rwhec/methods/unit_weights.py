@@ -18,7 +18,7 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.answers import answer_of
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
+from gtsam_rwhec.solver.reduced_form import ReducedForm
 
 #: The name of this cost in ``Estimate.proof``.
 COST = "J with all weights 1"
@@ -56,7 +56,7 @@ class UnitForm:
         """The form of the rotation residuals alone."""
         form = self.forms.rotation  # over [vec R] of each frame; the numbers before it, [t, s], have no residual here
         before = (13 - form.frames.shape[1], 0)
-        return reduce(
+        return ReducedForm.of(
             replace(
                 form,
                 frames=np.pad(form.frames, ((0, 0), before, before)),

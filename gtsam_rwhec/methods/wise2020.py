@@ -69,7 +69,7 @@ def wise2020(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 def certified_rotations(form: UnitForm) -> CertifiedRotations:
     """Solve the relaxation by Clarabel, descend from its rotations, and take the best of three lower bounds."""
     reduced = form.reduced
-    Q = reduced.dense()
+    Q = reduced.Q
     relaxation = solve_by_clarabel(Q, TOLERANCE, STEPS)
     ends = [descend(reduced, R, STEPS) for R in round_to_rotations(relaxation)]
     best = min(ends, key=lambda end: end.cost)

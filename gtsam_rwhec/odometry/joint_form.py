@@ -58,7 +58,7 @@ class JointForm:
     def _eliminated(self) -> tuple[Array, Array]:
         """The best translations and scales as a matrix times [vec R, 1], and the reduced form."""
         r, t = self._of_rotations, self._linear
-        (factor,), _ = generalised_inverse_factor(self.Q[np.ix_(t, t)][None])
+        factor, _ = generalised_inverse_factor(self.Q[np.ix_(t, t)])
         rows = factor.T @ self.Q[np.ix_(t, r)]
         reduced = self.Q[np.ix_(r, r)] - rows.T @ rows
         return -factor @ rows, 0.5 * (reduced + reduced.T)
@@ -66,19 +66,7 @@ class JointForm:
     @property
     def reduced(self) -> ReducedForm:
         """The form of the rotations alone, for the search."""
-        K = self.sensors
-        E = self._eliminated[1]
-        return ReducedForm(
-            D=np.zeros((0, 9, 9)),
-            C=np.zeros((0, 9, len(E))),
-            E=E,
-            G=np.zeros((0, 9 * K + 1)),
-            border_factor=np.zeros((1, 0)),
-            leaf_factor=np.zeros((0, 4, 4)),
-            leaf_rows=np.zeros((0, 4, 9 + len(E))),
-            border_null=np.zeros((1, 0)),
-            leaf_null=np.zeros((0, 4, 4)),
-        )
+        return ReducedForm.of_rotations(self._eliminated[1])
 
     def with_scales_near(self, scale: Array, share: float) -> JointForm:
         """The form with a row for each unknown scale (K,): off by ``share`` of it costs a half, as one deviation does.

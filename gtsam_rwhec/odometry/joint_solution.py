@@ -93,7 +93,7 @@ def _best(form: JointForm, starts: list[Array]) -> tuple[Descent, Array, JointCe
     y, certificate = _proven(form, best)
     if certificate.is_optimal or form.sensors > MAX_RELAXED:
         return best, y, certificate
-    relaxation = solve_by_blocks(reduced.dense(), 1e-9, 100)
+    relaxation = solve_by_blocks(reduced.Q, 1e-9, 100)
     ends = [descend(reduced, R, MAX_DESCENT) for R in round_to_rotations(relaxation)]
     best = min([best, *ends], key=lambda end: end.cost)
     more = stationary_multipliers(_gradient(reduced.apply(homogeneous(best.R))), best.R, relaxation.multipliers)
@@ -116,7 +116,7 @@ def _proven(form: JointForm, end: Descent) -> tuple[Array, JointCertificate]:
     first = _certified(form, end, multipliers)
     if first[1].is_optimal:
         return first
-    second = _certified(form, end, improve(reduced, end.R, multipliers)[0])
+    second = _certified(form, end, improve(reduced.Q, end.R, multipliers)[0])
     return max([first, second], key=lambda pair: pair[1].lower_bound)
 
 

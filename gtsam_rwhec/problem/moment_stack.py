@@ -173,51 +173,12 @@ I3 = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Matrices:
-    """A stack (E, n, n) that is made where it is asked for: ``stack[first:last]``, ``stack[:, rows, columns]``.
-
-    Ask for some pairs, or for some entries of all: all at once are 5 kB a pair.
-    """
-
-    stack: MomentStack
-    size: int
-
-    def __getitem__(self, key: object) -> Array:
-        pairs, *entries = key if isinstance(key, tuple) else (key,)
-        index = np.arange(len(self.stack.packed))[pairs]
-        chosen = (slice(None), *entries)
-        if np.ndim(index) == 0:
-            one: Array = self._of(np.atleast_1d(index))[chosen][0]
-            return one
-        if len(index) <= PAIRS_AT_ONCE:
-            few: Array = self._of(index)[chosen]
-            return few
-        several = [
-            self._of(index[first : first + PAIRS_AT_ONCE])[chosen] for first in range(0, len(index), PAIRS_AT_ONCE)
-        ]
-        return np.concatenate(several)
-
-    def __array__(self, dtype: object = None, copy: bool | None = None) -> Array:
-        return self[:]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(E, n, n)."""
-        return len(self.stack.packed), self.size, self.size
-
-    def _of(self, index: np.ndarray) -> Array:
-        return (
-            self.stack.translations(index) if self.size == 25 else self.stack.packed.rotation[index].reshape(-1, 9, 9)
-        )
-
-
-@dataclass(frozen=True)
 class MomentStack:
     """Moments of E pairs, about a gauge that is moved by ``a`` and ``c`` from that of the packed ones.
 
     ``motion`` (E,): whether both ends of a pair are the sensor's carrier. ``count``, ``kappa``, ``weight``,
-    ``operations``, ``deviation`` (E,), ``magnitude`` and ``feature_error`` (E, 25) are as in `Moments`; ``translation``
-    (E, 25, 25) and ``rotation`` (E, 9, 9) are made where they are asked for.
+    ``operations``, ``deviation`` (E,), ``magnitude`` and ``feature_error`` (E, 25) are as in `Moments`. Matrices of
+    some pairs are made where they are asked for: all at once are 5 kB a pair.
     """
 
     packed: PackedMoments
@@ -267,15 +228,9 @@ class MomentStack:
         error[:, T_A] = self.packed.feature_error[:]
         return self._by_shift(error)
 
-    @property
-    def translation(self) -> Matrices:
-        """(E, 25, 25): some pairs, or some entries."""
-        return Matrices(self, 25)
-
-    @property
-    def rotation(self) -> Matrices:
-        """(E, 9, 9): some pairs, or some entries."""
-        return Matrices(self, 9)
+    def rotations(self, index: np.ndarray | slice) -> Array:
+        """``rotation`` of some pairs (e, 9, 9)."""
+        return self.packed.rotation[index].reshape(-1, 9, 9)
 
     def translations(self, index: np.ndarray | slice) -> Array:
         """``translation`` of some pairs (e, 25, 25): t_A becomes t_A + R_A c - a, in rows and then in columns."""

@@ -31,8 +31,6 @@ UNEVEN = 8
 #: A congruence with a 25 x 25 matrix rounds each entry at most so many times.
 SHIFT_OPERATIONS = 54
 I3 = np.eye(3)
-I9 = np.eye(9)
-_UPPER = np.triu_indices(25, 1)
 
 
 @dataclass(frozen=True)
@@ -190,43 +188,3 @@ def shift_of(a: Array, c: Array) -> Array:
         shift[T_A, R_A][:, 3 * i : 3 * i + 3] = c[i] * I3
     shift[T_A, ONE] = -a
     return shift
-
-
-def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:
-    """Quadratic forms of E pairs over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (design fact 1; eqs. 24-33).
-
-    The moments are as in `MomentStack`; for the inverse equation ``translation`` is permuted by ``SWAPPED`` and
-    ``rotation`` transposed. x' form x is the pair's J_t and J_R (eq. 18), with the factor 1/2; each form (E, 25, 25).
-    """
-    G = translation
-    edges = len(G)
-    tX, tY, al, rX, rY = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)
-    weight = G[:, ONE, ONE, None, None]
-    Rt = G[:, R_A, ONE].reshape(edges, 3, 3)  # sum w R_A'
-    Q = np.zeros((edges, 25, 25))
-    # M_t = [R_A, -I, t_A, 0, -t_B' (x) I] (eq. 30); the upper triangle of sum w M_t' M_t:
-    Q[:, tX, tX] = weight * I3
-    Q[:, tX, tY] = -Rt
-    Q[:, tX, al] = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(edges, 3, 3, 3))
-    # -R_A' (t_B' (x) I): entry (i, 3 j + k) is -R_A[k, i] t_B[j]
-    Q[:, tX, rY] = -G[:, R_A, T_B].reshape(edges, 3, 3, 3).transpose(0, 1, 3, 2).reshape(edges, 3, 9)
-    Q[:, tY, tY] = weight * I3
-    Q[:, tY, al] = -G[:, T_A, ONE]
-    Q[:, tY, rY] = np.einsum("ej,ik->eijk", G[:, T_B, ONE], I3).reshape(edges, 3, 9)
-    Q[:, al, al] = np.einsum("ekk->e", G[:, T_A, T_A])
-    Q[:, al, rY] = -G[:, T_B, T_A].reshape(edges, 9)
-    Q[:, rY, rY] = np.einsum("ejl,ik->ejilk", G[:, T_B, T_B], I3).reshape(edges, 9, 9)
-    _mirror(Q)
-    P = np.zeros((edges, 25, 25))
-    # M_R = [I (x) R_A, -R_B' (x) I] (eq. 25); M_R' M_R has diagonal blocks kappa I, and -R_B' (x) R_A' off the
-    # diagonal.
-    P[:, rX, rX] = kappa[:, None, None] * I9
-    P[:, rY, rY] = kappa[:, None, None] * I9
-    cross = rotation.reshape(edges, 3, 3, 3, 3)  # [i, k, p, q] = sum kappa R_A[k, i] R_B[q, p]
-    P[:, rX, rY] = -cross.transpose(0, 3, 1, 4, 2).reshape(edges, 9, 9)
-    _mirror(P)
-    return 0.5 * Q, 0.5 * P
-
-
-def _mirror(Q: Array) -> None:
-    Q[:, _UPPER[1], _UPPER[0]] = Q[:, _UPPER[0], _UPPER[1]]

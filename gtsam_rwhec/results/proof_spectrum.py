@@ -88,15 +88,15 @@ def _spectrum(part: Part, solution: Solution, certificate: Certificate) -> dict[
     if not abs(evaluation.cost - certificate.cost) <= SAME_COST * certificate.cost + certificate.tolerance:
         return {"rows": rows, "why_not": OTHER}
     R = evaluation.point.rotations
-    x, Q = homogeneous(R), form.reduced.dense()
+    x, Q = homogeneous(R), form.reduced.Q
     multipliers = kkt_multipliers(R, (Q @ x)[:-1].reshape(-1, 9))
     if certificate.path.multipliers is Multipliers.ALL_CONSTRAINTS:
-        multipliers, _ = improve(form.reduced, R, multipliers)
+        multipliers, _ = improve(Q, R, multipliers)
     Z = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z = 0.5 * (Z + Z.T)
     Z[-1, -1] -= float(x @ Z @ x)  # the multiplier of h^2 = 1
     values = np.linalg.eigvalsh(Z)
     if not np.isfinite(values).all():
         return {"rows": rows, "why_not": "its entries overflow"}
-    rounding = rows * np.finfo(np.float64).eps * float(np.abs(np.diagonal(form.reduced.dense())).max())
+    rounding = rows * np.finfo(np.float64).eps * float(np.abs(np.diagonal(Q)).max())
     return {"rows": rows, "eigenvalues": tuple(values.tolist()), "rounding": max(rounding, 0.0)}

@@ -27,7 +27,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.answers import Residual
-from gtsam_rwhec.solver.free_directions import Identifiability, PairIdentifiability
+from gtsam_rwhec.solver.identification import Identifiability, PairIdentifiability
 from gtsam_rwhec.solver.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"

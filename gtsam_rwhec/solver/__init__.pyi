@@ -16,5 +16,5 @@ from .solution import SolvedPart as SolvedPart
 from .free_directions import FreeDirection as FreeDirection
 from .free_directions import FreeKind as FreeKind
 from .free_directions import FreeReason as FreeReason
-from .free_directions import Identifiability as Identifiability
-from .free_directions import PairIdentifiability as PairIdentifiability
+from .identification import Identifiability as Identifiability
+from .identification import PairIdentifiability as PairIdentifiability

@@ -102,8 +102,7 @@ class Answer:
 
 def answer_of(part: Part, form: SearchForm, R: Array) -> Answer:
     """The answer with the optimal translations and scales for given rotations of the form (eq. 47)."""
-    leaf, center, alpha = form.recover(homogeneous(R))
-    return answer_at(part, R, np.concatenate([leaf, center]), float(alpha[0]))
+    return answer_at(part, R, *form.recover(homogeneous(R)))
 
 
 def answer_at(part: Part, R: Array, numbers: Array, alpha: float) -> Answer:
@@ -240,7 +239,7 @@ def costs_of_pairs(part: Part, poses: PairPoses) -> tuple[Array, Array]:
         J_t[at] = 0.5 * ((linear @ G) * linear).sum(axis=(1, 2))
         # |R_A R_X|^2 + |R_Y R_B|^2 - 2 <R_A R_X, R_Y R_B>, with sum kappa R_A[k, i] R_B[q, p] at [i, k, p, q].
         squares = moments.kappa[at] * ((R_X**2).sum(axis=(1, 2)) + (R_Y**2).sum(axis=(1, 2)))
-        cross = moments.rotation[at].reshape(k, 3, 3, 3, 3)
+        cross = moments.rotations(at).reshape(k, 3, 3, 3, 3)
         J_R[at] = 0.5 * squares - np.einsum("ekp,ekp->e", np.einsum("eikpq,eip->ekq", cross, R_X), R_Y)
     return np.maximum(J_t, 0.0), np.maximum(J_R, 0.0)  # zero may round to a negative number
 

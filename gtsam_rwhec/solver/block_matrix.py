@@ -15,7 +15,6 @@ import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import UNIT
-from gtsam_rwhec.solver.arrow import backward_substitution, forward_substitution
 from gtsam_rwhec.solver.elimination import Elimination, Group
 
 #: So many numbers are worked on at once: 8 MB.
@@ -359,3 +358,26 @@ def _smaller(matrix: BlockMatrix, margin: Array | float) -> BlockMatrix:
     # The subtraction rounds by at most u times its result.
     reach = np.abs(diagonal) + np.abs(margin)
     return matrix.plus(-(margin + cholesky_allowance(matrix, reach) + 4.0 * UNIT * reach))
+
+
+def forward_substitution(lower: Array, right: Array) -> Array:
+    """Solve lower y = right for stacks (L, m, m) and (L, m, c): each row of all L systems at once."""
+    y = np.empty_like(right)
+    for i in range(lower.shape[1]):
+        row = right[:, i, :]
+        if i:
+            row = row - np.matmul(lower[:, i, None, :i], y[:, :i, :])[:, 0]
+        y[:, i, :] = row / lower[:, i, i, None]
+    return y
+
+
+def backward_substitution(lower: Array, right: Array) -> Array:
+    """Solve lower' y = right for stacks."""
+    y = np.empty_like(right)
+    m = lower.shape[1]
+    for i in reversed(range(m)):
+        row = right[:, i, :]
+        if i + 1 < m:
+            row = row - np.matmul(lower[:, i + 1 :, i][:, None, :], y[:, i + 1 :, :])[:, 0]
+        y[:, i, :] = row / lower[:, i, i, None]
+    return y

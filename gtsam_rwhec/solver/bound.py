@@ -38,7 +38,6 @@ from gtsam_rwhec.solver.null_vectors import NullVectors, free_vectors, point_as_
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.region import AT_LEAST, LARGER, Region, half_widths, smallest_region
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT, constraint_values
-from gtsam_rwhec.solver.weakest_rotation import smallest_eigenpair
 
 #: Margins of definiteness as parts of the form's diagonal: the largest that is proven costs least.
 ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -301,7 +300,9 @@ class _Lagrangian:
 
     def indefinite(self, enough: float) -> Bound:
         """Z has a negative eigenvalue: rotations are limited, so a slack on their entries costs a limited amount."""
-        smallest, direction = smallest_eigenpair(self.form.form, self.multipliers)
+        n = len(self.multipliers)
+        Lambda = (self.multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)[:, :9, :9]
+        smallest, direction = self.form.form.smallest_eigenpair(Lambda) if n else (0.0, np.zeros(0))
         slack = max(-1.01 * smallest, 4.0 * UNIT * self.form.form.magnitude)
         limit = 1e3 * self.form.form.magnitude
         # The first of slack, 3 slack, 9 slack, ... that is proven: by doubling of the exponent, then by halving.

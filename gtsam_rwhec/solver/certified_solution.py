@@ -26,8 +26,8 @@ from gtsam_rwhec.solver.answers import (
     scales_of,
 )
 from gtsam_rwhec.solver.certificate import Basis, Cause, Certificate, Objective
-from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind, FreeReason, Identifiability
-from gtsam_rwhec.solver.identification import identify
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.solver.identification import Identifiability, identify
 from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale
 from gtsam_rwhec.solver.parts import Part, connected_components, parts_of
 from gtsam_rwhec.solver.region import scale_ratio

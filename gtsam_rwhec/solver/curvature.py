@@ -19,8 +19,6 @@ from gtsam_rwhec.solver.block_matrix import (
     is_proven_to_exceed,
     proof_that_it_exceeds,
 )
-from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
 
 #: A variable that is held has this many times its own diagonal entry added.
@@ -35,20 +33,20 @@ SPARSE_NULLS = 24
 
 @dataclass(frozen=True)
 class Curvature:
-    """Z over [leaves (13 L), centers (13 P), alpha], and what dominates its rounding."""
+    """Z over the frames (13 each) and alpha, and what dominates its rounding."""
 
     matrix: BlockMatrix
     rounding: Array
     is_coupled_to_h: bool  #: whether Q has linear terms
 
     @staticmethod
-    def of(form: FullForm, order: Elimination, rounding: Array | None = None) -> Curvature:
+    def of(form: BlockMatrix, rounding: Array | None = None) -> Curvature:
         """Q of a form; without ``rounding`` (13 n + 1,), of the form exactly as it is stored."""
         frames = form.frames
         coupled = form.tails[:, :, 1].any() or form.tail[0, 1] != 0.0
         if rounding is None:
             rounding = np.zeros(13 * len(frames) + 1)
-        matrix = BlockMatrix(order, frames, form.couplings, form.tails[:, :, :1], form.tail[:1, :1])
+        matrix = replace(form, tails=form.tails[:, :, :1], tail=form.tail[:1, :1])
         return Curvature(matrix, rounding, bool(coupled))._without_absent()
 
     def _without_absent(self) -> Curvature:

@@ -16,86 +16,29 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma, gammas
-from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B, edge_forms
-from gtsam_rwhec.solver.block_matrix import sum_into
+from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B
+from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
+from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.parts import Part
 
-#: Positions among an edge's 28 numbers: leaf (13), center (13), alpha, h.
-ALPHA, H = 26, 27
+#: Positions among a pair's 28 numbers: target (13), sensor (13), alpha, h.
+SIDES, ALPHA, H = (slice(0, 13), slice(13, 26)), 26, 27
 #: The forms of so many pairs are made at once: a few megabytes.
 PAIRS_AT_ONCE = 256
-
-
-@dataclass(frozen=True)
-class FullForm:
-    """Blocks of Q over n frames (leaves, then centers), their couplings, and the tail, [alpha, h].
-
-    frames (n, m, m), symmetric; tails (n, m, 2); tail (2, 2). The coupling of leaf ``rows[k]`` and center
-    ``columns[k]`` is ``couplings[k]`` (F, m, m); each pair of frames is there once. m is 13, or 9 for rotations alone.
-    """
-
-    frames: Array
-    tails: Array
-    tail: Array
-    rows: np.ndarray
-    columns: np.ndarray
-    couplings: Array
-    leaves: int
-
-    @property
-    def centers(self) -> int:
-        """Number of centers."""
-        return len(self.frames) - self.leaves
-
-    @property
-    def leaf(self) -> Array:
-        """(L, m, m)."""
-        return self.frames[: self.leaves]
-
-    @property
-    def center(self) -> Array:
-        """(P, m, m)."""
-        return self.frames[self.leaves :]
-
-    @property
-    def leaf_tail(self) -> Array:
-        """(L, m, 2)."""
-        return self.tails[: self.leaves]
-
-    @property
-    def center_tail(self) -> Array:
-        """(P, m, 2)."""
-        return self.tails[self.leaves :]
-
-    @property
-    def leaf_center(self) -> Array:
-        """All couplings, also those that are zero: (L, P, m, m), for small parts."""
-        m = self.frames.shape[1]
-        result = np.zeros((self.leaves, self.centers, m, m))
-        result[self.rows, self.columns] = self.couplings
-        return result
-
-    def value(self, leaf: Array, center: Array, tail: Array) -> float:
-        """x' Q x for leaf (L, 13), center (P, 13), tail (2,); in extended precision, as large terms cancel."""
-        frames = np.concatenate([leaf, center]).astype(np.longdouble)
-        tail = tail.astype(np.longdouble)
-        own = (frames * np.einsum("nij,nj->ni", self.frames, frames)).sum()
-        of_tail = (frames * (self.tails @ tail)).sum()
-        first, second = frames[self.rows], frames[self.leaves + self.columns]
-        coupled = (first * np.einsum("fij,fj->fi", self.couplings, second)).sum()
-        return float(own + 2.0 * (of_tail + coupled) + tail @ self.tail @ tail)
+_I3, _I9 = np.eye(3), np.eye(9)
+_UPPER = np.triu_indices(25, 1)
 
 
 @dataclass(frozen=True)
 class Slots:
     """What the variables of each pair are in the form.
 
-    ``leaf`` and ``center`` (E,) are indices, one past the last where there is none. The 25 variables of a pair come
-    from the numbers of its leaf (13) and center (13), alpha and h, by ``matrices``.
+    ``frames`` (E, 2) are the free frames of target and sensor, by their places, one past the last where there is none;
+    a motion has its sensor alone. The 25 variables of a pair come from the 28 numbers of these frames (13 each), alpha
+    and h, by ``matrices``.
     """
 
-    leaf: np.ndarray
-    center: np.ndarray
+    frames: np.ndarray
     #: (E, 2): where the numbers of target and sensor begin among the 28, 0 or 13; -1 for a fixed frame.
     first: np.ndarray
     #: (E, 2): the row of ``poses`` for fixed frames, and else -1.
@@ -146,27 +89,25 @@ class Slots:
             sets.append((members, source))
         return sets
 
-    @property
-    def of_pair(self) -> Array:
-        """The matrices of all pairs, (E, 25, 28)."""
-        return self.matrices()
 
+def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
+    """Q of a part, and the form of its rotation residuals over [vec R] alone; both with the priors.
 
-def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
-    """Q of a part, and the form of its rotation residuals over [vec R] alone; both with the priors."""
-    L, n, E = len(part.leaves), len(part.free), len(part.pairs)
-    coupled = (slots.leaf < L) & (slots.center < n - L)
+    A block has 13 numbers for each frame, and 9 in the second form; the tail is [alpha, h].
+    """
+    n, E = len(part.free), len(part.pairs)
+    coupled = (slots.frames < n).all(axis=1)
     where = np.cumsum(coupled) - 1
-    rows, columns = slots.leaf[coupled], slots.center[coupled]
-    couplings = np.zeros((len(rows), 13, 13))
+    order = Elimination.of(n, *slots.frames[coupled].T)
+    couplings = np.zeros((int(coupled.sum()), 13, 13))
     # The residuals of translations have no rotation of the front pose: rotations are coupled by their own alone.
     forms = [
-        FullForm(np.zeros((n, m, m)), np.zeros((n, m, 2)), np.zeros((2, 2)), rows, columns, couplings[:, -m:, -m:], L)
+        BlockMatrix(order, np.zeros((n, m, m)), couplings[:, -m:, -m:], np.zeros((n, m, 2)), np.zeros((2, 2)))
         for m in (13, 9)
     ]
     for begin in range(0, E, PAIRS_AT_ONCE):
         at = slice(begin, begin + PAIRS_AT_ONCE)
-        translation, rotation = part.moments.translation[at], part.moments.rotation[at]
+        translation, rotation = part.moments.translations(at), part.moments.rotations(at)
         if part.kind == "inverse":
             translation = translation[:, SWAPPED[:, None], SWAPPED]
             rotation = rotation.transpose(0, 2, 1)
@@ -175,12 +116,12 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
         of_both += of_rotations
         for members, source in slots.alike(at):
             pairs = begin + members
-            leaf, center, has_both = slots.leaf[pairs], L + slots.center[pairs], coupled[pairs]
+            frames, has_both = slots.frames[pairs], coupled[pairs]
             for form, of_edges in zip(forms, (of_both, of_rotations), strict=True):
                 m = form.frames.shape[1]
                 if m == 9 and source is not None:  # kappa / 2 |R_A R_X|^2, and the same of R_Y R_B
                     half = 0.5 * np.tile(part.moments.kappa[pairs], 2)
-                    sums = np.bincount(np.concatenate([leaf, center]), half, minlength=n)
+                    sums = np.bincount(frames.T.ravel(), half, minlength=n)
                     np.einsum("nii->ni", form.frames)[...] += sums[:, None]
                     continue
                 own = of_edges if len(members) == len(of_edges) else of_edges[members]
@@ -190,7 +131,8 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
                 else:
                     numbers = _Numbers(own, source)
                 one, two, tail = np.arange(13 - m, 13), np.arange(26 - m, 26), np.arange(26, 28)
-                for index, has, side in ((leaf, leaf < L, one), (center, center < n, two)):
+                for index, side in zip(frames.T, (one, two), strict=True):
+                    has = index < n
                     sum_into(form.frames, index[has], numbers.block(side, side)[has])
                     sum_into(form.tails, index[has], numbers.block(side, tail)[has])
                 if m == 13:
@@ -231,13 +173,11 @@ def slots_of(part: Part) -> Slots:
     (its translation times alpha, where t is alpha times the translation); a known scale becomes h; both ends of a
     motion are one frame.
     """
-    L, P = len(part.leaves), len(part.centers)
-    index = np.where(part.ends < L + P, part.ends, -1)
-    fixed = np.where(part.ends < L + P, -1, part.ends - L - P)
-    is_leaf = (index >= 0) & (index < L)
-    leaf = np.where(is_leaf, index, -1).max(axis=1, initial=-1)
-    center = np.where(index >= L, index - L, -1).max(axis=1, initial=-1)
-    first = np.where(index < 0, -1, np.where(is_leaf, 0, 13))
+    n, motion = len(part.free), part.moments.motion[:, None]
+    is_free = part.ends < n
+    frames = np.where(is_free & ~(motion & [True, False]), part.ends, n)
+    fixed = np.where(is_free, -1, part.ends - n)
+    first = np.where(is_free, np.where(motion, 13, [0, 13]), -1)
     poses = np.empty((len(part.fixed), 12))
     for i, T in enumerate(part.fixed.values()):
         variable = as_variable(T, part)
@@ -253,14 +193,7 @@ def slots_of(part: Part) -> Slots:
         scale = np.array([1.0 / of_target.get(target, 1.0) for target, _ in part.pairs])
         scale[owns] = 1.0
     return Slots(
-        np.where(leaf < 0, L, leaf),
-        np.where(center < 0, P, center),
-        first,
-        fixed,
-        poses,
-        ALPHA if part.kind == "direct" and part.scale == "shared" else H,
-        scale_at,
-        scale,
+        frames, first, fixed, poses, ALPHA if part.kind == "direct" and part.scale == "shared" else H, scale_at, scale
     )
 
 
@@ -281,7 +214,7 @@ def _make_symmetric(blocks: Array) -> None:
         some[...] = 0.5 * (some + some.transpose(0, 2, 1))
 
 
-def _add_priors(form: FullForm, part: Part) -> None:
+def _add_priors(form: BlockMatrix, part: Part) -> None:
     """Add kappa |R - R_0|_F^2 / 2 and |t - t_0|^2 / (2 sigma^2), quadratic once multiplied by h (design fact 11)."""
     place = {name: i for i, name in enumerate(part.free)}
     used = slice(13 - form.frames.shape[1], 13)
@@ -350,8 +283,7 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
     # Sums over the pairs of a frame come on top of the sums over their measurements; a shared scale has all pairs.
     meeting = np.full(len(part.pairs), len(part.pairs))
     if part.scale != "shared":
-        frames = np.stack([slots.leaf, len(part.leaves) + slots.center])
-        meeting = np.bincount(frames.ravel())[frames].sum(axis=0)
+        meeting = np.bincount(slots.frames.ravel())[slots.frames].sum(axis=1)
     operations = moments.operations + 2 * meeting + 20
     unit = gammas(operations)
     # g m m' + m e' + e m' + e e' <= g m m' + (c m + e / c)(c m + e / c)' for any c up to 1.
@@ -369,15 +301,51 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
 
 
 def rounding_of(part: Part, slots: Slots) -> Array:
-    """What rounding did to Q, as a diagonal (13 n + 1,) over [leaves, centers, alpha] that dominates it."""
-    L, n = len(part.leaves), len(part.free)
+    """What rounding did to Q, as a diagonal (13 n + 1,) over [frames, alpha] that dominates it."""
+    n = len(part.free)
     result, of_pairs = np.zeros((n, 13)), _rounding_of_pairs(part, slots)
     of_alpha = 0.0
     for begin in range(0, len(of_pairs), PAIRS_AT_ONCE):
         at = slice(begin, begin + PAIRS_AT_ONCE)
         of_slots = np.einsum("ep,epq->eq", of_pairs[at], slots.matrices(at) ** 2)
-        leaf, center = slots.leaf[at], L + slots.center[at]
-        for index, has, side in ((leaf, leaf < L, slice(0, 13)), (center, center < n, slice(13, 26))):
-            sum_into(result, index[has], of_slots[has, side])
+        for index, side in zip(slots.frames[at].T, SIDES, strict=True):
+            sum_into(result, index[index < n], of_slots[index < n, side])
         of_alpha += float(of_slots[:, ALPHA].sum())
     return np.append(result.ravel(), of_alpha)
+
+
+def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:
+    """Quadratic forms of E pairs over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (design fact 1; eqs. 24-33).
+
+    The moments are as in `MomentStack`; for the inverse equation ``translation`` is permuted by ``SWAPPED`` and
+    ``rotation`` transposed. x' form x is the pair's J_t and J_R (eq. 18), with the factor 1/2; each form (E, 25, 25).
+    """
+    G = translation
+    edges = len(G)
+    tX, tY, al, rX, rY = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)
+    weight = G[:, ONE, ONE, None, None]
+    Rt = G[:, R_A, ONE].reshape(edges, 3, 3)  # sum w R_A'
+    Q = np.zeros((edges, 25, 25))
+    # M_t = [R_A, -I, t_A, 0, -t_B' (x) I] (eq. 30); the upper triangle of sum w M_t' M_t:
+    Q[:, tX, tX] = weight * _I3
+    Q[:, tX, tY] = -Rt
+    Q[:, tX, al] = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(edges, 3, 3, 3))
+    # -R_A' (t_B' (x) I): entry (i, 3 j + k) is -R_A[k, i] t_B[j]
+    Q[:, tX, rY] = -G[:, R_A, T_B].reshape(edges, 3, 3, 3).transpose(0, 1, 3, 2).reshape(edges, 3, 9)
+    Q[:, tY, tY] = weight * _I3
+    Q[:, tY, al] = -G[:, T_A, ONE]
+    Q[:, tY, rY] = np.einsum("ej,ik->eijk", G[:, T_B, ONE], _I3).reshape(edges, 3, 9)
+    Q[:, al, al] = np.einsum("ekk->e", G[:, T_A, T_A])
+    Q[:, al, rY] = -G[:, T_B, T_A].reshape(edges, 9)
+    Q[:, rY, rY] = np.einsum("ejl,ik->ejilk", G[:, T_B, T_B], _I3).reshape(edges, 9, 9)
+    P = np.zeros((edges, 25, 25))
+    # M_R = [I (x) R_A, -R_B' (x) I] (eq. 25); M_R' M_R has diagonal blocks kappa I, and -R_B' (x) R_A' off the
+    # diagonal.
+    P[:, rX, rX] = kappa[:, None, None] * _I9
+    P[:, rY, rY] = kappa[:, None, None] * _I9
+    cross = rotation.reshape(edges, 3, 3, 3, 3)  # [i, k, p, q] = sum kappa R_A[k, i] R_B[q, p]
+    P[:, rX, rY] = -cross.transpose(0, 3, 1, 4, 2).reshape(edges, 9, 9)
+    for form in (Q, P):
+        form[:, _UPPER[1], _UPPER[0]] = form[:, _UPPER[0], _UPPER[1]]
+        form *= 0.5
+    return Q, P

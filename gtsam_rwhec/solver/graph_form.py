@@ -8,64 +8,61 @@ translations and scales together, whose Schur complement it is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
-from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.full_form import FullForm
-from gtsam_rwhec.solver.rotations import unvec
+from gtsam_rwhec.solver.reduced_form import ABSENT, RANK_TOLERANCE
+from gtsam_rwhec.solver.rotations import tangent_curvature
 
-#: With a unit diagonal, a smaller pivot of the eliminated block is rounding error: a direction is free.
-RANK_TOLERANCE = 1e-12
-#: Then this part of the diagonal is added, which changes costs by its square.
+#: Where a pivot of the eliminated block is rounding error, a direction is free. Then this part of the diagonal is
+#: added, which changes costs by its square.
 DAMPING = 1e-11
-#: This is the square of the rounding of a zero: a variable with a smaller diagonal, relative to the largest, is absent.
-ABSENT = 1e-26
-_I3 = np.eye(3)
+#: Steps of Lanczos for the smallest eigenvalue, which the search for a bound then corrects.
+LANCZOS_STEPS = 80
 
 
 @dataclass(frozen=True)
 class GraphForm:
-    """Q' as a product; ``whole`` is Q over 13 numbers a frame and the tail [alpha, h]."""
+    """Q' as a product; ``full`` is Q over 13 numbers a frame and the tail [alpha, h]."""
 
-    whole: BlockMatrix
-    leaves: int
+    full: BlockMatrix
     translations: BlockFactor
     #: (4 n + 1,): what was added to the diagonal of Q_tt before it was factored.
     added: Array
-    #: (4 n + 1,): translations and scales that the problem does not have.
-    absent: np.ndarray
+    #: (4 n + 1,): the part of it that pulls scales to 1 where the measurements may leave them free.
+    pull: Array
 
     @staticmethod
-    def of(form: FullForm, order: Elimination, *, has_scales: bool) -> GraphForm | None:
-        """The form that follows a graph; None where the measurements leave a scale free, or moments are not finite.
+    def of(full: BlockMatrix) -> GraphForm | None:
+        """The form that follows a graph; None where Q_tt has no factor.
 
-        Free translations cost nothing: they stay near the gauge's origin. A free scale has to be 1 (`reduced_form`).
+        Free translations stay near the gauge's origin, free scales near 1, and those that the problem does not have
+        are 1.
         """
-        frames = form.frames
-        whole = BlockMatrix(order, frames, form.couplings, form.tails, form.tail)
-        tt = BlockMatrix(order, frames[:, :4, :4], form.couplings[:, :4, :4], form.tails[:, :4, :1], form.tail[:1, :1])
+        frames, n = full.frames, len(full.frames)
+        tt = BlockMatrix(
+            full.order, frames[:, :4, :4], full.couplings[:, :4, :4], full.tails[:, :4, :1], full.tail[:1, :1]
+        )
         diagonal = tt.diagonal
-        if not np.isfinite(diagonal).all():
-            return None
         absent = diagonal <= ABSENT * diagonal.max(initial=0.0)
-        added = np.where(absent, 1.0, 0.0)
-        factor = tt.plus(added).factor()
-        if factor is None or not (factor.pivots**2 > RANK_TOLERANCE * (diagonal + added)).all():
-            if has_scales:
-                return None
-            added = np.where(absent, 1.0, DAMPING * diagonal)
+        is_scale = np.append(np.tile([False, False, False, True], n), True)
+        for damping in (0.0, DAMPING):
+            added = np.where(absent, 1.0, damping * diagonal)
             factor = tt.plus(added).factor()
-        return None if factor is None else GraphForm(whole, form.leaves, factor, added, absent)
+            if damping or (factor is not None and (factor.pivots**2 > RANK_TOLERANCE * (diagonal + added)).all()):
+                break
+        return None if factor is None else GraphForm(full, factor, added, np.where(is_scale, added, 0.0))
 
     @property
     def rotations(self) -> int:
         """Number of free frames."""
-        return len(self.whole.frames)
+        return len(self.full.frames)
 
     @property
     def size(self) -> int:
@@ -75,73 +72,98 @@ class GraphForm:
     @cached_property
     def magnitude(self) -> float:
         """A scale for costs: the sum of the diagonal is about the cost of a grossly wrong answer."""
-        return float(np.einsum("nii->", self.whole.frames[:, 4:, 4:]) + self.whole.tail[1, 1])
+        return float(np.einsum("nii->", self.full.frames[:, 4:, 4:]) + self.full.tail[1, 1])
 
     def apply(self, x: Array) -> Array:
-        """Q' x for x = [vec R_1, ..., vec R_n, h]."""
+        """Q' x."""
         return self._solved(x)[1]
 
-    def recover(self, x: Array) -> tuple[Array, Array, Array]:
-        """Translations and scales of the optimum given the rotations (eq. 47): leaf (L, 4), center (P, 4), alpha.
-
-        The four numbers are [t, own scale]; scales that the problem does not have are 1.
-        """
+    def recover(self, x: Array) -> tuple[Array, float]:
+        """[t, own scale] of each frame (n, 4), and alpha, of the optimum given the rotations (eq. 47)."""
         w = self._solved(x)[0]
-        w[self.absent & ~np.append(np.tile([True, True, True, False], self.rotations), False)] = 1.0
-        frames = w[:-1].reshape(-1, 4)
-        return frames[: self.leaves], frames[self.leaves :], w[-1:]
+        return w[:-1].reshape(-1, 4), float(w[-1])
 
     def _solved(self, x: Array) -> tuple[Array, Array]:
         """The best translations and scales (4 n + 1,) for x, and Q' x."""
         n = self.rotations
         numbers = np.zeros((n, 13))
         numbers[:, 4:] = x[:-1].reshape(n, 9)
-        product = self.whole.times(np.r_[numbers.ravel(), 0.0, x[-1]])
+        product = self.full.times(np.r_[numbers.ravel(), 0.0, x[-1]])
         by_frame = product[:-2].reshape(n, 13)
-        w = -self.translations.solve_vector(np.append(by_frame[:, :4].ravel(), product[-2]))
+        right = np.append(by_frame[:, :4].ravel(), product[-2]) - x[-1] * self.pull
+        w = -self.translations.solve_vector(right)
         numbers[:, 4:] = 0.0
         numbers[:, :4] = w[:-1].reshape(n, 4)
-        rest = self.whole.times(np.r_[numbers.ravel(), w[-1], 0.0])
+        rest = self.full.times(np.r_[numbers.ravel(), w[-1], 0.0])
         by_frame = by_frame + rest[:-2].reshape(n, 13)
         return w, np.append(by_frame[:, 4:].ravel(), product[-1] + rest[-1])
 
-    def without_h(self) -> BlockMatrix:
-        """Q over the numbers of the frames and alpha, with what makes Q_tt definite."""
+    def _without_h(self, of_rotations: float = 0.0) -> BlockMatrix:
+        """Q over the numbers of the frames and alpha, with what makes Q_tt definite, and more for rotations."""
         n = self.rotations
-        whole = replace(self.whole, tails=self.whole.tails[:, :, :1], tail=self.whole.tail[:1, :1])
-        added = np.zeros((n, 13))
+        matrix = replace(self.full, tails=self.full.tails[:, :, :1], tail=self.full.tail[:1, :1])
+        added = np.full((n, 13), of_rotations)
         added[:, :4] = self.added[:-1].reshape(n, 4)
-        return whole.plus(np.append(added.ravel(), self.added[-1]))
+        return matrix.plus(np.append(added.ravel(), self.added[-1]))
 
-    def hessian(self, R: Array, basis: Array, q: Array) -> GraphHessian:
-        """Half the Hessian at R (n, 3, 3), with its tangents' basis (n, 9, 3) and q = Q' x."""
+    def newton(self, R: Array, basis: Array, q: Array) -> Callable[[Array, float], Array | None]:
+        """Newton's step, as that of `ReducedForm`: over [t, own scale, tangent] (7) of each frame, and alpha."""
         n = self.rotations
-        M = unvec(q[:-1]).transpose(0, 2, 1) @ R
-        curvature = 0.5 * (M + M.transpose(0, 2, 1)) - np.einsum("nii->n", M)[:, None, None] * _I3
         T = np.zeros((n, 13, 7))
         T[:, :4, :4] = np.eye(4)
         T[:, 4:, 4:] = basis
-        joint = self.without_h().congruent(T)
-        joint.frames[:, 4:, 4:] += curvature
-        return GraphHessian(joint)
+        joint = self._without_h().congruent(T)
+        joint.frames[:, 4:, 4:] += tangent_curvature(R, q)
 
+        def step(gradient: Array, damping: float) -> Array | None:
+            damped = np.append(np.tile(np.repeat([0.0, damping], [4, 3]), n), 0.0)
+            factor = (joint.plus(damped) if damping else joint).factor()
+            if factor is None:
+                return None
+            right = np.zeros((n, 7))
+            right[:, 4:] = gradient
+            return -factor.solve_vector(np.append(right.ravel(), 0.0))[:-1].reshape(n, 7)[:, 4:]
 
-@dataclass(frozen=True)
-class GraphHessian:
-    """Half the Hessian over translation, scale and tangent of each frame, and alpha: [t, s, w] (7) a frame."""
+        return step
 
-    joint: BlockMatrix
-
-    def step(self, gradient: Array, damping: float) -> Array | None:
-        """Newton's step in the rotations (n, 3) for half the gradient (n, 3); None where it is not definite."""
-        n = len(gradient)
-        joint = self.joint
-        if damping:
-            joint = joint.plus(np.append(np.tile(np.r_[np.zeros(4), np.full(3, damping)], n), 0.0))
-        factor = joint.factor()
+    def solver(self, shift: float) -> Callable[[Array], Array] | None:
+        """Solve with Q' + shift I, without h, for vectors (9 n,); None where it is not positive definite."""
+        n, factor = self.rotations, self._without_h(shift).factor()
         if factor is None:
             return None
-        right = np.zeros((n, 7))
-        right[:, 4:] = gradient
-        step: Array = -factor.solve_vector(np.append(right.ravel(), 0.0))[:-1].reshape(n, 7)[:, 4:]
-        return step
+
+        def solved(right: Array) -> Array:
+            numbers = np.zeros((n, 13))
+            numbers[:, 4:] = right.reshape(n, 9)
+            return factor.solve_vector(np.append(numbers.ravel(), 0.0))[:-1].reshape(n, 13)[:, 4:].ravel()
+
+        return solved
+
+    def smallest_eigenpair(self, Lambda: Array) -> tuple[float, Array]:
+        """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,): an upper bound, and near it.
+
+        Lambda (n, 9, 9). By Lanczos' method with full orthogonalisation.
+        """
+        n = self.rotations
+        size = 9 * n
+        steps = min(LANCZOS_STEPS, size)
+        basis = np.zeros((steps, size))
+        diagonal, beside = np.zeros(steps), np.zeros(steps)
+        v = np.random.default_rng(0).standard_normal(size)
+        v /= np.linalg.norm(v)
+        for k in range(steps):
+            basis[k] = v
+            product = self.apply(np.append(v, 0.0))[:-1] - np.matmul(Lambda, v.reshape(n, 9, 1)).ravel()
+            diagonal[k] = float(v @ product)
+            for _ in range(2):  # twice is enough (Parlett 1998, section 6.9)
+                product -= basis[: k + 1].T @ (basis[: k + 1] @ product)
+            beside[k] = float(np.linalg.norm(product))
+            if beside[k] <= 1e-12 * self.magnitude:
+                steps = k + 1
+                break
+            v = product / beside[k]
+        values, vectors = scipy.linalg.eigh_tridiagonal(
+            diagonal[:steps], beside[: steps - 1], select="i", select_range=(0, 0)
+        )
+        vector: Array = basis[:steps].T @ vectors[:, 0]
+        return float(values[0]), vector / np.linalg.norm(vector)

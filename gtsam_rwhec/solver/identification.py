@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.moments import T_B
 from gtsam_rwhec.solver.answers import PairPoses
 from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.free_directions import (
-    FreeDirection,
-    FreeReason,
-    Identifiability,
-    LaterVerdicts,
-    PairIdentifiability,
-    free_directions_of,
-    reason_for,
-    sparse_basis,
-)
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_directions_of, reason_for, sparse_basis
 from gtsam_rwhec.solver.information import (
     IS_ROTATION,
     PairInformation,
@@ -41,6 +34,92 @@ from gtsam_rwhec.solver.noise_bounds import (
 )
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.weak_directions import ROUNDING, Weak, unit_of, weakest
+
+#: So many pairs are tested at once.
+TESTED_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class PairIdentifiability:
+    """What one pair determines alone.
+
+    Attributes
+    ----------
+    is_unique : bool
+    free_directions : tuple of FreeDirection
+    rotation_axes : int
+        Number of axes about which its motion turned: 0, 1, or 2 for two and more (Corollary 2).
+    number_of_measurements : int
+    weakest : float
+        Information of the weakest direction, in units of the information that noise alone would create.
+    threshold : float
+        Up to this value of ``weakest`` the direction is free.
+    """
+
+    is_unique: bool
+    free_directions: tuple[FreeDirection, ...]
+    rotation_axes: int
+    number_of_measurements: int
+    weakest: float
+    threshold: float
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a problem's measurements determine. ``str()`` is a sentence about the pairs and the whole problem.
+
+    Attributes
+    ----------
+    is_unique : bool
+        Whether every frame and scale is determined.
+    free_directions : tuple of FreeDirection
+        They span all that is free.
+    weakest, threshold : float
+        As in ``PairIdentifiability``, for the whole problem.
+    pairs : mapping of (target, sensor) to PairIdentifiability
+        Each pair alone: the grid of the paper's Figure 8; tested when it is asked for.
+    parts : tuple of tuple of str
+        Frames of each unconnected part.
+    """
+
+    is_unique: bool
+    free_directions: tuple[FreeDirection, ...]
+    weakest: float
+    threshold: float
+    pairs: Mapping[Pair, PairIdentifiability]
+    parts: tuple[tuple[str, ...], ...]
+
+    @staticmethod
+    def merged(results: list[Identifiability], components: tuple[tuple[str, ...], ...]) -> Identifiability:
+        """One result for parts that were solved separately."""
+        weakest = min(results, key=lambda r: r.weakest / max(r.threshold, 1e-300))
+        return Identifiability(
+            is_unique=all(r.is_unique for r in results),
+            free_directions=tuple(direction for r in results for direction in r.free_directions),
+            weakest=weakest.weakest,
+            threshold=weakest.threshold,
+            pairs=PairVerdicts(
+                [alone for r in results if isinstance(r.pairs, PairVerdicts) for alone in r.pairs.parts]
+            ),
+            parts=components,
+        )
+
+    def __str__(self) -> str:
+        alone = sum(pair.is_unique for pair in self.pairs.values())
+        if not self.is_unique:
+            number = len(self.free_directions)
+            return f"The measurements leave {number} direction{'s' if number > 1 else ''} free; see free_directions."
+        if len(self.pairs) == 1:
+            return "The pair's measurements determine both of its frames."
+        if alone:
+            number = len(self.pairs)
+            if alone == number:
+                which = f"Each of the {number} pairs determines its own frames"
+            else:
+                own = "determines its own frames" if alone == 1 else "determine their own frames"
+                which = f"{alone} of {number} pairs {own}, and the other pairs connect the rest to them"
+            return f"{which}, so every frame is determined (RWHEC paper, Theorem 3)."
+        return "No pair determines its frames on its own; together the pairs determine every frame."
 
 
 def typical_length(part: Part) -> float:
@@ -109,6 +188,8 @@ class PairsAlone:
             np.maximum.at(best, np.minimum(side, n), key)
         return {name: self.reason(int(best[i]) % E) for i, name in enumerate(self.free)}
 
+    @one_blas_thread()
+    @np.errstate(all="ignore")
     def verdicts(self, at: slice = slice(None)) -> dict[Pair, PairIdentifiability]:
         """Test some pairs, each alone, in the way the whole problem is tested."""
         info, noise = self.information, self.noise
@@ -127,28 +208,32 @@ class PairsAlone:
         of_rest = np.where(settled[:, 0] & (self.scale == "known"), spare, with_translations)
         other, threshold = of_rest != spare, of_turning.copy()
         threshold[other] = free_threshold(squares[other], fitted[other], of_rest[other])
-        result = {}
+        free = rest <= threshold[:, None]
+        ends, axes = self.ends[at] < len(self.free), self.axes[at]
+        # Corollary 4: a pair that turns about one axis leaves a direction free.
+        open_ = np.flatnonzero(~free.any(axis=1) & (axes < 2) & ends.all(axis=1))
+        free[open_, rest[open_].argmin(axis=1)] = True
+        # The weaker of the tests counts: of rotations, where they are determined, and of the rest.
+        weakest, limit = rest.min(axis=1), threshold.copy()
+        of_rotations = turning.min(axis=1)
+        by_rotations = settled[:, 0] & (of_rotations * limit < weakest * of_turning)
+        weakest[by_rotations], limit[by_rotations] = of_rotations[by_rotations], of_turning[by_rotations]
         begin = at.indices(len(self.pairs))[0]
-        for i, pair in enumerate(self.pairs[at]):
-            e = begin + i
-            free = np.less_equal(rest[i], threshold[i])
-            ends = {name: 7 * end for end, name in enumerate(pair) if self.ends[e, end] < len(self.free)}
-            if not free.any() and self.axes[e] < 2 and len(ends) == 2:
-                free[rest[i].argmin()] = True  # Corollary 4: a pair that turns about one axis leaves a direction free
-            directions_free: tuple[FreeDirection, ...] = ()
-            if free.any():
-                rows = [first + k for first in ends.values() for k in range(7)] + [14]
-                basis = sparse_basis(directions[i][rows][:, free], self.length)
-                reasons = dict.fromkeys(ends, self.reason(e))
-                directions_free = free_directions_of(tuple(ends), basis, self.length, reasons)
-            tests = [(float(rest[i].min()), float(threshold[i]))]
-            if settled[i, 0]:
-                tests.append((float(turning[i].min()), float(of_turning[i])))
-            least, up_to = min(tests, key=lambda test: test[0] / test[1])
-            result[pair] = PairIdentifiability(
-                not free.any(), directions_free, int(self.axes[e]), int(counts[i]), least, up_to
-            )
-        return result
+        found = {
+            e: self._free_directions(begin + e, directions[e][:, free[e]]) for e in np.flatnonzero(free.any(axis=1))
+        }
+        each = zip(self.pairs[at], axes.tolist(), counts.tolist(), weakest.tolist(), limit.tolist(), strict=True)
+        return {
+            pair: PairIdentifiability(e not in found, found.get(e, ()), turned, count, least, up_to)
+            for e, (pair, turned, count, least, up_to) in enumerate(each)
+        }
+
+    def _free_directions(self, e: int, directions: Array) -> tuple[FreeDirection, ...]:
+        """The records of a pair's free directions (15, k)."""
+        ends = {name: 7 * end for end, name in enumerate(self.pairs[e]) if self.ends[e, end] < len(self.free)}
+        rows = [first + k for first in ends.values() for k in range(7)] + [14]
+        reasons = dict.fromkeys(ends, self.reason(e))
+        return free_directions_of(tuple(ends), sparse_basis(directions[rows], self.length), self.length, reasons)
 
 
 def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
@@ -164,8 +249,40 @@ def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array
     return np.where(foreign, np.inf, values), vectors * unit[:, :, None]
 
 
-#: The pairs of larger parts are tested one by one where their verdicts are asked for: 80,000 take seconds.
-AT_ONCE = 2000
+class PairVerdicts(Mapping[Pair, PairIdentifiability]):
+    """What each pair determines alone, tested when it is asked for, some pairs at a time: a mapping like a dict.
+
+    A copy, and what is pickled, is a dict with all verdicts.
+    """
+
+    def __init__(self, parts: Sequence[PairsAlone]) -> None:
+        self.parts = tuple(parts)
+        self._known: dict[Pair, PairIdentifiability] = {}
+
+    @cached_property
+    def _place(self) -> dict[Pair, tuple[PairsAlone, int]]:
+        return {pair: (part, e) for part in self.parts for e, pair in enumerate(part.pairs)}
+
+    def __getitem__(self, pair: Pair) -> PairIdentifiability:
+        if pair not in self._known:
+            part, e = self._place[pair]
+            begin = e - e % TESTED_AT_ONCE
+            self._known |= part.verdicts(slice(begin, begin + TESTED_AT_ONCE))
+        return self._known[pair]
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self._place)
+
+    def __len__(self) -> int:
+        return len(self._place)
+
+    def __eq__(self, other: object) -> bool:
+        return dict(self) == (dict(other) if isinstance(other, Mapping) else other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[type[dict[Pair, PairIdentifiability]], tuple[dict[Pair, PairIdentifiability]]]:
+        return dict, (dict(self),)
 
 
 def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array, order: Elimination | None = None) -> Identifiability:
@@ -198,7 +315,7 @@ def identify_with_basis(
         free_directions=free,
         weakest=float(weak.values[0]) if len(weak.values) else np.inf,
         threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
-        pairs=alone.verdicts() if len(part.pairs) <= AT_ONCE else LaterVerdicts((part.pairs,), (alone,)),
+        pairs=PairVerdicts([alone]),
         parts=(part.names,),
     )
     return known, basis

@@ -26,7 +26,7 @@ from gtsam_rwhec.geometry.rounding import Doubled, difference, gamma, product, r
 from gtsam_rwhec.problem.knowledge import Prior
 from gtsam_rwhec.solver.answers import Action, Answer, Evaluation, Point, as_point
 from gtsam_rwhec.solver.block_matrix import sum_into
-from gtsam_rwhec.solver.full_form import ALPHA, Slots, rounding_of_fixed
+from gtsam_rwhec.solver.full_form import ALPHA, SIDES, Slots, rounding_of_fixed
 from gtsam_rwhec.solver.parts import Given, Part
 from gtsam_rwhec.solver.residual_sums import Coefficients, Measured, Sums, plain_sums, weighted_sums
 
@@ -270,13 +270,12 @@ class MeasuredForm:
         """The coefficients of directions V (13 n + 1, D) about the gauge; with h = 1, of values of the variables."""
         part = self.part
         a, c = (each[at] for each in self._centres)
-        leaf, center, S = self.slots.leaf[at], self.slots.center[at], self.slots.matrices(at)
-        L, P = len(part.leaves), len(part.centers)
-        D = V.shape[1]
-        leaves = np.concatenate([V[: 13 * L].reshape(L, 13, D), np.zeros((1, 13, D))])
-        centers = np.concatenate([V[13 * L : -1].reshape(P, 13, D), np.zeros((1, 13, D))])
+        (target, sensor), S, D = self.slots.frames[at].T, self.slots.matrices(at), V.shape[1]
+        frames = np.concatenate([V[:-1].reshape(-1, 13, D), np.zeros((1, 13, D))])
         tail = np.stack([V[-1], np.full(D, h)])
-        x = np.matmul(S, np.concatenate([leaves[leaf], centers[center], np.broadcast_to(tail, (len(S), 2, D))], axis=1))
+        x = np.matmul(
+            S, np.concatenate([frames[target], frames[sensor], np.broadcast_to(tail, (len(S), 2, D))], axis=1)
+        )
         x = x.transpose(0, 2, 1)  # (E, D, 25)
         R_1, R_2 = (x[:, :, at : at + 9].reshape(-1, D, 3, 3).transpose(0, 1, 3, 2) for at in (7, 16))
         t_1, t_2, s = Doubled.of(x[:, :, 0:3].copy()), Doubled.of(x[:, :, 3:6].copy()), Doubled.of(x[:, :, 6].copy())
@@ -376,10 +375,9 @@ class MeasuredForm:
 
     def _by_variables(self, sums: Sums, directions: range, at_pairs: slice) -> tuple[Array, Array]:
         """The sums over features as Q V (13 n + 1, D) by variables, with a bound on its error: the chain rule."""
-        leaf, center = self.slots.leaf[at_pairs], self.slots.center[at_pairs]
         S = self.slots.matrices(at_pairs)
-        L, n, E = len(self.part.leaves), len(self.part.free), len(self.part.pairs)
-        k, size, D = len(leaf), 13 * n + 1, len(directions)
+        n, E = len(self.part.free), len(self.part.pairs)
+        k, size, D = len(S), 13 * n + 1, len(directions)
         result, bound = np.zeros((size, D)), np.zeros((size, D))
         for d in directions:
             at = slice(12 * d, 12 * d + 12)
@@ -393,8 +391,8 @@ class MeasuredForm:
             slack[:, ALPHA] += 0.5 * np.einsum("esk,esk->e", of_fixed, np.abs(value[:, :6]).reshape(k, 2, 3))
             for of_pairs, out in ((shares, result), (slack, bound)):
                 frames = np.zeros((n, 13))
-                for index, has, side in ((leaf, leaf < L, slice(0, 13)), (L + center, L + center < n, slice(13, 26))):
-                    sum_into(frames, index[has], of_pairs[has, side])
+                for index, side in zip(self.slots.frames[at_pairs].T, SIDES, strict=True):
+                    sum_into(frames, index[index < n], of_pairs[index < n, side])
                 out[:, d] = np.append(frames.ravel(), of_pairs[:, ALPHA].sum())
         return result, bound * (1.0 + 1e-9)
 

@@ -29,13 +29,13 @@ MAX_FRAMES = 8
 
 def scale_row(form: ReducedForm) -> Array:
     """The row (9 n,) with best scale alpha = row . r, for homogeneous forms (eq. 47)."""
-    row: Array = -(form.border_factor[-1] @ form.G)[:-1]
+    row: Array = -(form.factor[-1] @ form.G)[:-1]
     return row
 
 
 def scale_spread(form: ReducedForm) -> float:
     """s: a scale that is d away from the best scale costs d^2 / s more."""
-    return float(form.border_factor[-1] @ form.border_factor[-1])
+    return float(form.factor[-1] @ form.factor[-1])
 
 
 def run_with_nonnegative_scale(search: Search) -> Found:
@@ -57,11 +57,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     options, form = search.options, search.whole.reduced
     with search.stages.of("semidefinite relaxation"):
         relaxation = solve_with_scale(
-            form.dense(),
-            scale_row(form),
-            scale_spread(form),
-            options.relaxation_tolerance,
-            options.max_relaxation_iterations,
+            form.Q, scale_row(form), scale_spread(form), options.relaxation_tolerance, options.max_relaxation_iterations
         )
     with search.stages.of("descent"):
         starts = round_to_rotations(relaxation) + search.random_starts(options.random_starts)
@@ -100,9 +96,10 @@ def run_with_nonnegative_scale(search: Search) -> Found:
 
 
 def without_scale(form: ReducedForm) -> ReducedForm:
-    """Q' with the scale held at zero: the row of G from the elimination of the scale is taken out."""
-    of_scale = form.border_factor[-1] / np.linalg.norm(form.border_factor[-1])
-    return dataclasses.replace(form, G=form.G - np.outer(of_scale, of_scale @ form.G))
+    """Q' with the scale held at zero: what the elimination of the scale took off is there again."""
+    of_scale = form.factor[-1] / np.linalg.norm(form.factor[-1])
+    row = of_scale @ form.G
+    return dataclasses.replace(form, Q=form.Q + np.outer(row, row), G=form.G - np.outer(of_scale, row))
 
 
 def _descend(form: ReducedForm, starts: list[Array], max_iterations: int) -> list[Descent]:
@@ -113,8 +110,7 @@ def _descend(form: ReducedForm, starts: list[Array], max_iterations: int) -> lis
 def _bounds(search: Search, relaxation: Relaxation, at_zero: Array, positive: Array | None) -> list[Bound]:
     """Bounds from the relaxation's multipliers, about the best answer, and about the best point of scale zero."""
     whole, form = search.whole, search.whole.reduced
-    leaf, center, _ = without_scale(form).recover(homogeneous(at_zero))
-    numbers = np.c_[np.concatenate([leaf, center]), vec(at_zero)]
+    numbers = np.c_[without_scale(form).recover(homogeneous(at_zero))[0], vec(at_zero)]
     zero = whole.cost.at(Point(numbers, 0.0))
     # At scale zero the multiplier of the scale is the slope of the cost.
     of_slope = max(2.0 * float(zero.gradient[-1]), 0.0)

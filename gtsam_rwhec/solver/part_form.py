@@ -9,24 +9,20 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.answers import Answer, Evaluation, Form, answer_at, answer_of, as_point
+from gtsam_rwhec.solver.block_matrix import BlockMatrix
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.descent import SearchForm
-from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, rounding_of, slots_of
+from gtsam_rwhec.solver.full_form import Slots, full_forms, rounding_of, slots_of
 from gtsam_rwhec.solver.graph_form import GraphForm
-from gtsam_rwhec.solver.graph_start import graph_spectral_start
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.polish import is_worth_a_step, newton_step
-from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
+from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import project, unvec
-from gtsam_rwhec.solver.start import spectral_start
 from gtsam_rwhec.solver.stored_form import StoredForm
 
-#: An arrow of fewer numbers is quick enough.
-SMALL_ARROW = 4_000_000
-#: The graph is followed where it makes no more numbers than this many times those of the arrow.
-AS_LARGE = 1.2
+#: Up to so many frames Q' is one matrix for the search.
+DENSE_FRAMES = 40
 #: Newton steps that follow the elimination; one is usual with extreme weights, and none without.
 STEPS = 6
 
@@ -37,8 +33,8 @@ class PartForm:
 
     part: Part
     slots: Slots
-    full: FullForm
-    rotation: FullForm
+    full: BlockMatrix
+    rotation: BlockMatrix
 
     @staticmethod
     def of(part: Part) -> PartForm:
@@ -47,40 +43,21 @@ class PartForm:
         return PartForm(part, slots, *full_forms(part, slots))
 
     @cached_property
-    def order(self) -> Elimination:
-        """The order in which frames are eliminated where their graph is followed."""
-        full = self.full
-        return Elimination.of(len(full.frames), full.rows, full.leaves + full.columns)
-
-    @cached_property
     def reduced(self) -> ReducedForm:
-        """Translations and scales eliminated, as an arrow: for all that needs Q' as a matrix."""
-        return reduce(self.full)
+        """Translations and scales eliminated, for all that needs Q' as a matrix."""
+        return ReducedForm.of(self.full)
 
     @cached_property
     def form(self) -> SearchForm:
-        """Where the search looks for answers: Q' as an arrow, or by the graph where that is much smaller."""
-        full, order = self.full, self.order
-        arrow = full.leaves * 13 * (13 * full.centers + 2) + (13 * full.centers + 2) ** 2
-        by_graph = 169 * len(order.first) + (13 * len(order.rest)) ** 2
-        found = None
-        if arrow > SMALL_ARROW and by_graph < arrow * AS_LARGE:
-            found = GraphForm.of(full, order, has_scales=self.part.scale != "known")
-        return found or self.reduced
-
-    def spectral_starts(self) -> list[Array]:
-        """Rotations (n, 3, 3) to begin a descent with, as the form has them."""
-        if isinstance(self.form, GraphForm):
-            return graph_spectral_start(self.part, self.rotation, self.order) or [
-                np.tile(np.eye(3), (len(self.part.free), 1, 1))
-            ]
-        return spectral_start(self.part, self.rotation)
+        """Where the search looks for answers: Q' as a matrix, or by the graph where frames are many."""
+        by_graph = GraphForm.of(self.full) if len(self.part.free) > DENSE_FRAMES else None
+        return by_graph or self.reduced
 
     @cached_property
     def curvature(self) -> Curvature:
         """Q without h, with what dominates its rounding."""
         rounding = None if self.part.given is None else rounding_of(self.part, self.slots)
-        return Curvature.of(self.full, self.order, rounding)
+        return Curvature.of(self.full, rounding)
 
     @cached_property
     def cost(self) -> Form:

@@ -81,8 +81,7 @@ FAR = 100.0
 class Part:
     """One connected part of a problem, about its own gauge."""
 
-    leaves: tuple[str, ...]  #: free frames of the larger side; leaves have pairs with centers only
-    centers: tuple[str, ...]  #: the other free frames
+    free: tuple[str, ...]  #: the frames whose poses are unknown, targets first: the order of all their numbers
     targets: tuple[str, ...]  #: all of the part, fixed ones too
     sensors: tuple[str, ...]  #: all of the part, fixed ones too
     pairs: tuple[Pair, ...]  #: the pairs that join the frames
@@ -95,11 +94,6 @@ class Part:
     scale: ScaleMode
     is_relative: bool  #: whether all weights are 1, so that costs have no statistical meaning
     given: Given | None  #: the raw measurements, fixed frames and priors; None where measurements were not kept
-
-    @property
-    def free(self) -> tuple[str, ...]:
-        """Free frames in the order of the rotations: leaves, then centers."""
-        return self.leaves + self.centers
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -202,10 +196,8 @@ def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...]) -> Part:
         problem.scale == "shared" and any(p.sigma is not None for beliefs in priors.values() for p in beliefs)
     )
     shift = {name: gauge.target_carrier for name in targets} | {name: gauge.sensor_carrier for name in sensors}
-    leaves, centers = _sides(targets, sensors, pairs, problem.fixed)
     part = Part(
-        leaves=leaves,
-        centers=centers,
+        free=tuple(name for name in targets + sensors if name not in problem.fixed),
         targets=targets,
         sensors=sensors,
         pairs=pairs,
@@ -250,18 +242,6 @@ def _moved(T: Array, origin: Array) -> Array:
     moved = T.copy()
     moved[:3, 3] -= origin
     return moved
-
-
-def _sides(
-    targets: tuple[str, ...], sensors: tuple[str, ...], pairs: tuple[Pair, ...], fixed: dict[str, Array]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Leaves and centers: the larger side is eliminated first, without frames that have motions of their own only."""
-    paired = {name for pair in pairs if not pair.is_motion for name in pair}
-    free_targets = tuple(name for name in targets if name not in fixed)
-    free_sensors = tuple(name for name in sensors if name not in fixed)
-    smaller, larger = sorted((free_sensors, free_targets), key=len)
-    leaves = tuple(name for name in larger if name in paired)
-    return leaves, smaller + tuple(name for name in larger if name not in paired)
 
 
 def _check(part: Part) -> None:

@@ -1,20 +1,21 @@
 """The reduced form Q' (RWHEC paper eq. 48): translations and scales eliminated, rotations and h left.
 
-x = [vec R of the leaves, vec R of the centers, h]. Each leaf's own translation is eliminated first, which keeps the
-arrow shape. The centers' translations and the shared scale couple everything: their elimination subtracts a product of
-few rows, Q' = arrow(D, C, E) - G'G. The time grows linearly with the leaves, whether they are targets or sensors.
+x = [vec R of each frame, h], with h the homogenising entry. Q' is one dense matrix: for parts with few frames, and
+for all that needs it as a matrix (small dual, relaxation). The search of larger parts follows the graph (`graph_form`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.full_form import FullForm
+from gtsam_rwhec.solver.block_matrix import BlockMatrix
+from gtsam_rwhec.solver.rotations import tangent_curvature
 
 #: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding error. The pseudo-inverse of eq. 48
 #: leaves its direction out.
@@ -22,167 +23,139 @@ RANK_TOLERANCE = 1e-12
 #: A variable with a smaller diagonal, relative to the largest, is absent. This is the square of the rounding of a zero,
 #: and it is far below any ratio of weights.
 ABSENT = 1e-26
+#: A null direction moves a scale where the scale has more than this part of its length.
+MOVES = 1e-6
 
 
 @dataclass(frozen=True)
 class ReducedForm:
-    """Q' = arrow(D, C, E) - G'G over x = [leaves (9 L), centers (9 P), h (1)], and the way back to translations.
+    """Q' (9 n + 1, 9 n + 1), exactly symmetric, and the way back to translations and scales.
 
-    D (L, 9, 9) and E (9 P + 1, 9 P + 1), exactly symmetric, C (L, 9, 9 P + 1), G (k, 9 L + 9 P + 1). The factors and
-    rows give the eliminated variables; the null vectors are the translations and scales that no measurement
-    determines, at any rotations.
+    The best [t, own scale] of each frame and alpha are -factor (G x), (4 n + 1,). ``null`` (4 n + 1, m) has the
+    directions of them that no measurement determines, at any rotations.
     """
 
-    D: Array
-    C: Array
-    E: Array
+    Q: Array
     G: Array
-    border_factor: Array
-    leaf_factor: Array
-    leaf_rows: Array
-    border_null: Array
-    leaf_null: Array
+    factor: Array
+    null: Array
 
-    @property
-    def leaves(self) -> int:
-        """Number of leaves."""
-        return len(self.D)
+    @staticmethod
+    def of(full: BlockMatrix) -> ReducedForm:
+        """Eliminate translations and scales from Q, 13 numbers a frame and the tail [alpha, h]."""
+        n, Q = len(full.frames), full.dense()
+        at = 13 * np.arange(n)[:, None]
+        inner = np.append(at + np.arange(4), 13 * n)
+        outer = np.append(at + np.arange(4, 13), 13 * n + 1)
+        factor, null = generalised_inverse_factor(Q[inner[:, None], inner])
+        G = factor.T @ Q[inner[:, None], outer]
+        reduced = Q[outer[:, None], outer] - G.T @ G
+        return ReducedForm(0.5 * (reduced + reduced.T), G, factor, null)
+
+    @staticmethod
+    def of_rotations(Q: Array) -> ReducedForm:
+        """A form that has no translations and no scales."""
+        n = (len(Q) - 1) // 9
+        return ReducedForm(Q, np.zeros((0, len(Q))), np.zeros((4 * n + 1, 0)), np.zeros((4 * n + 1, 0)))
 
     @property
     def rotations(self) -> int:
         """Number of free frames."""
-        return len(self.D) + (len(self.E) - 1) // 9
+        return (len(self.Q) - 1) // 9
 
     @property
     def size(self) -> int:
         """9 n + 1."""
-        return 9 * self.rotations + 1
-
-    @cached_property
-    def wide(self) -> Array:
-        """C as one matrix (9 L, 9 P + 1)."""
-        return arrow.flat(self.C)
-
-    @cached_property
-    def G_leaf(self) -> Array:
-        """G's columns of the leaves, (k, L, 9)."""
-        return self.G[:, : 9 * self.leaves].reshape(len(self.G), self.leaves, 9)
-
-    @cached_property
-    def G_border(self) -> Array:
-        """G's columns of the centers and h."""
-        return self.G[:, 9 * self.leaves :]
+        return len(self.Q)
 
     @cached_property
     def magnitude(self) -> float:
         """A scale for costs: the sum of the diagonal is about the cost of a grossly wrong answer."""
-        return float(np.einsum("lii->", self.D) + np.trace(self.E))
+        return float(np.trace(self.Q) + (self.G**2).sum())
+
+    @cached_property
+    def _blocks(self) -> Array:
+        """Q' without h as blocks (n, n, 9, 9)."""
+        n = self.rotations
+        return np.ascontiguousarray(self.Q[:-1, :-1].reshape(n, 9, n, 9).transpose(0, 2, 1, 3))
 
     def apply(self, x: Array) -> Array:
         """Q' x."""
-        split = 9 * self.leaves
-        leaf, border = x[:split], x[split:]
-        result = np.empty_like(x)
-        result[:split] = np.matmul(self.D, leaf.reshape(-1, 9, 1)).ravel() + self.wide @ border
-        result[split:] = self.wide.T @ leaf + self.E @ border
-        result -= self.G.T @ (self.G @ x)
-        return result
+        return self.Q @ x
 
-    def dense(self) -> Array:
-        """Q' as one array; for small problems and for the semidefinite relaxation."""
-        full = arrow.dense(self.D, self.C, self.E) - self.G.T @ self.G
-        symmetric: Array = 0.5 * (full + full.T)
-        return symmetric
+    def recover(self, x: Array) -> tuple[Array, float]:
+        """[t, own scale] of each frame (n, 4), and alpha, of the optimum given the rotations (eq. 47).
 
-    def recover(self, x: Array) -> tuple[Array, Array, Array]:
-        """Translations and scales of the optimum given the rotations (eq. 47): leaf (L, 4), center (P, 4), alpha.
-
-        The four numbers are [t, own scale]. Where the measurements leave a scale free, the pseudo-inverse may choose
-        zero, which is not a valid scale. Then the scale becomes 1, and the translations follow at the same cost.
+        Where the measurements leave a scale free, the pseudo-inverse may choose zero, which is not a valid scale. Then
+        the scale becomes 1, and the translations follow at the same cost.
         """
-        split = 9 * self.leaves
-        w = -self.border_factor @ (self.G @ x)
-        scales = np.r_[3 : len(w) : 4, len(w) - 1]
-        w += _toward_unit_scale(w, self.border_null, scales)
-        absent = ~(self.border_factor[scales].any(axis=1) | self.border_null[scales].any(axis=1))
-        w[scales[absent]] = 1.0  # nothing depends on it
-        border = np.concatenate([w, x[split:]])
-        inner = np.concatenate([x[:split].reshape(-1, 9), np.broadcast_to(border, (self.leaves, len(border)))], axis=1)
-        leaf = -np.matmul(self.leaf_factor, np.matmul(self.leaf_rows, inner[:, :, None]))[:, :, 0]
-        leaf[~(self.leaf_factor[:, 3].any(axis=1) | self.leaf_null[:, 3].any(axis=1)), 3] = 1.0
-        for i in np.flatnonzero(self.leaf_null[:, 3].any(axis=1)):
-            leaf[i] += _toward_unit_scale(leaf[i], self.leaf_null[i], np.array([3]))
-        return leaf, w[:-1].reshape(-1, 4), w[-1:]
+        w = -self.factor @ (self.G @ x)
+        scales = np.append(np.arange(3, len(w), 4), len(w) - 1)
+        along = self.null[scales]
+        is_open = (np.abs(along) > MOVES * np.linalg.norm(self.null, axis=0)).any(axis=1)
+        if is_open.any():
+            w += self.null @ np.linalg.lstsq(along[is_open], 1.0 - w[scales][is_open], rcond=1e-9)[0]
+        is_absent = ~(self.factor[scales].any(axis=1) | along.any(axis=1))
+        w[scales[is_absent]] = 1.0  # nothing depends on it
+        return w[:-1].reshape(-1, 4), float(w[-1])
 
+    def newton(self, R: Array, basis: Array, q: Array) -> Callable[[Array, float], Array | None]:
+        """Newton's step (n, 3) as a function of half the gradient (n, 3) and of a damping.
 
-def reduce(form: FullForm) -> ReducedForm:
-    """Eliminate translations and scales from Q (eq. 48)."""
-    L, P = form.leaves, form.centers
-    w = 4 * P + 1
-    b = w + 9 * P + 1
-    # The border's order: [t, s of the centers], alpha, [vec R of the centers], h.
-    leaf_center = form.leaf_center
-    leaf_border = np.empty((L, 13, b))
-    leaf_border[:, :, : 4 * P] = leaf_center[..., :4].transpose(0, 2, 1, 3).reshape(L, 13, 4 * P)
-    leaf_border[:, :, 4 * P] = form.leaf_tail[..., 0]
-    leaf_border[:, :, w : b - 1] = leaf_center[..., 4:].transpose(0, 2, 1, 3).reshape(L, 13, 9 * P)
-    leaf_border[:, :, b - 1] = form.leaf_tail[..., 1]
-    E = np.zeros((b, b))
-    for p in range(P):
-        at = np.r_[4 * p : 4 * p + 4, w + 9 * p : w + 9 * p + 9]
-        E[at[:, None], at] = form.center[p]
-        E[at, w - 1] = E[w - 1, at] = form.center_tail[p, :, 0]
-        E[at, b - 1] = E[b - 1, at] = form.center_tail[p, :, 1]
-    corner = [w - 1, b - 1]
-    E[np.ix_(corner, corner)] += form.tail
+        At R (n, 3, 3), with its tangents' basis (n, 9, 3) and q = Q' x. The step is None where the Hessian is not
+        positive definite.
+        """
+        n = self.rotations
+        blocks = basis.transpose(0, 2, 1)[:, None] @ self._blocks @ basis
+        blocks[np.arange(n), np.arange(n)] += tangent_curvature(R, q)
+        hessian = blocks.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
-    leaf_factor, leaf_null = generalised_inverse_factor(form.leaf[:, :4, :4])
-    own = np.concatenate([form.leaf[:, :4, 4:], leaf_border[:, :4]], axis=2)
-    rows = np.matmul(leaf_factor.transpose(0, 2, 1), own)  # (L, 4, 9 + b)
-    to_self, to_border = rows[:, :, :9], rows[:, :, 9:]
-    D = form.leaf[:, 4:, 4:] - np.matmul(to_self.transpose(0, 2, 1), to_self)
-    C = leaf_border[:, 4:] - np.matmul(to_self.transpose(0, 2, 1), to_border)
-    flat = arrow.flat(to_border)
-    E -= flat.T @ flat
+        def step(gradient: Array, damping: float) -> Array | None:
+            damped = hessian + damping * np.eye(3 * n) if damping else hessian
+            lower, failed = scipy.linalg.lapack.dpotrf(damped, lower=1)
+            if failed or not np.isfinite(np.diagonal(lower)).all():
+                return None
+            solved: Array = scipy.linalg.lapack.dpotrs(lower, gradient.ravel(), lower=1)[0]
+            return -solved.reshape(n, 3)
 
-    (factor,), (null,) = generalised_inverse_factor(E[None, :w, :w])
-    factor = factor[:, np.abs(factor).max(axis=0) > 0.0]
-    null = null[:, np.abs(null).max(axis=0) > 0.0]
-    G = np.empty((factor.shape[1], 9 * L + b - w))
-    G[:, : 9 * L] = np.matmul(C[:, :, :w], factor).reshape(9 * L, factor.shape[1]).T
-    G[:, 9 * L :] = factor.T @ E[:w, w:]
-    # Exactly symmetric: a factorisation reads one triangle, and its proof must be about the form as it is evaluated.
-    symmetric = 0.5 * (E[w:, w:] + E[w:, w:].T)
-    D = 0.5 * (D + D.transpose(0, 2, 1))
-    return ReducedForm(D, np.ascontiguousarray(C[:, :, w:]), symmetric, G, factor, leaf_factor, rows, null, leaf_null)
+        return step
+
+    def solver(self, shift: float) -> Callable[[Array], Array] | None:
+        """Solve with Q' + shift I, without h, for vectors (9 n,); None where it is not positive definite."""
+        lower, failed = scipy.linalg.lapack.dpotrf(self.Q[:-1, :-1] + shift * np.eye(self.size - 1), lower=1)
+        if failed:
+            return None
+        return lambda right: np.asarray(scipy.linalg.lapack.dpotrs(lower, right, lower=1)[0])
+
+    def smallest_eigenpair(self, Lambda: Array) -> tuple[float, Array]:
+        """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,); Lambda (n, 9, 9)."""
+        M = self.Q[:-1, :-1].copy()
+        n = self.rotations
+        np.einsum("iaib->iab", M.reshape(n, 9, n, 9))[...] -= Lambda
+        values, vectors = scipy.linalg.eigh(M, subset_by_index=[0, 0], check_finite=False)
+        return float(values[0]), vectors[:, 0]
 
 
 def generalised_inverse_factor(M: Array) -> tuple[Array, Array]:
-    """F (s, m, m), where F F' is a generalised inverse of each positive semidefinite M (s, m, m), and M's null vectors.
+    """F (m, k), where F F' is a generalised inverse of a positive semidefinite M (m, m), and M's null vectors (m, l).
 
-    Rows and columns are scaled to a unit diagonal first, so that metres and scales compare. F has zero columns for the
-    directions that the measurements leave free, and the second matrix has these directions as columns, zero elsewhere.
-    Variables that the problem does not have (zero diagonal) are in neither.
+    Rows and columns are scaled to a unit diagonal first, so that metres and scales compare. Variables that the problem
+    does not have (zero diagonal) are in neither.
     """
-    diagonal = np.einsum("sii->si", M)
-    largest = diagonal.max(axis=1, keepdims=True, initial=0.0)
-    used = diagonal > ABSENT * largest
-    d = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
-    scaled = M * d[:, :, None] * d[:, None, :]
-    np.einsum("sii->si", scaled)[...] = 1.0
-    values, vectors = np.linalg.eigh(scaled)
-    keep = values > RANK_TOLERANCE * M.shape[1]
-    inverse_root = np.where(keep, 1.0 / np.sqrt(np.where(keep, values, 1.0)), 0.0)
-    vectors *= d[:, :, None]
-    return vectors * inverse_root[:, None, :], vectors * ~keep[:, None, :]
-
-
-def _toward_unit_scale(w: Array, null: Array, scales: np.ndarray) -> Array:
-    """The step along null directions that brings each scale that they move to 1; zero if they move none."""
-    along = null[scales]
-    size = np.linalg.norm(null, axis=0)
-    open_ones = (np.abs(along) > 1e-6 * np.where(size > 0.0, size, 1.0)).any(axis=1) if null.size else np.zeros(0, bool)
-    if not open_ones.any():
-        return np.zeros_like(w)
-    step: Array = null @ np.linalg.lstsq(along[open_ones], 1.0 - w[scales][open_ones], rcond=1e-9)[0]
-    return step
+    diagonal = np.diagonal(M)
+    used = np.flatnonzero(diagonal > ABSENT * diagonal.max(initial=0.0))
+    unit = 1.0 / np.sqrt(diagonal[used])
+    scaled = M[used[:, None], used] * unit[:, None] * unit
+    np.fill_diagonal(scaled, 1.0)
+    least = RANK_TOLERANCE * len(M)
+    lower, failed = scipy.linalg.lapack.dpotrf(scaled, lower=1, clean=1)
+    if not failed and (np.diagonal(lower) ** 2).min(initial=1.0) > least:
+        root, null = scipy.linalg.lapack.dtrtri(lower, lower=1)[0].T, np.zeros((len(used), 0))
+    else:
+        values, vectors = np.linalg.eigh(scaled)
+        keep = values > least
+        root, null = vectors[:, keep] / np.sqrt(values[keep]), vectors[:, ~keep]
+    result = np.zeros((len(M), root.shape[1])), np.zeros((len(M), null.shape[1]))
+    for out, columns in zip(result, (root, null), strict=True):
+        out[used] = columns * unit[:, None]
+    return result

@@ -95,6 +95,13 @@ def tangent_basis(R: Array) -> Array:
     return basis.reshape(-1, 9, 3)
 
 
+def tangent_curvature(R: Array, q: Array) -> Array:
+    """What the Hessian on SO(3) has beside basis' Q' basis, for q = Q' x: sym(M) - tr(M) I with M = G'R."""
+    M = unvec(q[:-1]).transpose(0, 2, 1) @ R
+    result: Array = 0.5 * (M + M.transpose(0, 2, 1)) - np.einsum("nii->n", M)[:, None, None] * np.eye(3)
+    return result
+
+
 def retract(R: Array, w: Array) -> Array:
     """R exp(w^); one Newton-Schulz step brings it back to SO(3), so that rounding does not add up."""
     theta2 = (w * w).sum(axis=1)[:, None, None]

@@ -17,14 +17,13 @@ from gtsam_rwhec.solver.certificate import Cause, Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import Descent, SearchForm, descend
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.local_dual import LocalDual, improve_locally, relax_locally
-from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.relaxation import Relaxation, round_to_rotations, solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec
 from gtsam_rwhec.solver.small_dual import improve, stationary_multipliers
 from gtsam_rwhec.solver.solve_options import Method, SolveOptions
-from gtsam_rwhec.solver.start import unconstrained_start
+from gtsam_rwhec.solver.starts import mirrored, spectral_start, unconstrained_start
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ class Attempt:
                 self._local = improve_locally(self.search.whole, evaluation, kkt, self.search.options.max_dense_frames)
                 multipliers, is_better = self._local.multipliers, self._local.t > 0.0
             else:
-                (multipliers, _), is_better = improve(self.search.whole.reduced, R, kkt), True
+                (multipliers, _), is_better = improve(self.search.whole.reduced.Q, R, kkt), True
             if is_better:
                 self._add(Multipliers.ALL_CONSTRAINTS, multipliers)
         if self.is_closed or relaxation is None:
@@ -401,7 +400,7 @@ class Search(SearchedPart):
             attempt = Attempt(self, [initial], Start.GIVEN)
         else:
             with self.stages.of("spectral start"):
-                starts = self.whole.spectral_starts()
+                starts = spectral_start(self.part, self.whole.rotation)
             attempt = Attempt(self, starts, Start.SPECTRAL)
         if method == "auto" and self.is_large:
             return attempt.run_locally()
@@ -443,7 +442,7 @@ class Search(SearchedPart):
     def ended(self, found: Found) -> Searched:
         """What was found, without the forms where nothing more is searched: in large parts no twin is."""
         keeps = found.is_closed and not found.bound.definite and not self.is_large
-        return Searched(self.part, found, self.whole.order, self.stages, self if keeps else None)
+        return Searched(self.part, found, self.whole.full.order, self.stages, self if keeps else None)
 
     def has_twin(self, found: Found) -> bool:
         """Whether descents from random starts find another answer of the same cost.
@@ -466,7 +465,7 @@ class Search(SearchedPart):
         options = self.options
         with self.stages.of("semidefinite relaxation"):
             return solve_relaxation(
-                self.whole.reduced.dense(),
+                self.whole.reduced.Q,
                 options.relaxation_tolerance,
                 options.max_relaxation_iterations,
                 self.stages.progress,

@@ -17,7 +17,6 @@ import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.descent import homogeneous
-from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, vec
 
 
@@ -100,7 +99,7 @@ def stationary_multipliers(gradient: Array, R: Array, multipliers: Array) -> Arr
     return result
 
 
-def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
+def improve(Q: Array, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
     """Maximise t with z'Z z >= t z'P z for all z with z'P x = 0, over the multipliers that keep Z x = 0.
 
     R (n, 3, 3) is a critical point. Z x is zero at the given multipliers (n, 20) and at the returned ones. A positive t
@@ -108,7 +107,6 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     t is minus infinity and the multipliers are the given ones.
     """
     x = homogeneous(R)
-    Q = form.dense()
     Z = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z = 0.5 * (Z + Z.T)
     Z[-1, -1] -= float(x @ Z @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too

@@ -11,7 +11,7 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.answers import Residual
 from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.free_directions import Identifiability
+from gtsam_rwhec.solver.identification import Identifiability
 
 
 @dataclass(frozen=True)

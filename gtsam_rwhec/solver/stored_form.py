@@ -12,7 +12,8 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma
 from gtsam_rwhec.solver.answers import Action, Evaluation, Point
-from gtsam_rwhec.solver.full_form import PAIRS_AT_ONCE, FullForm
+from gtsam_rwhec.solver.block_matrix import BlockMatrix
+from gtsam_rwhec.solver.full_form import PAIRS_AT_ONCE
 
 #: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (looser bounds).
 Wide = np.longdouble
@@ -26,7 +27,7 @@ MOMENTS_UNIT = 2.0**-51
 class StoredForm:
     """x' Q x of a stored form, in extended precision."""
 
-    form: FullForm
+    form: BlockMatrix
 
     def at(self, point: Point) -> Evaluation:
         """The cost at values of the variables."""
@@ -78,9 +79,10 @@ class StoredForm:
         return _product(self.form, np.abs(x).astype(float), size=True)
 
 
-def _product(form: FullForm, x: Array, *, size: bool) -> Array:
+def _product(form: BlockMatrix, x: Array, *, size: bool) -> Array:
     """The form, or the sizes of its entries, times x (13 n + 2, D), in the precision of x."""
-    n, L, D = len(form.frames), form.leaves, x.shape[1]
+    n, D = len(form.frames), x.shape[1]
+    ends = form.ends
     of_frames, of_tail = x[:-2].reshape(n, 13, D), x[-2:]
     result, last = np.zeros((n, 13, D), dtype=x.dtype), _as(form.tail, x, size=size) @ of_tail
     for begin in range(0, n, PAIRS_AT_ONCE):
@@ -90,9 +92,9 @@ def _product(form: FullForm, x: Array, *, size: bool) -> Array:
         last += np.einsum("nit,nid->td", tails, of_frames[at])
     for begin in range(0, len(form.couplings), PAIRS_AT_ONCE):
         at = slice(begin, begin + PAIRS_AT_ONCE)
-        couplings, leaf, center = _as(form.couplings[at], x, size=size), form.rows[at], L + form.columns[at]
-        np.add.at(result, leaf, np.einsum("fij,fjd->fid", couplings, of_frames[center]))
-        np.add.at(result, center, np.einsum("fij,fid->fjd", couplings, of_frames[leaf]))
+        couplings, first, second = _as(form.couplings[at], x, size=size), ends[0][at], ends[1][at]
+        np.add.at(result, first, np.einsum("fij,fjd->fid", couplings, of_frames[second]))
+        np.add.at(result, second, np.einsum("fij,fid->fjd", couplings, of_frames[first]))
     whole: Array = np.concatenate([result.reshape(13 * n, D), last])
     return whole
 

@@ -1,24 +1,28 @@
 """Moments against the measurements they stand for, and the forms Q and Q' against the papers' matrices."""
 
 from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
+from hypothesis import settings
 from hypothesis import strategies as st
 from naive_cost import naive_cost
 from rwhec_factors.se3 import pose
-
 import gtsam_rwhec as rw
-from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments, edge_forms
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.problem.moments import BLOCK
+from gtsam_rwhec.problem.moments import Gauge
+from gtsam_rwhec.problem.moments import Moments
+from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.simulate import general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.solver.answers import Answer, as_point
+from gtsam_rwhec.solver.answers import Answer
+from gtsam_rwhec.solver.answers import as_point
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.full_form import edge_forms
 
 NOISE = Noise(0.02, 200.0)
 
@@ -240,7 +244,7 @@ def test_the_reduced_form_is_that_of_the_paper(graph: str) -> None:
     (part,) = parts_of(problem)
     reduced = PartForm.of(part).reduced
     expected = eliminated_by_pinv(part, naive_form(problem, part))
-    close(reduced.dense(), expected, 1e-10)
+    close(reduced.Q, expected, 1e-10)
     x = np.random.default_rng(0).standard_normal(reduced.size)
     close(reduced.apply(x), expected @ x, 1e-10)
 
@@ -248,7 +252,7 @@ def test_the_reduced_form_is_that_of_the_paper(graph: str) -> None:
 @pytest.mark.parametrize("options", [dict(scale="per_target"), dict(scale="per_target", known_sizes=("target0",))])
 def test_the_form_turned_round_is_reduced_alike(options: dict) -> None:
     (part,) = parts_of(general(3, 2, **options, seed=17, noise=NOISE, number_of_measurements=5).problem)
-    close(PartForm.of(part).reduced.dense(), eliminated_by_pinv(part, dense_form(part)), 1e-10)
+    close(PartForm.of(part).reduced.Q, eliminated_by_pinv(part, dense_form(part)), 1e-10)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -256,7 +260,7 @@ def test_free_translations_take_the_pseudo_inverse(scale: str) -> None:
     """Planar motion leaves a translation open: eq. 48's inverse does not exist, its pseudo-inverse does."""
     problem = general(2, 2, seed=19, motion="planar", noise=NOISE, scale=scale, number_of_measurements=6).problem
     (part,) = parts_of(problem)
-    close(PartForm.of(part).reduced.dense(), eliminated_by_pinv(part, naive_form(problem, part)), 1e-9)
+    close(PartForm.of(part).reduced.Q, eliminated_by_pinv(part, naive_form(problem, part)), 1e-9)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -265,7 +269,7 @@ def test_forms_of_the_real_dataset(utias_folder: Path, scale: Any) -> None:
     (part,) = parts_of(problem)
     Q = naive_form(problem, part)
     close(dense_form(part), Q)
-    close(PartForm.of(part).reduced.dense(), eliminated_by_pinv(part, Q), 1e-10)
+    close(PartForm.of(part).reduced.Q, eliminated_by_pinv(part, Q), 1e-10)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 9))

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report import PairGrid
-from gtsam_rwhec.solver.free_directions import Identifiability, PairIdentifiability
+from gtsam_rwhec.solver.identification import Identifiability, PairIdentifiability
 
 
 def grid(pairs: dict[tuple[str, str], bool]) -> PairGrid:

@@ -7,7 +7,6 @@ from fractions import Fraction
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import tangent_basis, unvec
 
@@ -24,12 +23,8 @@ def fractions(array: Array) -> np.ndarray:
 
 
 def stored_matrix(form: ReducedForm) -> np.ndarray:
-    """Q' = arrow(D, C, E) - G'G of the stored numbers, its symmetric part, as fractions (9 n + 1 square)."""
-    full = fractions(arrow.dense(form.D, form.C, form.E))
-    G = fractions(form.G)
-    Q = full - G.T @ G if len(G) else full
-    symmetric: np.ndarray = (Q + Q.T) / 2
-    return symmetric
+    """Q' as it is stored, as fractions (9 n + 1 square)."""
+    return fractions(form.Q)
 
 
 def rotation(q: np.ndarray) -> np.ndarray:
@@ -77,7 +72,7 @@ def random_quaternions(count: int, generator: np.random.Generator) -> list[np.nd
 def lowest_cost(form: ReducedForm, R: Array, steps: int = 4) -> Fraction:
     """The cost at the bottom of the valley that R (n, 3, 3) is in, to some 40 digits: Newton with exact gradients."""
     Q, n = stored_matrix(form), len(R)
-    rounded = form.dense()[:-1, :-1]
+    rounded = form.Q[:-1, :-1]
     quaternions = [rational_quaternion(each) for each in R]
     best = cost(Q, quaternions)
     for _ in range(steps):

@@ -15,7 +15,7 @@ def lowest_of_random_starts(form: ReducedForm, count: int, seed: int = 0) -> Arr
 
     It is not the library's descent.
     """
-    Q, n = form.dense(), form.rotations
+    Q, n = form.Q, form.rotations
     R = random_rotations(count * n, np.random.default_rng(seed))
     damping = np.full(count, 1e-3 * form.magnitude)
 

@@ -14,14 +14,13 @@ from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
-from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, vec
 from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.start import spectral_start
+from gtsam_rwhec.solver.starts import spectral_start
 
 #: One centimetre, and half a degree about each axis.
 SMALL_NOISE = Noise(0.01, 6500.0)
@@ -93,7 +92,7 @@ def gradient_norm(form: ReducedForm, R: Array) -> float:
 
 
 def true_rotations(simulation: Simulation) -> Array:
-    """The truth as the form's variables: leaves, then centers; inverted in the form turned round."""
+    """The truth as the form's variables; inverted in the form turned round."""
     part = part_of(simulation.problem)
     frames = simulation.X | simulation.Y
     R = np.array([frames[name][:3, :3] for name in part.free])
@@ -103,21 +102,3 @@ def true_rotations(simulation: Simulation) -> Array:
 def flat(R: Array) -> Array:
     """vec R_1, ..., vec R_n, one after the other."""
     return vec(R).ravel()
-
-
-def dense_full(form: FullForm) -> Array:
-    """Q over [leaf numbers (13 each), center numbers (13 each), alpha, h] as one array."""
-    L, P = form.leaves, form.centers
-    Q = np.zeros((13 * (L + P) + 2,) * 2)
-    for i in range(L + P):
-        at = slice(13 * i, 13 * i + 13)
-        Q[at, at] = form.leaf[i] if i < L else form.center[i - L]
-        Q[at, -2:] = form.leaf_tail[i] if i < L else form.center_tail[i - L]
-        Q[-2:, at] = Q[at, -2:].T
-    for i in range(L):
-        for p in range(P):
-            rows, columns = slice(13 * i, 13 * i + 13), slice(13 * (L + p), 13 * (L + p) + 13)
-            Q[rows, columns] = form.leaf_center[i, p]
-            Q[columns, rows] = form.leaf_center[i, p].T
-    Q[-2:, -2:] = form.tail
-    return Q

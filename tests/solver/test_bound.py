@@ -133,12 +133,12 @@ def test_any_multipliers_at_any_point_bound_the_optimum(name: str, seed: int) ->
 def test_small_duals_and_relaxations_multipliers_bound_the_optimum(name: str, seed: int) -> None:
     problem = PROBLEMS[name](seed)
     form, end = whole(problem), optimum(problem)
-    relaxation = solve_relaxation(form.reduced.dense(), 1e-8, 100)
+    relaxation = solve_relaxation(form.reduced.Q, 1e-8, 100)
     bound, evaluation = bound_at(form, end.R, relaxation.multipliers)
     assert bound.lower_bound <= evaluation.upper
     gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
     kkt = kkt_multipliers(evaluation.point.rotations, gradient)
-    improved, _ = improve(form.reduced, evaluation.point.rotations, kkt)
+    improved, _ = improve(form.reduced.Q, evaluation.point.rotations, kkt)
     assert bound_at(form, end.R, improved)[0].lower_bound <= evaluation.upper
 
 

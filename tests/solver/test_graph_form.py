@@ -2,40 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_problems import SCALES, part_of, simulated, solved, whole
+from small_problems import SCALES, part_of, simulated, solved, true_rotations, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import part_form
-from gtsam_rwhec.solver.descent import ArrowHessian, descend, homogeneous
+from gtsam_rwhec.solver.answers import answer_of
+from gtsam_rwhec.solver.descent import descend, homogeneous
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.graph_form import GraphForm
-from gtsam_rwhec.solver.graph_start import graph_smallest_eigenpair, graph_spectral_start, graph_unconstrained_start
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT, kkt_multipliers, random_rotations, tangent_basis
-from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
-from gtsam_rwhec.solver.weakest_rotation import smallest_eigenpair
+from gtsam_rwhec.solver.starts import spectral_start, unconstrained_start
 
 
 @pytest.fixture
 def by_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     """The graph is followed in parts of any size."""
-    monkeypatch.setattr(part_form, "SMALL_ARROW", 0)
-    monkeypatch.setattr(part_form, "AS_LARGE", 1e9)
+    monkeypatch.setattr(part_form, "DENSE_FRAMES", 0)
 
 
 def form_by_graph(forms: PartForm) -> GraphForm:
     """With every frame eliminated in its order, as in a large part."""
     full = forms.full
-    order = Elimination.of(len(full.frames), full.rows, full.leaves + full.columns, few=0)
-    found = GraphForm.of(full, order, has_scales=forms.part.scale != "known")
+    order = Elimination.of(len(full.frames), *full.ends, few=0)
+    found = GraphForm.of(replace(full, order=order))
     assert found is not None
     return found
 
@@ -51,23 +51,21 @@ def on_random_graph(seed: int, scale: ScaleMode, *, anchored: bool = False) -> P
 
 @given(seed=st.integers(0, 10**6), scale=st.sampled_from(SCALES), anchored=st.booleans())
 @settings(max_examples=8, deadline=None)
-def test_products_scales_and_newtons_steps_are_those_of_the_arrow(seed: int, scale: ScaleMode, anchored: bool) -> None:
+def test_products_scales_and_newtons_steps_are_those_of_the_matrix(seed: int, scale: ScaleMode, anchored: bool) -> None:
     forms = on_random_graph(seed, scale, anchored=anchored and scale != "per_target")
-    arrow, graph = forms.reduced, form_by_graph(forms)
-    assert (graph.rotations, graph.size) == (arrow.rotations, arrow.size)
+    dense, graph = forms.reduced, form_by_graph(forms)
+    assert (graph.rotations, graph.size) == (dense.rotations, dense.size)
     generator = np.random.default_rng(seed)
-    x = generator.standard_normal(arrow.size)
-    np.testing.assert_allclose(graph.apply(x), arrow.apply(x), atol=1e-10 * arrow.magnitude)
-    for mine, theirs in zip(graph.recover(x), arrow.recover(x), strict=True):
+    x = generator.standard_normal(dense.size)
+    np.testing.assert_allclose(graph.apply(x), dense.apply(x), atol=1e-10 * dense.magnitude)
+    x[-1] = 1.0
+    for mine, theirs in zip(graph.recover(x), dense.recover(x), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-7, atol=1e-7)
-    R = random_rotations(arrow.rotations, generator)
-    q, basis = arrow.apply(homogeneous(R)), tangent_basis(R)
+    R = random_rotations(dense.rotations, generator)
+    q, basis = dense.apply(homogeneous(R)), tangent_basis(R)
     gradient = np.einsum("nij,ni->nj", basis, q[:-1].reshape(-1, 9))
-    for damping in (0.0, 2.0 * arrow.magnitude):
-        steps = [
-            hessian.step(gradient, damping)
-            for hessian in (graph.hessian(R, basis, q), ArrowHessian.of(arrow, R, basis, q))
-        ]
+    for damping in (0.0, 2.0 * dense.magnitude):
+        steps = [form.newton(R, basis, q)(gradient, damping) for form in (graph, dense)]
         assert (steps[0] is None) == (steps[1] is None)
         if steps[0] is not None and steps[1] is not None:
             np.testing.assert_allclose(*steps, atol=1e-7)
@@ -84,17 +82,17 @@ def test_starts_lead_to_the_optimum(scale: ScaleMode, anchored: bool) -> None:
     def lowest(starts: list[Array]) -> float:
         return min(descend(graph, start, 200).cost for start in starts)
 
-    best = lowest(spectral_start(forms.part, forms.rotation))
-    assert lowest(graph_spectral_start(forms.part, forms.rotation, forms.order)) == pytest.approx(best, rel=1e-9)
+    best = min(descend(forms.reduced, start, 200).cost for start in spectral_start(forms.part, forms.rotation))
+    assert lowest(spectral_start(forms.part, replace(forms.rotation, order=graph.full.order))) == pytest.approx(best)
     # The smallest eigenvector of Q' as a whole is no better a start where only some have priors: both are the same.
-    mine, theirs = graph_unconstrained_start(graph), unconstrained_start(forms.reduced)
+    mine, theirs = unconstrained_start(graph), unconstrained_start(forms.reduced)
     assert lowest(mine) == pytest.approx(lowest(theirs), rel=1e-9)
 
 
 def test_parts_that_only_the_scale_joins_have_a_sign_each() -> None:
     problem = general(4, 4, seed=5, graph=[(0, 0), (1, 0), (2, 1), (3, 2), (3, 3)], noise=None, scale="shared").problem
     forms = PartForm.of(parts_of(problem)[0])
-    (start,) = graph_spectral_start(forms.part, forms.rotation, forms.order)
+    (start,) = spectral_start(forms.part, forms.rotation)
     assert descend(form_by_graph(forms), start, 5).cost < 1e-15 * forms.reduced.magnitude
 
 
@@ -103,30 +101,29 @@ def test_the_smallest_eigenvalue_is_found() -> None:
     graph = form_by_graph(forms)
     multipliers = np.random.default_rng(0).standard_normal((graph.rotations, 20)) * graph.magnitude / 10.0
     Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(-1, 10, 10)[:, :9, :9]
-    value, vector = graph_smallest_eigenpair(graph, Lambda)
-    expected, direction = smallest_eigenpair(forms.reduced, multipliers)
+    value, vector = graph.smallest_eigenpair(Lambda)
+    expected, direction = forms.reduced.smallest_eigenpair(Lambda)
     assert value == pytest.approx(expected, rel=1e-9)
     assert abs(float(vector @ direction)) == pytest.approx(1.0, abs=1e-6)
 
 
 @given(seed=st.integers(0, 10**6), scale=st.sampled_from(SCALES), kept=st.booleans())
 @settings(max_examples=4, deadline=None)
-def test_the_answer_and_the_bound_are_those_of_the_arrow(seed: int, scale: ScaleMode, kept: bool) -> None:
+def test_the_answer_and_the_bound_are_those_of_the_matrix(seed: int, scale: ScaleMode, kept: bool) -> None:
     """In whatever way the answer is found, no bound is above the cost of another answer."""
     problem = simulated(
         5, 4, seed, graph="random", edge_probability=0.2, scale=scale, keep_measurements=kept, noise=Noise(0.02, 800.0)
     ).problem
     with pytest.MonkeyPatch.context() as patch:
-        arrow = solved(problem)
-        patch.setattr(part_form, "SMALL_ARROW", 0)
-        patch.setattr(part_form, "AS_LARGE", 1e9)
+        dense = solved(problem)
+        patch.setattr(part_form, "DENSE_FRAMES", 0)
         assert isinstance(PartForm.of(part_of(problem)).form, GraphForm)
         graph = solved(problem)
-    assert graph.certificate.status == arrow.certificate.status
-    assert graph.cost == pytest.approx(arrow.cost, rel=1e-9)
-    assert graph.certificate.lower_bound <= arrow.cost
-    assert graph.certificate.relative_gap <= max(4.0 * arrow.certificate.relative_gap, 1e-8)
-    for name, X in arrow.X.items():
+    assert graph.certificate.status == dense.certificate.status
+    assert graph.cost == pytest.approx(dense.cost, rel=1e-9)
+    assert graph.certificate.lower_bound <= dense.cost
+    assert graph.certificate.relative_gap <= max(4.0 * dense.certificate.relative_gap, 1e-8)
+    for name, X in dense.X.items():
         np.testing.assert_allclose(graph.X[name].matrix(), X.matrix(), atol=1e-6)
 
 
@@ -188,14 +185,26 @@ def test_what_is_not_determined_is_optimal_at_most(kept: bool) -> None:
 
 
 @pytest.mark.usefixtures("by_graph")
-def test_free_directions_beside_an_unknown_scale_are_left_to_the_arrow() -> None:
-    """Its null vectors say whether they move the scale."""
-    forms = whole(simulated(3, 2, 0, scale="shared", motion="planar").problem)
-    assert forms.form is forms.reduced
-    assert isinstance(whole(simulated(3, 2, 0, motion="planar").problem).form, GraphForm)
+@pytest.mark.parametrize("scale", ["shared", "per_target"])
+def test_free_directions_beside_an_unknown_scale_leave_it_as_it_is(scale: ScaleMode) -> None:
+    """Planar motion leaves heights free, and tells the scale; a carrier at rest leaves the scale free: it is 1."""
+    simulation = simulated(3, 2, 0, scale=scale, motion="planar", noise=None)
+    forms = whole(simulation.problem)
+    assert isinstance(forms.form, GraphForm)
+    x = homogeneous(true_rotations(simulation))
+    scales = [np.append(numbers[:, 3], alpha) for numbers, alpha in (forms.form.recover(x), forms.reduced.recover(x))]
+    np.testing.assert_allclose(*scales, rtol=1e-6)
+    at_rest = rw.Problem(scale=scale)
+    for target, sensor in simulation.problem.pairs:
+        data = simulation.problem.measurements(target, sensor)
+        at_rest.add(target, sensor, np.repeat(data.A[:1], 5, axis=0), np.repeat(data.B[:1], 5, axis=0))
+    forms = whole(at_rest)
+    answer = answer_of(forms.part, forms.form, true_rotations(simulation))
+    own = answer.own_scale[np.isfinite(answer.own_scale)]
+    np.testing.assert_allclose(np.append(own, answer.scale), 1.0, rtol=1e-6)
 
 
-def test_multipliers_at_the_answer_are_those_of_the_arrow() -> None:
+def test_multipliers_at_the_answer_are_those_of_the_matrix() -> None:
     forms = on_random_graph(7, "known")
     graph = form_by_graph(forms)
     R = random_rotations(graph.rotations, np.random.default_rng(0))

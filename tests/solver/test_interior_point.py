@@ -54,7 +54,7 @@ def infeasibility(Q: Array, relaxation: Relaxation) -> tuple[float, float, float
 @pytest.mark.parametrize("scale", ["known", "shared"])
 @pytest.mark.parametrize("frames", SIDES)
 def test_it_agrees_with_clarabel(frames: int, scale: ScaleMode, gross: bool) -> None:
-    Q = reduced(problem_of(frames, scale, gross=gross)).dense()
+    Q = reduced(problem_of(frames, scale, gross=gross)).Q
     ours, theirs = solve_by_blocks(Q, 1e-9, 100), solve_by_clarabel(Q, 1e-9, 100)
     assert ours.solver != theirs.solver
     for relaxation in (ours, theirs):
@@ -66,7 +66,7 @@ def test_it_agrees_with_clarabel(frames: int, scale: ScaleMode, gross: bool) -> 
 @pytest.mark.parametrize("scale", ["known", "shared"])
 @pytest.mark.parametrize("frames", SIDES)
 def test_its_solutions_are_feasible_and_complementary(frames: int, scale: ScaleMode) -> None:
-    Q = reduced(problem_of(frames, scale)).dense()
+    Q = reduced(problem_of(frames, scale)).Q
     relaxation = solve_by_blocks(Q, 1e-9, 100)
     constraints, smallest_of_X, smallest_of_Z, product = infeasibility(Q, relaxation)
     assert constraints < 1e-9
@@ -84,8 +84,8 @@ def test_tight_relaxations_reach_the_certified_optimum(frames: int, scale: Scale
         form, end = reduced(problem), optimum(problem)
         bound, _ = bound_at(whole(problem), end.R)
         assert end.cost - bound.lower_bound < 1e-6 * end.cost
-        relaxation = solve_by_blocks(form.dense(), 1e-9, 100)
-        assert relaxation.dual == pytest.approx(end.cost, abs=accuracy(form.dense()))
+        relaxation = solve_by_blocks(form.Q, 1e-9, 100)
+        assert relaxation.dual == pytest.approx(end.cost, abs=accuracy(form.Q))
         # Rank one, and its h column is x: with unknown scale too, since the handedness couples to h.
         values = np.linalg.eigvalsh(relaxation.X)
         assert values[-2] < 1e-3 * values[-1]
@@ -95,7 +95,7 @@ def test_tight_relaxations_reach_the_certified_optimum(frames: int, scale: Scale
 def test_data_without_noise_end_at_zero(frames: int) -> None:
     simulation = simulated(*SIDES[frames], noise=None)
     form = reduced(simulation.problem)
-    relaxation = solve_by_blocks(form.dense(), 1e-9, 100)
+    relaxation = solve_by_blocks(form.Q, 1e-9, 100)
     assert abs(relaxation.dual) < 1e-8 * form.magnitude
 
 
@@ -112,14 +112,14 @@ def test_the_end_of_double_precision_is_no_error(seeds: range) -> None:
             scale="per_target",
             noise=Noise(0.0126, 66000.0),
         )
-        relaxation = solve_by_blocks(reduced(simulation.problem).dense(), 0.0, 300)
+        relaxation = solve_by_blocks(reduced(simulation.problem).Q, 0.0, 300)
         assert relaxation.iterations < 300
         assert np.isfinite(relaxation.multipliers).all()
 
 
 def test_it_reports_as_it_goes() -> None:
     said: list[str] = []
-    solve_by_blocks(reduced(problem_of(3, "known")).dense(), 1e-9, 100, said.append)
+    solve_by_blocks(reduced(problem_of(3, "known")).Q, 1e-9, 100, said.append)
     assert len(said) >= 2
     assert all("semidefinite relaxation, iteration" in each for each in said)
 
@@ -127,7 +127,7 @@ def test_it_reports_as_it_goes() -> None:
 def test_real_dataset(utias_folder: Path) -> None:
     """24 frames, a 217 x 217 cone, which Clarabel does not hold."""
     problem = rw.read_csv(utias_folder, scale="known", sigma=1.0, kappa=1.0)
-    Q = reduced(problem).dense()
+    Q = reduced(problem).Q
     assert Q.shape == (217, 217)
     relaxation = solve_by_blocks(Q, 1e-9, 100)
     assert relaxation.dual == pytest.approx(8.2812454, rel=1e-5)

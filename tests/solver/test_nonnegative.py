@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from small_problems import GROSS_NOISE, dense_full, flat, optimum, part_of, reduced, searched, simulated, whole
+from small_problems import GROSS_NOISE, flat, optimum, part_of, reduced, searched, simulated, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OptionError, ScaleError
@@ -36,7 +36,7 @@ def cost_on_positive_scales(problem: rw.Problem, R: Array) -> float:
     forms = PartForm.of(part)
     if answer_of(part, forms.reduced, R).scale >= 0.0:
         return cost_of(forms.reduced, R)
-    Q = dense_full(forms.full)
+    Q = forms.full.dense()
     fixed = np.zeros(len(Q))
     for i, each in enumerate(flat(R).reshape(-1, 9)):
         fixed[13 * i + 4 : 13 * i + 13] = each

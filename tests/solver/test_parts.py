@@ -32,9 +32,7 @@ def test_one_scale_for_all_joins_them() -> None:
 def test_several_odometries_are_as_many_parts() -> None:
     parts = parts_of(simulated(0, 3, odometry=5).problem)
     assert [part.names for part in parts] == [("sensor0",), ("sensor1",), ("sensor2",)]
-    # A frame that only moves by itself has nothing to be eliminated against.
-    assert all(part.leaves == () for part in parts)
-    assert [part.centers for part in parts] == [("sensor0",), ("sensor1",), ("sensor2",)]
+    assert [part.free for part in parts] == [("sensor0",), ("sensor1",), ("sensor2",)]
 
 
 def test_components_in_order_of_appearance() -> None:
@@ -43,31 +41,14 @@ def test_components_in_order_of_appearance() -> None:
     assert connected_components((("s", "s"),)) == [["s"]]
 
 
-@pytest.mark.parametrize(
-    ("sides", "leaves"), [((3, 2), "target"), ((2, 3), "sensor"), ((2, 2), "target"), ((1, 4), "sensor")]
-)
-def test_the_larger_side_are_the_leaves(sides: tuple[int, int], leaves: str) -> None:
-    part = part_of(simulated(*sides).problem)
-    assert all(name.startswith(leaves) for name in part.leaves)
-    assert not any(name.startswith(leaves) for name in part.centers)
-    assert part.free == part.leaves + part.centers
-
-
 def test_known_frames_are_not_free_and_do_not_count() -> None:
     simulation = simulated(3, 3)
     for name in ("target0", "target1"):
         simulation.problem.fix(name, simulation.X[name])
     part = part_of(simulation.problem)
-    assert part.leaves == ("sensor0", "sensor1", "sensor2")
-    assert part.centers == ("target2",)
+    assert part.free == ("target2", "sensor0", "sensor1", "sensor2")
     assert set(part.fixed) == {"target0", "target1"}
     assert part.number_of_unknowns == 24
-
-
-def test_all_of_a_leafs_neighbours_are_centers_with_motions_too() -> None:
-    part = part_of(simulated(1, 3, odometry=4).problem)
-    assert part.leaves == ("sensor0", "sensor1", "sensor2")
-    assert part.pairs[-1] == ("sensor2", "sensor2")
 
 
 @pytest.mark.parametrize("scale", SCALES)

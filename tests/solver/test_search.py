@@ -56,7 +56,7 @@ class TestEasyProblems:
         for seed in range(3):
             problem = simulated(2, 1, seed, scale=scale).problem
             form, best = reduced(problem), optimum(problem)
-            relaxation = solve_by_clarabel(form.dense(), 1e-9, 100)
+            relaxation = solve_by_clarabel(form.Q, 1e-9, 100)
             assert relaxation.dual == pytest.approx(best.cost, abs=1e-7 * form.magnitude)
             np.testing.assert_allclose(relaxation.X[:-1, -1], flat(best.R), atol=1e-3)
 
@@ -104,7 +104,7 @@ class TestGrossNoise:
         for search, found in gross(scale):
             if found.is_closed:
                 continue
-            bound = solve_by_clarabel(search.form.dense(), 1e-9, 200).dual
+            bound = solve_by_clarabel(search.whole.reduced.Q, 1e-9, 200).dual
             assert found.cause is Cause.NOT_TIGHT
             assert found.figures["relaxation_cost"] == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
             assert found.bound.lower_bound == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))

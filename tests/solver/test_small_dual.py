@@ -22,7 +22,7 @@ POORLY_EXCITED = Motion("planar", wobble_rad=0.01)
 
 def certificate_matrix(form: ReducedForm, multipliers: Array, cost: float) -> Array:
     """Z, with the cost taken off h's entry: Z x = 0 at a critical point."""
-    Z = form.dense() - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+    Z = form.Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z[-1, -1] -= cost
     return Z
 
@@ -44,12 +44,12 @@ def test_z_x_stays_zero_and_the_measure_is_reached(seed: int, scale: ScaleMode) 
     form, end = reduced(problem), optimum(problem)
     x = homogeneous(end.R)
     kkt = multipliers_at(form, end.R)
-    multipliers, t = improve(form, end.R, kkt)
+    multipliers, t = improve(form.Q, end.R, kkt)
     before, after = (certificate_matrix(form, m, end.cost) for m in (kkt, multipliers))
     scale_of = float(np.abs(np.diagonal(before)).max())
     np.testing.assert_allclose(after @ x, 0.0, atol=1e-9 * scale_of)
     # t: the smallest generalised eigenvalue against P = Q' (and a little more) across x, in P's own measure.
-    P = form.dense()
+    P = form.Q
     P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12 * scale_of
     across = scipy.linalg.null_space((P @ x)[None])
     reached = scipy.linalg.eigh(across.T @ after @ across, across.T @ P @ across, eigvals_only=True)[0]
@@ -68,7 +68,7 @@ def test_it_certifies_where_the_multipliers_of_orthogonality_do_not() -> None:
         kkt = multipliers_at(form, end.R)
         if end.cost - bound_at(whole(problem), end.R)[0].lower_bound > tolerance:
             needed += 1
-            multipliers, _ = improve(form, end.R, kkt)
+            multipliers, _ = improve(form.Q, end.R, kkt)
             helped += end.cost - bound_at(whole(problem), end.R, multipliers)[0].lower_bound <= tolerance
     assert needed >= 8
     assert helped >= 0.75 * needed
@@ -77,7 +77,7 @@ def test_it_certifies_where_the_multipliers_of_orthogonality_do_not() -> None:
 def test_at_a_local_minimum_it_cannot_certify() -> None:
     problem = simulated(1, 1, 2, noise=GROSS_NOISE, number_of_measurements=4).problem
     form, start = reduced(problem), optimum(problem)  # the spectral start leads to a local minimum here
-    multipliers, t = improve(form, start.R, multipliers_at(form, start.R))
+    multipliers, t = improve(form.Q, start.R, multipliers_at(form, start.R))
     assert t < 0.0
     assert bound_at(whole(problem), start.R, multipliers)[0].lower_bound < start.cost - 1e-3
 
@@ -101,11 +101,9 @@ def test_stationary_multipliers_are_the_nearest_with_z_x_zero(seed: int) -> None
 
 def test_a_form_that_rounding_made_negative_has_no_measure() -> None:
     form = reduced(simulated(2, 1, noise=None).problem)
-    below = dataclasses.replace(
-        form, D=form.D - 1e-7 * form.magnitude * np.eye(9), E=form.E - 1e-7 * form.magnitude * np.eye(10)
-    )
+    below = dataclasses.replace(form, Q=form.Q - 1e-7 * form.magnitude * np.eye(form.size))
     R = optimum(simulated(2, 1, noise=None).problem).R
     given = multipliers_at(below, R)
-    multipliers, t = improve(below, R, given)
+    multipliers, t = improve(below.Q, R, given)
     assert t == -np.inf
     np.testing.assert_array_equal(multipliers, given)

@@ -11,7 +11,7 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Simulation
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
+from gtsam_rwhec.solver.starts import spectral_start, unconstrained_start
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
