@@ -6,31 +6,30 @@ runs: no certificate, no covariances.
 """
 
 from __future__ import annotations
+
 import math
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+
 import numpy as np
-from rwhec_factors.se3 import inverse
-from rwhec_factors.se3 import pose
+from rwhec_factors.se3 import inverse, pose
+
 from gtsam_rwhec.calibration.other_readings import OtherReading
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.answers import answer_of
-from gtsam_rwhec.solver.answers import scales_of
+from gtsam_rwhec.solver.answers import answer_of, scales_of
 from gtsam_rwhec.solver.descent import descend
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.starts import spectral_start
-from gtsam_rwhec.solver.starts import unconstrained_start
+from gtsam_rwhec.solver.starts import spectral_start, unconstrained_start
 
 #: The median length of a Gaussian vector in three dimensions, in its standard deviations about one axis.
 MEDIAN_OF_CHI = 1.5382

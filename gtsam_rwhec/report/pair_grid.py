@@ -1,19 +1,19 @@
 """The grid of the RWHEC paper's Figure 8: which pairs were seen, and which are determined on their own."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Sequence
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from rich.console import Console
-from rich.console import ConsoleOptions
-from rich.console import RenderResult
+
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.style import Style
 from rich.text import Text
-from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.files.terminal_text import shown
+
+from gtsam_rwhec.files.terminal_text import natural_key, shown
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.identification import Identifiability
+
 
 @dataclass(frozen=True)
 class Symbol:

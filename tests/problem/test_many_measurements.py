@@ -1,25 +1,19 @@
 """Measurements of many pairs in one call are those of one call for each pair: moments, raw measurements, refusals."""
 
 from __future__ import annotations
+
 from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import PoseError
-from gtsam_rwhec.errors import RotationsProjectedWarning
-from gtsam_rwhec.errors import StampError
+from gtsam_rwhec.errors import CountError, FrameError, NoiseError, PoseError, RotationsProjectedWarning, StampError
 from gtsam_rwhec.problem.accumulation import OPENING
 from gtsam_rwhec.problem.moment_stack import PAIRS_AT_ONCE
-from gtsam_rwhec.problem.moments import BLOCK
-from gtsam_rwhec.problem.moments import R_B
-from gtsam_rwhec.problem.moments import T_A
-from gtsam_rwhec.problem.moments import shift_of
+from gtsam_rwhec.problem.moments import BLOCK, R_B, T_A, shift_of
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 #: All features but B's rotation.

@@ -1,28 +1,25 @@
 """Moments against the measurements they stand for, and the forms Q and Q' against the papers' matrices."""
 
 from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_cost import naive_cost
 from rwhec_factors.se3 import pose
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.problem.moments import BLOCK
-from gtsam_rwhec.problem.moments import Gauge
-from gtsam_rwhec.problem.moments import Moments
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
+from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.solver.answers import Answer
-from gtsam_rwhec.solver.answers import as_point
-from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.answers import Answer, as_point
 from gtsam_rwhec.solver.full_form import edge_forms
+from gtsam_rwhec.solver.part_form import PartForm
+from gtsam_rwhec.solver.parts import Part, parts_of
 
 NOISE = Noise(0.02, 200.0)
 

@@ -1,31 +1,25 @@
 """Graphs of a thousand frames: the verdicts of the dense road, and what is free named right."""
 
 from __future__ import annotations
+
 import pickle
 from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rwhec_factors.se3 import inverse
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate.simulated_noise import perturb
-from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.simulate import Motion, Noise, general
+from gtsam_rwhec.simulate.simulated_noise import perturb, random_poses
 from gtsam_rwhec.simulate.simulated_rigs import carrier_poses
-from gtsam_rwhec.solver import identification
-from gtsam_rwhec.solver import weak_directions
-from gtsam_rwhec.solver.answers import PairPoses
-from gtsam_rwhec.solver.answers import costs_of_pairs
-from gtsam_rwhec.solver.answers import given_answer
-from gtsam_rwhec.solver.free_directions import FreeKind
-from gtsam_rwhec.solver.free_directions import FreeReason
-from gtsam_rwhec.solver.identification import identify
+from gtsam_rwhec.solver import identification, weak_directions
+from gtsam_rwhec.solver.answers import PairPoses, costs_of_pairs, given_answer
+from gtsam_rwhec.solver.free_directions import FreeKind, FreeReason
+from gtsam_rwhec.solver.identification import Identifiability, identify
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.identification import Identifiability
 
 NOISE = Noise(0.005, 5000.0)
 
