@@ -57,7 +57,7 @@ def row(what: str, figures: dict[str, float], unit: str) -> Row:
 
 
 def reading(folder: Path, count: int) -> list[Row]:
-    """``logs/mcap_blocks.py`` against mcap's reader: time, memory, and what is lost of damaged files."""
+    """``logs/mcap_file.py`` against mcap's reader: time, memory, and what is lost of damaged files."""
     path = folder / "poses.mcap"
     with LogWriter(path) as out:
         for i in range(count):

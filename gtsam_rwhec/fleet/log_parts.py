@@ -11,12 +11,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeAlias
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
 
 from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
 from gtsam_rwhec.files.budgets import Spending
@@ -25,8 +25,7 @@ from gtsam_rwhec.fleet.byte_count import count_bytes, counted_bytes
 from gtsam_rwhec.fleet.mcap_copy import McapCopy
 from gtsam_rwhec.fleet.stores import Options, local_path, read_ranges, size_of
 from gtsam_rwhec.fleet.without_secrets import shown
-from gtsam_rwhec.logs.mcap_index import Extra, read_index
-from gtsam_rwhec.logs.mcap_records import FAULTS, RECORD, Descriptions, parsed, records_in
+from gtsam_rwhec.logs.mcap_file import FAULTS, RECORD, read_index
 from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
 #: Bytes. A file on disk that is smaller is read where it is, whatever is in it.
@@ -64,12 +63,12 @@ _Request: TypeAlias = tuple[int, int, list[tuple[int, int]]]
 
 @dataclass(frozen=True)
 class Needed:
-    """What is needed of a log, by its index: schemas, channels and statistics as they are, chunks and metadata."""
+    """What is needed of a log, by its index: schemas and channels, statistics, chunks and metadata."""
 
-    descriptions: tuple[bytes, ...]
+    descriptions: tuple[McapRecord, ...]
     statistics: Statistics
     chunks: tuple[ChunkIndex, ...]
-    metadata: tuple[Extra, ...]
+    metadata: tuple[MetadataIndex, ...]
 
     @property
     def chunk_bytes(self) -> int:
@@ -121,53 +120,41 @@ def local_copy_of_topics(url: str, topics: Collection[str], folder: Path, option
 
 def needed_of(url: str, size: int, topics: Collection[str], options: Options | None = None) -> Needed | str:
     """What a log of `size` bytes has of some topics, by its index; or why the index does not tell."""
-    kept: list[bytes] = []
 
     def read(offset: int, length: int) -> bytes:
-        data = read_ranges(url, [(offset, min(size, offset + length))], options)[0]
-        kept.append(data)
-        return data
+        return read_ranges(url, [(offset, min(size, offset + length))], options)[0]
 
     place = Path(shown(url))
-    descriptions = Descriptions(place)
     try:
-        index = read_index(read, place, size, descriptions, Spending(place, size))
+        index = read_index(read, place, size, Spending(place, size), with_channels=True)
     except BudgetError as error:
         raise BudgetError(str(error).replace(str(place), shown(url))) from None
     except FAULTS as error:
         return f"its index is damaged ({error})"
     if index is None:
         return "it has no index, or one that does not fit (recording broke off?); mcap recover makes one"
-    wanted = _channels(descriptions, topics)
-    raw, chunks, statistics = [], [], None
-    summary = kept[-1]  # after the footer
-    for opcode, begins, ends in records_in(summary):
-        content = summary[begins:ends]
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            raw.append(RECORD.pack(opcode, len(content)) + content)
-        elif opcode == Opcode.STATISTICS:
-            statistics = parsed(Statistics, content)
-        elif opcode == Opcode.CHUNK_INDEX:
-            chunk = parsed(ChunkIndex, content)
-            # A recorder that writes no index of messages does not say what is in the chunk.
-            if not chunk.message_index_offsets or wanted & set(chunk.message_index_offsets):
-                chunks.append(chunk)
-    assert statistics is not None  # read_index asks for it
-    counts = {key: count for key, count in statistics.channel_message_counts.items() if key in wanted}
-    statistics.channel_message_counts = counts
-    own = (extra for extra in index.extras if extra.opcode == Opcode.METADATA and extra.name.startswith(_OWN))
-    chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
-    return Needed(tuple(raw), statistics, tuple(chunks), tuple(own))
-
-
-def _channels(descriptions: Descriptions, topics: Collection[str]) -> set[int]:
-    """The channels of topics, by number."""
+    summary = index.summary
     with_tf = any(topic.rpartition("/")[2] in TF_TOPICS for topic in topics)
-    found = set()
-    for number, channel in descriptions.channels.items():
-        if channel.topic in topics or (with_tf and _is_tf(channel, descriptions.schemas.get(channel.schema_id))):
-            found.add(number)
-    return found
+    wanted = {
+        number
+        for number, channel in summary.channels.items()
+        if channel.topic in topics or (with_tf and _is_tf(channel, summary.schemas.get(channel.schema_id)))
+    }
+    # A recorder that writes no index of messages does not say what is in a chunk.
+    chunks = [
+        chunk
+        for chunk in summary.chunk_indexes
+        if not chunk.message_index_offsets or wanted & set(chunk.message_index_offsets)
+    ]
+    chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
+    assert summary.statistics is not None  # read_index asks for it
+    counts = summary.statistics.channel_message_counts
+    statistics = replace(
+        summary.statistics, channel_message_counts={key: counts[key] for key in counts if key in wanted}
+    )
+    own = (metadata for metadata in summary.metadata_indexes if metadata.name.startswith(_OWN))
+    descriptions = (*summary.schemas.values(), *summary.channels.values())
+    return Needed(descriptions, statistics, tuple(chunks), tuple(own))
 
 
 def _is_tf(channel: Channel, schema: Schema | None) -> bool:

@@ -9,7 +9,7 @@ from typing import BinaryIO
 from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex, DataEnd, Footer, Header, McapRecord, MetadataIndex, Statistics
 
-from gtsam_rwhec.logs.mcap_index import MAGIC
+from gtsam_rwhec.logs.mcap_file import MAGIC
 
 
 class McapCopy:
@@ -36,12 +36,10 @@ class McapCopy:
         self._metadata.append(MetadataIndex(offset=self._at, length=len(record), name=name))
         self._write(record)
 
-    def finish(self, descriptions: Sequence[bytes], statistics: Statistics) -> None:
-        """Write the index: schemas and channels as records, and the counts of the channels that are whole."""
+    def finish(self, descriptions: Sequence[McapRecord], statistics: Statistics) -> None:
+        """Write the index: schemas and channels, and the counts of the channels that are whole."""
         self._write_record(DataEnd(data_section_crc=0))
         begins = self._at
-        for record in descriptions:
-            self._write(record)
         counted = replace(
             statistics,
             chunk_count=len(self._chunks),
@@ -49,7 +47,7 @@ class McapCopy:
             metadata_count=len(self._metadata),
             message_count=sum(statistics.channel_message_counts.values()),
         )
-        for entry in (counted, *self._chunks, *self._metadata):
+        for entry in (*descriptions, counted, *self._chunks, *self._metadata):
             self._write_record(entry)
         self._write_record(Footer(summary_start=begins, summary_offset_start=0, summary_crc=0))
         self._write(MAGIC)

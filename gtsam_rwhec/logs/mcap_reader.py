@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import heapq
 import warnings
-from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
@@ -22,7 +21,7 @@ from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, MessageError
 from gtsam_rwhec.files.budgets import MIB, LogBudget
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.logs.foxglove_messages import Decoder, decoder_for
-from gtsam_rwhec.logs.mcap_blocks import Block, McapFile, Messages
+from gtsam_rwhec.logs.mcap_file import Block, McapFile, Messages
 from gtsam_rwhec.logs.records import Array, PoseRecord, PoseSeries, Record, Topic
 
 OnBad = Literal["warn", "raise"]
@@ -37,12 +36,7 @@ MOST_NAMED = 50
 
 
 def open_log(path: str | Path | Iterable[str | Path]) -> Log:
-    """Open a log.
-
-    Parameters
-    ----------
-    path
-        An MCAP file, several (a bag that was split), or a folder of them (a ROS 2 bag).
+    """Open an MCAP file, several (a bag that was split), or a folder of them (a ROS 2 bag).
 
     Raises
     ------
@@ -96,11 +90,11 @@ class Log:
                 schema = file.schemas.get(channel.schema_id)
                 key = channel.topic, schema.name if schema else "", channel.message_encoding
                 decoder = self._decoder(number, channel.id)
-                seen, before = file.seen.get(channel.id), found.get(key)
-                spans = [(s.first_ns, s.last_ns) for s in (seen, before) if s is not None]
-                firsts = [first for first, _ in spans if first is not None]
-                lasts = [last for _, last in spans if last is not None]
-                count = (seen.count if seen else 0) + (before.count if before else 0)
+                span, before = file.spans.get(channel.id), found.get(key)
+                known = [each for each in (span, before) if each is not None]
+                firsts = [each.first_ns for each in known if each.first_ns is not None]
+                lasts = [each.last_ns for each in known if each.last_ns is not None]
+                count = sum(each.count for each in known)
                 unreadable = decoder if isinstance(decoder, str) else ""
                 found[key] = Topic(*key, count, min(firsts, default=None), max(lasts, default=None), unreadable)
         return tuple(found[key] for key in sorted(found))
@@ -149,59 +143,53 @@ class Log:
         bad = _Bad(on_bad)
         for file in self.files:
             file.spending.begin_pass()
-        waiting = sorted(
-            ((block.start_ns, number, block) for number, file in enumerate(self.files) for block in file.blocks),
-            key=lambda entry: entry[:2],
-            reverse=True,
-        )
-        # The heap holds the time of each open block's next record; the number breaks ties.
-        heap: list[tuple[int, int, Record, Iterator[Record], int]] = []
-        order = open_bytes = 0
-        while waiting or heap:
-            if waiting and (not heap or waiting[-1][0] <= heap[0][0]):
-                _, number, block = waiting.pop()
+        blocks = [(number, block) for number, file in enumerate(self.files) for block in file.blocks]
+        blocks.sort(key=lambda entry: (entry[1].start_ns, entry[0]))
+        # What is next by time: a block that is to be opened (False), or a record of one that is open (True).
+        heap = [(block.start_ns, False, i) for i, (_, block) in enumerate(blocks)]
+        waiting: dict[int, tuple[Record, Iterator[Record], int]] = {}
+        open_bytes = 0
+        while heap:
+            _, is_open, i = heapq.heappop(heap)
+            record: Record | None
+            if is_open:
+                record, records, size = waiting.pop(i)
+                limit = heap[0][0] if heap else 1 << 64
+                yield record
+                for record in records:
+                    if record.logged_ns >= limit:
+                        break
+                    yield record
+                else:
+                    record = None
+            else:
+                number, block = blocks[i]
                 messages = self._opened(number, block, bad)
                 if messages is None:
                     continue
                 size = len(messages.data) + RECORDS_FOR_A_BYTE * min(len(messages.data), SLICE_BYTES)
                 open_bytes += size
-                if heap and open_bytes > self._budget.open:
+                if waiting and open_bytes > self._budget.open:
                     raise BudgetError(
-                        f"{self.files[number].path}: {len(heap) + 1} chunks overlap in time, which take {open_bytes} "
-                        f"bytes together, and a log of {self._budget.size} bytes may take {self._budget.open}. Sort "
-                        "the log first (mcap sort)."
+                        f"{self.files[number].path}: {len(waiting) + 1} chunks overlap in time, which take "
+                        f"{open_bytes} bytes together, and a log of {self._budget.size} bytes may take "
+                        f"{self._budget.open}. Sort the log first (mcap sort)."
                     )
                 records = self._records_of(number, messages, wanted, bad)
-                first = next(records, None)
-                if first is None:
-                    open_bytes -= size
-                else:
-                    heapq.heappush(heap, (first.logged_ns, order, first, records, size))
-                    order += 1
-                # The generator keeps the messages for as long as they are needed; this frame must not.
-                del messages, records
-                continue
-            _, tie, record, records, size = heapq.heappop(heap)
-            limit = min(heap[0][0] if heap else 1 << 64, waiting[-1][0] if waiting else 1 << 64)
-            yield record
-            for record in records:
-                if record.logged_ns >= limit:
-                    heapq.heappush(heap, (record.logged_ns, tie, record, records, size))
-                    break
-                yield record
-            else:
+                del messages  # the generator keeps it for as long as it is needed
+                record = next(records, None)
+            if record is None:
                 open_bytes -= size
+            else:
+                waiting[i] = record, records, size
+                heapq.heappush(heap, (record.logged_ns, True, i))
+            del record, records  # a block that is at its end must not wait for the next one to be opened
         bad.say()
 
     def records_logged_at(self, topics: Iterable[str], logged_ns: Iterable[int]) -> Iterator[Record]:
         """The records of some topics whose log time is one of these, in any order: only their blocks are opened.
 
-        What cannot be read is left out without a word, since `records` names it.
-
-        Raises
-        ------
-        LogError
-            As `records`.
+        What cannot be read is left out without a word, since `records` names it. Raises a LogError as `records`.
         """
         wanted, bad = self._checked_topics(topics), _Bad("warn")
         times = np.unique(np.fromiter(logged_ns, dtype=np.uint64))
@@ -211,14 +199,9 @@ class Log:
                 first = np.searchsorted(times, np.uint64(block.start_ns))
                 end = np.searchsorted(times, np.uint64(block.end_ns), side="right")
                 messages = self._opened(number, block, bad) if first < end else None
-                if messages is None:
-                    continue
-                some = np.flatnonzero(np.isin(messages.heads["log_time"], times))
-                start, stop = (np.asarray(part, dtype=np.uint64)[some] for part in (messages.start, messages.end))
-                of_times = Messages(
-                    messages.data, messages.heads[some], array("Q", start.tobytes()), array("Q", stop.tobytes())
-                )
-                yield from self._records_of(number, of_times, wanted, bad)
+                if messages is not None:
+                    some = np.flatnonzero(np.isin(messages.heads["log_time"], times))
+                    yield from self._records_of(number, messages, wanted, bad, some)
 
     def poses(self, topic: str, parent: str | None = None, child: str | None = None) -> PoseSeries:
         """All poses of a topic (and of one pair of frames of it), sorted by their own stamps.
@@ -287,11 +270,13 @@ class Log:
             bad.add(f"{file.path}", error)
             return None
 
-    def _records_of(self, number: int, messages: Messages, wanted: set[str] | None, bad: _Bad) -> Iterator[Record]:
-        """Records of one block, in the order of log time. They are decoded a slice at a time."""
+    def _records_of(
+        self, number: int, messages: Messages, wanted: set[str] | None, bad: _Bad, some: np.ndarray | None = None
+    ) -> Iterator[Record]:
+        """Records of one block, or of `some` of its messages, by log time. They are decoded a slice at a time."""
         file = self.files[number]
         log_time = messages.heads["log_time"]
-        order = np.argsort(log_time, kind="stable")
+        order = np.argsort(log_time, kind="stable") if some is None else some
         data = memoryview(messages.data)
         sizes = np.asarray(messages.end, dtype=np.int64) - np.asarray(messages.start, dtype=np.int64)
         for places in _slices(order, sizes):
