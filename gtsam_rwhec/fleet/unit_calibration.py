@@ -21,7 +21,7 @@ from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.fleet.merging import Merged
 from gtsam_rwhec.problem.selection import problem_of_moments
 from gtsam_rwhec.results.log_history import LogFields, TimeOffsetFields
-from gtsam_rwhec.results.result_file import calibration_json
+from gtsam_rwhec.results.result_file import result_json
 from gtsam_rwhec.results.result_judgement import judge, short_of_measurements
 from gtsam_rwhec.rig import Rig
 
@@ -136,7 +136,7 @@ def calibrated(
     if found.solution is not None:
         judgement = judge(found.solution, found.refined, fields, findings)
     found = replace(found, findings=findings, judgement=judgement, notes=notes)
-    return UnitCalibration(found, fields, calibration_json(found, fields, "the result of a unit"))
+    return UnitCalibration(found, fields, result_json(found, fields, "the result of a unit"))
 
 
 def _with_offsets(fields: LogFields, found: Calibration) -> LogFields:

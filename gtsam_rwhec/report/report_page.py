@@ -32,7 +32,7 @@ from gtsam_rwhec.results import Evidence, evidence_path, read_evidence
 from gtsam_rwhec.results.evidence import checksum
 from gtsam_rwhec.results.json_tree import MOST_BYTES
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_file import calibration_json
+from gtsam_rwhec.results.result_file import result_json
 
 #: The name of a result in an output folder.
 RESULT_FILE = "result.json"
@@ -85,7 +85,7 @@ def write_html(
     folder = None if figures is None else checked_path(figures)
     _check_evidence(evidence)
     if isinstance(result, Calibration):
-        shown = ShownResult.of(calibration_json(result, log), evidence, images=images)
+        shown = ShownResult.of(result_json(result, log), evidence, images=images)
     else:
         file = _result_file(result)
         if is_one_of(path, (file, evidence_path(file))):

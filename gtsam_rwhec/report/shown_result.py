@@ -8,14 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.report.report_blocks import Number
 from gtsam_rwhec.results import Evidence
-from gtsam_rwhec.results.earlier_versions import FIRST_WITH_CALIBRATION, as_version_4
 from gtsam_rwhec.results.evidence import evidence_json
-from gtsam_rwhec.results.json_tree import parse_json
-from gtsam_rwhec.results.result_file import Result, parse_result
-from gtsam_rwhec.results.schema import FORMAT, FORMAT_VERSION
+from gtsam_rwhec.results.result_file import Result, has_no_answer, parse_result, parse_tree
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +21,7 @@ class ShownResult:
     Attributes
     ----------
     tree : dict
-        The result's JSON; of files of versions 1 to 3, as version 4 has it.
+        The result's JSON.
     result : Result or None
         The same as records; None where the calibration has no answer.
     evidence : Evidence or None
@@ -53,16 +49,8 @@ class ShownResult:
         FileFormatError, ResultVersionError
             As `read_result` does; a result without an answer is shown all the same.
         """
-        try:
-            tree = parse_json(content)
-        except ValueError:
-            tree = None  # what is wrong with it is said below
-        if _has_no_answer(tree):
-            return ShownResult(tree, None, evidence, name, images)
-        result = parse_result(content, name)
-        if "verdict" not in tree:  # of versions 1 to 3, whose fields have other places
-            tree = as_version_4(tree)
-        return ShownResult(tree, result, evidence, name, images)
+        tree = parse_tree(content, name)
+        return ShownResult(tree, None if has_no_answer(tree) else parse_result(content, name), evidence, name, images)
 
     @cached_property
     def evidence_tree(self) -> Any:
@@ -82,18 +70,6 @@ class ShownResult:
     def evident(self, *path: str | int, times: float = 1.0, spec: str = ".4g", unit: str = "") -> Number:
         """The number at a place of the evidence's JSON."""
         return _number(self.evidence_tree, "evidence.json", path, times, spec, unit)
-
-
-def _has_no_answer(tree: Any) -> bool:
-    """Whether this is the result of a calibration without an answer, which has a verdict and no poses."""
-    return (
-        isinstance(tree, dict)
-        and tree.get("format") == FORMAT
-        and tree.get("format_version") in range(FIRST_WITH_CALIBRATION, FORMAT_VERSION + 1)
-        and "certified" not in tree
-        and tree.get("verdict") == Verdict.DO_NOT_USE
-        and isinstance(tree.get("verdict_reason"), str)
-    )
 
 
 def _number(tree: Any, file: str, path: tuple[str | int, ...], times: float, spec: str, unit: str) -> Number:

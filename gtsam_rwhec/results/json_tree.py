@@ -146,10 +146,10 @@ def _cut(place: str) -> str:
     return shown(place, 200)
 
 
-def in_words(error: Exception, moved: tuple[str, ...] = POSED) -> str:
+def in_words(error: Exception, owner: str = "") -> str:
     """What is wrong with a file: of pydantic's error, each fault with its JSON path, the first three in full.
 
-    ``moved`` are the fields that were moved from the top of the file into ``refined`` before the check.
+    ``owner`` is the record into which `POSED` was moved from the top of the file before the check.
     """
     if not isinstance(error, ValidationError):
         return f"{error}."
@@ -157,7 +157,7 @@ def in_words(error: Exception, moved: tuple[str, ...] = POSED) -> str:
         return f"{error.error_count()} fields are missing, unknown or wrong."
     faults = []
     for fault in error.errors(include_url=False):
-        keys = fault["loc"][1:] if fault["loc"][:2] in [("refined", name) for name in moved] else fault["loc"]
+        keys = fault["loc"][1:] if fault["loc"][:2] in [(owner, name) for name in POSED] else fault["loc"]
         place = "$" + "".join(_step(key) for key in keys)
         given = brief(fault["input"], 60)
         value = f" (found {given})" if "characters ...]" not in given and fault["type"] != "missing" else ""

@@ -5,12 +5,11 @@ The logs that stages write hold these records, and so does the result file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from gtsam_rwhec.calibration.outliers import NEARLY_HALF, contradicted_frames
+from gtsam_rwhec.calibration.outliers import LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.sizes import is_size_doubted, is_size_uncertain
 from gtsam_rwhec.problem.measurements import Pair
 
@@ -57,17 +56,6 @@ class OutlierCount(_Count):
     """How many measurements of a pair the answer uses, and how many were left out as outliers."""
 
     left_out: Count = Field(default=0, description="measurements that were left out as outliers")
-
-
-class FrameOutliers(_Record):
-    """How many measurements of one sensor or target were left out as outliers."""
-
-    frame: str = Field(description="name of the sensor or target")
-    left_out: Count = Field(description="measurements that were left out as outliers")
-    measurements: Count = Field(description="all measurements of the frame, with the outliers")
-
-    def __str__(self) -> str:
-        return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
 
 
 class DetectionReport(_Record):
@@ -152,12 +140,11 @@ class LogFields(_Record):
     outliers: tuple[OutlierCount, ...] = Field(description="measurements in the answer, and outliers, of each pair")
     sizes: tuple[SizeFields, ...] = Field(description="what the measurements say about the stated sizes")
     time_offsets: tuple[TimeOffsetFields, ...] = Field(description="time offset of every sensor that was used")
-    contradicted: tuple[FrameOutliers, ...] = Field(
-        default=(), description="sensors and targets whose poses must not be used"
-    )
 
+    @property
+    def contradicted(self) -> tuple[LeftOut, ...]:
+        """The sensors and targets of which most, or of many nearly half, of the measurements were left out.
 
-def contradictions(outliers: Iterable[OutlierCount], nearly_half: float = NEARLY_HALF) -> tuple[FrameOutliers, ...]:
-    """The sensors and targets of which more than half, or of many nearly half, of the measurements were left out."""
-    counts = {count.pair: (count.used, count.used + count.left_out) for count in outliers}
-    return tuple(FrameOutliers(**vars(frame)) for frame in contradicted_frames(counts, nearly_half))
+        Their poses are not to be used.
+        """
+        return contradicted_frames({count.pair: (count.used, count.used + count.left_out) for count in self.outliers})

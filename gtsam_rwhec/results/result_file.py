@@ -1,13 +1,13 @@
-"""Result files: calibrations are read back bit for bit, and everything in a file is checked.
+"""Result files: calibrations are written as JSON and read back bit for bit, and what is read is checked.
 
-`gtsam_rwhec.results.schema` has the fields, `gtsam_rwhec.results.result_file` writes them.
+Every file states its units and frame conventions itself; `gtsam_rwhec.results.schema` has the fields.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,26 +21,17 @@ from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.files.whole_files import checked_path, read_whole, write_atomically
 from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
-from gtsam_rwhec.results.agreement import (
-    check_certificates,
-    check_log,
-    check_says_what_it_is_about,
-    check_scale,
-    check_sizes,
-    check_top,
-    check_verdict,
-)
-from gtsam_rwhec.results.corners_agreement import check_corners
-from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
-from gtsam_rwhec.results.earlier_versions import (
-    FIRST_VERSION,
-    FIRST_WITH_CALIBRATION,
-    FIRST_WITH_REGION,
-    FIRST_WITH_VERDICT,
-    as_version_4,
-)
+from gtsam_rwhec.fitting.refinement_from_poses import movements
 from gtsam_rwhec.results.json_tree import MOST_BYTES, POSED, from_json, in_words, parse_json, to_json
 from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.result_checks import (
+    check_certificates,
+    check_corners,
+    check_joint,
+    check_log,
+    check_sizes,
+    check_verdict,
+)
 from gtsam_rwhec.results.result_judgement import contradicted_names, judge
 from gtsam_rwhec.results.schema import (
     CONVENTIONS,
@@ -55,6 +46,13 @@ from gtsam_rwhec.results.schema import (
     pose_rows,
 )
 from gtsam_rwhec.solver.solution import Solution
+
+#: The name of the result in an output folder.
+RESULT_FILE = "result.json"
+#: Fields of the certified solution that the file does not repeat: they stand in its certificate.
+OF_CERTIFICATE = ("cost", "is_relative")
+#: Fields of a certificate that limit what it proves.
+LIMITS = ("basis", "region")
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ def read_solution(path: str | Path) -> Solution:
     Raises
     ------
     ResultVersionError
-        A newer version of this library wrote the file; the message says what to do.
+        Another version of this library wrote the file; the message says what to do.
     FileFormatError
         The file cannot be read, is not JSON, or is not a result; or a field is missing, unknown or wrong. The message
         gives the JSON path of the field.
@@ -110,13 +108,7 @@ def read_solution(path: str | Path) -> Solution:
 
 
 def read_refined(path: str | Path) -> RefinedPoses:
-    """Read the refined calibration of a result file: poses and covariances are the same doubles as before.
-
-    Raises
-    ------
-    ResultVersionError, FileFormatError
-        As `read_solution` does; and if the file holds no refined poses.
-    """
+    """Read the refined calibration of a result file; raises as `read_solution`, and if it holds no refined poses."""
     refined = read_result(path).refined
     if refined is None:
         raise FileFormatError(
@@ -131,87 +123,130 @@ def read_result(path: str | Path) -> Result:
     return parse_result(read_whole(path, MOST_BYTES, "A result was"), path)
 
 
+def read_calibration(path: str | Path) -> Result:
+    """Read ``result.json``, or the one in a folder that ``calibrate`` wrote; raises as `read_solution` does."""
+    return read_result(result_path(path))
+
+
+def result_path(path: str | Path) -> Path:
+    """The result file that a path means: itself, or the one in this folder; FileFormatError if there is none."""
+    path = Path(path)
+    if not path.is_dir():
+        return path
+    inside = path / RESULT_FILE
+    if not inside.is_file():
+        raise FileFormatError(
+            f"{path} has no {RESULT_FILE}; give a folder that gtsam-rwhec calibrate wrote, or a result file"
+        )
+    return inside
+
+
 def parse_result(content: bytes, path: str | Path) -> Result:
     """Read the content of a file; messages name `path`. Raises as `read_solution` does."""
+    raw = parse_tree(content, path)
+    if has_no_answer(raw):
+        why = shown(str(raw.get("verdict_reason")))
+        raise FileFormatError(f"{path} has no poses, because the calibration has no answer: {why}")
+    try:
+        file = checked_file(raw)
+        solution, refined = _of_class(Solution, file.certified), None
+        if file.refined is not None:
+            refined = _of_class(RefinedPoses, file.refined)
+            refined = replace(refined, moved=movements(solution, refined.X, refined.Y))
+        result = Result(solution, refined, file.log, file.calibration)
+        check_verdict(file.verdict, file.verdict_grounds, result.judgement)
+    except ValueError as error:
+        raise FileFormatError(f"{path} is not a valid result: {in_words(error)}") from error
+    return result
+
+
+def parse_tree(content: bytes, path: str | Path) -> dict[str, Any]:
+    """The JSON values of a result file of this version; its fields are not checked."""
     try:
         raw = parse_json(content)
-        fields = {name: raw[name] for name in _Header.model_fields if name in raw} if isinstance(raw, dict) else raw
-        header = _Header.model_validate(fields)
+        heading = {name: raw[name] for name in _Header.model_fields if name in raw} if isinstance(raw, dict) else raw
+        header = _Header.model_validate(heading)
     except ValueError as error:
         raise FileFormatError(f"{path} is not a result of gtsam-rwhec: {in_words(error)}") from error
     if header.format != FORMAT:
         raise FileFormatError(
             f"{path}: $.format is {brief(header.format)}, expected {FORMAT!r}: this is another kind of file."
         )
-    number = header.format_version
-    if not FIRST_VERSION <= number <= FORMAT_VERSION:
-        remedy = "Install a newer gtsam-rwhec" if number > FORMAT_VERSION else "Calibrate again to write a new file"
+    if header.format_version != FORMAT_VERSION:
+        is_newer = header.format_version > FORMAT_VERSION
+        remedy = "Install a newer gtsam-rwhec" if is_newer else "Calibrate again to write a new file"
         raise ResultVersionError(
-            f"{path} has version {number} of the result format (written by {shown(header.written_by)}); this "
-            f"gtsam-rwhec reads versions {FIRST_VERSION} to {FORMAT_VERSION}. {remedy}."
+            f"{path} has version {header.format_version} of the result format (written by {shown(header.written_by)}); "
+            f"this gtsam-rwhec reads version {FORMAT_VERSION}. {remedy}."
         )
-    if number >= FIRST_WITH_CALIBRATION and "certified" not in raw and raw.get("verdict") == Verdict.DO_NOT_USE.value:
-        why = shown(str(raw.get("verdict_reason")))
-        raise FileFormatError(f"{path} has no poses, because the calibration has no answer: {why}")
-    try:
-        if number < FIRST_WITH_VERDICT:
-            raw = as_version_4(raw)
-        if number >= FIRST_WITH_REGION:
-            check_says_what_it_is_about(raw)
-        file = checked_file(
-            {**raw, "format_version": FORMAT_VERSION}, number
-        )  # version 4 lacks fields that have defaults
-        result = _result_of(file)
-        if number >= FIRST_WITH_VERDICT:
-            check_verdict(file.verdict, file.verdict_grounds, result.judgement, number)
-    except ValueError as error:
-        of_version = (
-            "" if number == FORMAT_VERSION else f" of version {number} (converted places are those of {FORMAT_VERSION})"
-        )
-        raise FileFormatError(f"{path} is not a valid result{of_version}: {in_words(error)}") from error
-    return result
+    tree: dict[str, Any] = raw
+    return tree
 
 
-def _result_of(file: ResultFile) -> Result:
-    refined = None if file.refined is None else _of_class(RefinedPoses, file.refined)
-    return Result(_of_class(Solution, file.certified), refined, file.log, file.calibration)
+def has_no_answer(tree: Mapping[str, Any]) -> bool:
+    """Whether a file is of a calibration without an answer: it has a verdict, and no poses."""
+    return (
+        "certified" not in tree
+        and tree.get("verdict") == Verdict.DO_NOT_USE
+        and isinstance(tree.get("verdict_reason"), str)
+    )
 
 
 def _of_class(base: Any, record: Any) -> Any:
     return base(**{field.name: getattr(record, field.name) for field in fields(base)})
 
 
-def checked_file(tree: dict[str, Any], version: int) -> ResultFile:
-    """Check the fields of a file of this version and make records of them.
-
-    `POSED` at the top belong to the refined answer, if any.
+def checked_file(tree: dict[str, Any]) -> ResultFile:
+    """Check the fields of a file and make records of them.
 
     Raises
     ------
     ValueError
         A field is missing, unknown or wrong, or two fields contradict one another; the message has the JSON path.
     """
-    posed = {name: tree[name] for name in POSED if name in tree}
-    rest = {name: value for name, value in tree.items() if name not in posed}
-    if isinstance(tree.get("refined"), dict):
-        rest["refined"] = {**tree["refined"], **posed}
-    file = ResultFile.model_validate_json(json.dumps(from_json(rest)))
+    owner = "refined" if isinstance(tree.get("refined"), dict) else "certified"
+    try:
+        file = ResultFile.model_validate_json(json.dumps(_with_what_follows(from_json(tree), owner)))
+    except ValueError as error:
+        raise ValueError(in_words(error, owner).removesuffix(".")) from error
     check_certificates(file.certified)
-    check_scale(file.certified, "$.certified.scale")
     check_sizes(file.certified, file.refined)
     if file.log is not None:
-        check_log(file.log, version)
-    if file.refined is None:
-        check_top(tree)
-    else:
-        check_scale(file.refined, "$.scale")
-        check_joint(file.refined, file.certified)
-        check_frames(file.refined, _of_class(RefinedPoses, file.refined))
+        check_log(file.log)
+    if file.refined is not None:
         check_corners(file.refined)
+        check_joint(file.refined, file.certified)
     return file
 
 
-CARRIERS = {"X": TARGET_CARRIER, "Y": SENSOR_CARRIER}
+def _with_what_follows(tree: dict[str, Any], owner: str) -> dict[str, Any]:
+    """The tree as the records have it: with `POSED` in its ``owner``, and with what a file does not repeat."""
+    certified, answer = tree.get("certified"), tree.get(owner)
+    if not isinstance(certified, dict) or not isinstance(answer, dict):
+        return tree  # the schema says what is missing
+    again = [
+        *(f"$.{owner}.{name}" for name in POSED if name in answer),
+        *(f"$.certified.{name}" for name in OF_CERTIFICATE if name in certified),
+    ]
+    if again:
+        raise ValueError(f"{again[0]}: unknown field")
+    answer |= {name: tree.pop(name) for name in POSED if name in tree}
+    certificate, residuals = certified.get("certificate"), certified.get("residuals")
+    if isinstance(certificate, dict):
+        certified |= {name: certificate[name] for name in OF_CERTIFICATE if name in certificate}
+        missing = [name for name in LIMITS if name not in certificate]
+        if missing:  # without one it would claim too much
+            raise ValueError(f"$.certified.certificate.{missing[0]}: is missing")
+    identifiability = certified.get("identifiability")
+    pairs = identifiability.get("pairs") if isinstance(identifiability, dict) else None
+    if isinstance(residuals, dict) and isinstance(pairs, dict):
+        for key, residual in residuals.items():
+            of_pair = pairs.get(key)
+            if isinstance(residual, dict) and isinstance(of_pair, dict) and "number_of_measurements" in of_pair:
+                residual["number_of_measurements"] = of_pair["number_of_measurements"]
+    if isinstance(tree.get("refined"), dict):
+        tree["refined"]["moved"] = {}
+    return tree
 
 
 def write_solution(solution: Solution, path: str | Path) -> None:
@@ -230,7 +265,7 @@ def write_solution(solution: Solution, path: str | Path) -> None:
         The file cannot be written (the message says why), or a number of the solution is NaN.
     """
     path = checked_path(path)
-    write_atomically(path, _content(path, solution, None, None))
+    write_atomically(path, result_json(solution, path=path))
 
 
 def write_refined(refined: Refined, path: str | Path, log: LogFields | None = None) -> None:
@@ -250,7 +285,7 @@ def write_refined(refined: Refined, path: str | Path, log: LogFields | None = No
     path = checked_path(path)
     if not isinstance(refined, Refined):
         raise OptionError(f"refined is a {type(refined).__name__}; give what gtsam_rwhec.refine returned")
-    write_atomically(path, _content(path, refined.solution, refined, log))
+    write_atomically(path, result_json(refined, log, path))
 
 
 def write_calibration(calibration: Calibration, path: str | Path, log: LogFields | None = None) -> None:
@@ -270,61 +305,53 @@ def write_calibration(calibration: Calibration, path: str | Path, log: LogFields
     path = checked_path(path)
     if not isinstance(calibration, Calibration):
         raise OptionError(f"calibration is a {type(calibration).__name__}; give what gtsam_rwhec.calibrate returned")
-    write_atomically(path, calibration_json(calibration, log, path))
+    write_atomically(path, result_json(calibration, log, path))
 
 
-def calibration_json(calibration: Calibration, log: LogFields | None = None, path: str | Path = "the result") -> bytes:
-    """What `write_calibration` writes."""
-    record, names = CalibrationFields.of(calibration), calibration.carriers
-    if calibration.solution is None:
-        return _without_answer(path, calibration, record)
-    carriers = {"X": names.targets or TARGET_CARRIER, "Y": names.sensors or SENSOR_CARRIER}
-    return _content(path, calibration.solution, calibration.refined, log, record, carriers)
-
-
-def _content(
-    path: str | Path,
-    solution: Solution,
-    refined: Refined | None,
-    log: LogFields | None,
-    calibration: CalibrationFields | None = None,
-    carriers: Mapping[str, str] = CARRIERS,
+def result_json(
+    answer: Calibration | Refined | Solution, log: LogFields | None = None, path: str | Path = "the result"
 ) -> bytes:
-    """The content of a file. It is read back here once, so that every written file can be read."""
-    judgement = judge(solution, refined, log, () if calibration is None else calibration.findings)
+    """The content of the file of an answer. It is read back here once, so that every written file can be read."""
+    solution, refined, record = answer, None, None
+    targets, sensors = TARGET_CARRIER, SENSOR_CARRIER
+    if isinstance(answer, Calibration):
+        solution, refined, record = answer.solution, answer.refined, CalibrationFields.of(answer)
+        targets, sensors = answer.carriers.targets or targets, answer.carriers.sensors or sensors
+    elif isinstance(answer, Refined):
+        solution, refined = answer.solution, answer
+    if isinstance(answer, Calibration) and solution is None:
+        none = {"sensors": [], "targets": [], "conventions": CONVENTIONS}
+        return _encoded({**_heading(answer.judgement), **none, "calibration": to_json(record, "$.calibration")})
     if log is not None:
-        carriers = {"X": log.target_carrier, "Y": log.sensor_carrier}
+        targets, sensors = log.target_carrier, log.sensor_carrier
     try:
+        judgement = judge(solution, refined, log, () if record is None else record.findings)
         wrong = contradicted_names(refined, log)
-        certified = _posed(to_json(solution, "$.certified"), solution, carriers, wrong)
+        certified = _posed(to_json(solution, "$.certified"), solution, (targets, sensors), wrong)
+        for name in OF_CERTIFICATE:
+            certified.pop(name)
+        for residual in certified["residuals"]:
+            residual.pop("number_of_measurements")
         parts: dict[str, Any] = {"certified": certified}
-        poses = {name: certified[name] for name in POSED}
         if refined is not None:
-            parts["refined"] = _posed(to_json(_refined_fields(refined), "$.refined"), refined, carriers, wrong)
-            poses = {name: parts["refined"].pop(name) for name in POSED}
-        if calibration is not None:
-            parts["calibration"] = to_json(calibration, "$.calibration")
+            fields_of = to_json(_refined_fields(refined), "$.refined")
+            parts["refined"] = _posed(fields_of, refined, (targets, sensors), wrong)
+            parts["refined"].pop("moved")
+        owner = parts["certified" if refined is None else "refined"]
+        poses = {name: owner.pop(name) for name in POSED}
+        if record is not None:
+            parts["calibration"] = to_json(record, "$.calibration")
         if log is not None:
             parts["log"] = log.model_dump(mode="json")
-        tree = {**_heading(judgement), **poses, "conventions": CONVENTIONS, **parts}
-        content = json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        encoded = content.encode("utf-8")  # a name may have half a character
-        checked_file(json.loads(content), FORMAT_VERSION)
+        content = _encoded({**_heading(judgement), **poses, "conventions": CONVENTIONS, **parts})
+        checked_file(json.loads(content))
     except ValueError as error:
         raise FileFormatError(f"{path} was not written, because the result is not valid: {in_words(error)}") from error
-    return encoded
+    return content
 
 
-def _without_answer(path: str | Path, calibration: Calibration, record: CalibrationFields) -> bytes:
-    """The content of a file for a calibration that has no answer: its verdict, for programs, and no poses."""
-    judgement = calibration.judgement
-    tree = {
-        **_heading(judgement),
-        "sensors": [],
-        "targets": [],
-        "conventions": CONVENTIONS,
-        "calibration": to_json(record, "$.calibration"),
-    }
+def _encoded(tree: dict[str, Any]) -> bytes:
+    """A tree as text; a name may have half a character, which is a `ValueError`."""
     return (json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
 
@@ -340,12 +367,12 @@ def _heading(judgement: Judgement) -> dict[str, Any]:
 
 
 def _posed(
-    tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: Mapping[str, str], contradicted: Collection[str]
+    tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: tuple[str, str], contradicted: Collection[str]
 ) -> dict[str, Any]:
-    """Put the poses into a record's JSON, under the names that files have for them."""
+    """Put the poses into a record's JSON, under the names that files have for them; targets' carrier first."""
     poses = {
-        "targets": pose_rows(carriers["X"], answer.X, contradicted),
-        "sensors": pose_rows(carriers["Y"], answer.Y, contradicted),
+        "targets": pose_rows(carriers[0], answer.X, contradicted),
+        "sensors": pose_rows(carriers[1], answer.Y, contradicted),
     }
     return {**poses, **{name: value for name, value in tree.items() if name not in ("X", "Y")}}
 
@@ -358,25 +385,3 @@ def _refined_fields(refined: Refined) -> RefinedFields:
         frames[name] = FrameFields(degrees, millimetres, rows)
     kept = {field.name: getattr(refined, field.name) for field in fields(RefinedPoses)}
     return RefinedFields(**kept, residual=refined.options.residual, robust=refined.options.robust, frames=frames)
-
-
-#: The name of the result in an output folder.
-RESULT_FILE = "result.json"
-
-
-def result_path(path: str | Path) -> Path:
-    """The result file that a path means: itself, or the one in this folder; FileFormatError if there is none."""
-    path = Path(path)
-    if not path.is_dir():
-        return path
-    inside = path / RESULT_FILE
-    if not inside.is_file():
-        raise FileFormatError(
-            f"{path} has no {RESULT_FILE}; give a folder that gtsam-rwhec calibrate wrote, or a result file"
-        )
-    return inside
-
-
-def read_calibration(path: str | Path) -> Result:
-    """Read ``result.json``, or the one in a folder that ``calibrate`` wrote; raises as ``rw.results.read_result``."""
-    return read_result(result_path(path))

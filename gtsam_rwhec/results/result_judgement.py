@@ -9,7 +9,7 @@ from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, LeftOut, contrad
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.results.log_history import FrameOutliers, LogFields
+from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.solution import Solution
 
 
@@ -18,10 +18,10 @@ def contradicted_names(refined: RefinedPoses | None, log: LogFields | None = Non
     return frozenset(one.frame for one in contradicted(refined, log))
 
 
-def contradicted(refined: RefinedPoses | None, log: LogFields | None = None) -> tuple[LeftOut | FrameOutliers, ...]:
+def contradicted(refined: RefinedPoses | None, log: LogFields | None = None) -> tuple[LeftOut, ...]:
     """The same with the counts of their measurements."""
     if log is not None:
-        return tuple(log.contradicted)
+        return log.contradicted
     return contradicted_frames({} if refined is None else refined.inlier_counts)
 
 

@@ -6,33 +6,46 @@ bases describe the fields. Lengths are in metres, angles in radians, times in se
 """
 
 from __future__ import annotations
-
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
-
+from typing import Annotated
+from typing import Any
+from typing import Final
+from typing import Literal
 import gtsam
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetPydanticSchema, model_validator
-
+from pydantic import AfterValidator
+from pydantic import BaseModel
+from pydantic import BeforeValidator
+from pydantic import ConfigDict
+from pydantic import Field
+from pydantic import GetPydanticSchema
+from pydantic import model_validator
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, point_sentence
-from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground, Verdict
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
+from gtsam_rwhec.calibration.point_uncertainty import point_sentence
+from gtsam_rwhec.calibration.verdict import Choice
+from gtsam_rwhec.calibration.verdict import Finding
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
+from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.answers import Residual
-from gtsam_rwhec.solver.identification import Identifiability, PairIdentifiability
+from gtsam_rwhec.solver.identification import Identifiability
+from gtsam_rwhec.solver.identification import PairIdentifiability
 from gtsam_rwhec.solver.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"
 #: It grows whenever a reader of the version before would misread or refuse the file.
-FORMAT_VERSION: Final = 7
+FORMAT_VERSION: Final = 1
 
 #: Name of the frame that carries the sensors, if no rig file names it.
 SENSOR_CARRIER = "sensorcarrier"
@@ -231,7 +244,7 @@ class ResultFile(BaseModel):
     model_config = CONFIG
 
     format: Literal["gtsam-rwhec result"] = Field(description="what kind of file this is")
-    format_version: Literal[7] = Field(description="the version of these fields")
+    format_version: Literal[1] = Field(description="the version of these fields")
     written_by: str = Field(description="the library and its version")
     verdict: Verdict = Field(description="use, care or do_not_use")
     verdict_reason: str = Field(description="the reasons as a sentence")
@@ -269,8 +282,8 @@ class ResultFile(BaseModel):
 
 CONVENTIONS = {
     "poses": (
-        "sensors and targets at the top are the poses to use: the refined poses if the answer was refined, otherwise "
-        "the certified poses; certified has the certified poses in either case"
+        "sensors and targets at the top are the poses to use: the refined poses if the answer was refined, and then "
+        "certified has the certified poses; otherwise the certified poses"
     ),
     "pose": (
         "T_parent_child is the pose of frame child in frame parent: p_parent = T_parent_child p_child. "

@@ -1,4 +1,4 @@
-"""Result files, of this version and of the earlier ones."""
+"""Result files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read(data: bytes) -> None:
 
 
 def seeds() -> Iterable[bytes]:
-    """Certified, with a free direction, with scales, refined, and of one call; and the files of earlier versions."""
+    """Certified, with a free direction, with scales, refined, and of one call; of a log, and from corners."""
     folder = scratch()
     noise = Noise(0.005, 6000.0)
     problems = [
@@ -55,9 +55,9 @@ def seeds() -> Iterable[bytes]:
     result_file.write_refined(better, folder / "b.json")
     yield (folder / "b.json").read_bytes()
     for calibration in calibrations:
-        yield result_file.calibration_json(calibration)
-    for version in (1, 2, 3, 4, 5, 6, 7):  # 7 is of a refinement from corners
-        yield (GOLDEN / f"result_version_{version}.json").read_bytes()
+        yield result_file.result_json(calibration)
+    for name in ("log", "corners"):
+        yield (GOLDEN / f"result_{name}.json").read_bytes()
 
 
 HARNESS = Harness(read, seeds, json_tree)

@@ -60,7 +60,7 @@ def test_the_section_stands_between_poses_and_details(refined: Refined) -> None:
 
 
 def test_a_log_whose_corners_were_not_used_has_intrinsics_that_count_as_exact(refined: Refined) -> None:
-    log = read_result(GOLDEN / "result_version_3.json").log
+    log = read_result(GOLDEN / "result_log.json").log
     for found, is_said in ((refined, False), (dataclasses.replace(refined, reprojection=None, intrinsics={}), True)):
         stream = io.StringIO()
         print_refined(found, Console(file=stream, width=160, color_system=None), log=log)

@@ -23,7 +23,7 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 @pytest.fixture
 def found() -> tuple[rw.RefinedPoses, LogFields]:
     """A calibration that is 1 mm off in x everywhere, made of a stored one."""
-    stored = rw.results.read_result(GOLDEN / "result_version_3.json")
+    stored = rw.results.read_result(GOLDEN / "result_log.json")
     truth = demo_truth()
     assert stored.refined is not None
     assert stored.log is not None

@@ -14,7 +14,7 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 
 def test_a_count_has_no_unit() -> None:
     """ "rotation off the pair's consensus (rad): 2" read as an angle of 2 rad."""
-    log = rw.results.read_result(GOLDEN / "result_version_3.json").log
+    log = rw.results.read_result(GOLDEN / "result_log.json").log
     assert log is not None
     track = TrackCount(target="tag", sensor="cam", used=5, removed={RemovalReason.ROTATION_OFF: 2})
     cleaning = log.cleaning.model_copy(update={"tracks": (track,)})

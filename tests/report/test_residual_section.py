@@ -17,14 +17,14 @@ from gtsam_rwhec.report.report_blocks import Chart, Page
 from gtsam_rwhec.report.residual_section import image_figure, residuals_section
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.evidence import evidence_json
-from gtsam_rwhec.results.result_file import calibration_json
+from gtsam_rwhec.results.result_file import result_json
 
 
 @pytest.fixture(scope="module")
 def shown() -> ShownResult:
     problem = rig().problem
     calibration = rw.calibrate(problem)
-    return ShownResult.of(calibration_json(calibration), rw.results.evidence_of(problem, calibration))
+    return ShownResult.of(result_json(calibration), rw.results.evidence_of(problem, calibration))
 
 
 def test_every_number_is_that_of_the_evidence(shown: ShownResult) -> None:

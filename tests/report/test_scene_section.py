@@ -40,7 +40,7 @@ def shown() -> ShownResult:
     rows = rw.results.measured_rows(problem, calibration)
     scene = scene_of(calibration, rows, ("hand", "base"), cameras, targets)
     evidence = rw.results.evidence_of(problem, calibration).model_copy(update={"scene": scene})
-    return ShownResult.of(rw.results.result_file.calibration_json(calibration), evidence)
+    return ShownResult.of(rw.results.result_file.result_json(calibration), evidence)
 
 
 def drawing(section: Section) -> Drawing:
@@ -168,7 +168,7 @@ def test_free_directions_are_drawn_where_nothing_is_known() -> None:
     problem = rig(motion=Motion("planar")).problem
     calibration = rw.calibrate(problem)
     evidence = rw.results.evidence_of(problem, calibration)
-    shown = ShownResult.of(rw.results.result_file.calibration_json(calibration), evidence)
+    shown = ShownResult.of(rw.results.result_file.result_json(calibration), evidence)
     section = scene_section(shown)
     block = drawing(section)
     free = [dict(trace) for trace in block.traces if trace["meta"] == "directions" and trace["name"] == "free"]
@@ -197,9 +197,9 @@ def test_a_result_alone_is_drawn_carrier_by_carrier(shown: ShownResult) -> None:
     assert np.abs(places(sensors) - [row["translation_m"] for row in shown.tree["sensors"]]).max() < 1e-9
 
 
-@pytest.mark.parametrize("version", [1, 7])
-def test_results_of_all_versions_are_drawn(version: int) -> None:
-    section = scene_section(read_shown(REPOSITORY / "tests" / "golden" / f"result_version_{version}.json"))
+@pytest.mark.parametrize("name", ["free", "corners"])
+def test_results_of_all_kinds_are_drawn(name: str) -> None:
+    section = scene_section(read_shown(REPOSITORY / "tests" / "golden" / f"result_{name}.json"))
     assert any(isinstance(block, Drawing) for block in section.blocks)
 
 

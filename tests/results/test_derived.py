@@ -53,7 +53,7 @@ def test_scales_have_their_deviations() -> None:
 
 
 def test_a_clock_moves_poses_as_the_best_poses_of_another_offset_do() -> None:
-    refined = rw.read_refined(REPOSITORY / "tests" / "golden" / "result_version_5.json")
+    refined = rw.read_refined(REPOSITORY / "tests" / "golden" / "result_scales.json")
     frames = [Unknown.of(name) for name in (*refined.X, *refined.Y)]
     unknowns = (*frames, Unknown(UnknownKind.TIME_OFFSET, "sensor0"))
     size = 6 * len(frames) + 1

@@ -5,19 +5,23 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from gtsam_rwhec.results.log_history import FrameOutliers, OutlierCount, TrackCount, contradictions
+from gtsam_rwhec.calibration.outliers import LeftOut
+from gtsam_rwhec.results.log_history import LogFields, OutlierCount, TrackCount
+
+
+def contradicted(*outliers: OutlierCount) -> tuple[LeftOut, ...]:
+    return LogFields.model_construct(outliers=outliers).contradicted
 
 
 def names(*outliers: OutlierCount) -> list[str]:
-    return [counts.frame for counts in contradictions(outliers)]
+    return [counts.frame for counts in contradicted(*outliers)]
 
 
 def test_a_frame_most_of_whose_measurements_were_left_out_is_contradicted() -> None:
     good = OutlierCount(target="tag", sensor="left", used=40, left_out=3)
     bad = OutlierCount(target="tag", sensor="right", used=4, left_out=30)
-    assert contradictions([good]) == ()
-    assert contradictions([good, bad]) == (FrameOutliers(frame="right", left_out=30, measurements=34),)
-    assert str(contradictions([good, bad])[0]) == "30 of 34 measurements of right contradict the answer"
+    assert contradicted(good) == ()
+    assert contradicted(good, bad) == (LeftOut(frame="right", left_out=30, measurements=34),)
 
 
 def test_targets_are_not_to_blame_for_a_camera() -> None:

@@ -154,8 +154,7 @@ def test_the_file_explains_itself(demo_solution: rw.Solution, written: Path) -> 
     assert (raw["verdict"], raw["verdict_grounds"]) == ("use", [])
     assert raw["verdict_reason"] == "the measurements determine every pose, and no other poses fit them better"
     assert not any(pose["contradicted"] for pose in (*raw["sensors"], *raw["targets"]))
-    assert raw["sensors"] == raw["certified"]["sensors"]
-    assert raw["targets"] == raw["certified"]["targets"]
+    assert not {"sensors", "targets", "scale", "cost"} & raw["certified"].keys()  # each fact is there once
     assert raw["written_by"] == f"gtsam-rwhec {rw.__version__}"
     assert "p_parent = T_parent_child p_child" in raw["conventions"]["pose"]
     pose = raw["sensors"][0]
@@ -207,12 +206,7 @@ def test_another_version_says_what_to_do(written: Path, version: int, remedy: st
     spoil(written, lambda raw: raw.update(format_version=version, written_by="gtsam-rwhec 9.9", new_field=1))
     with pytest.raises(ResultVersionError) as caught:
         read_solution(written)
-    for words in (
-        f"has version {version}",
-        "written by gtsam-rwhec 9.9",
-        f"reads versions 1 to {FORMAT_VERSION}",
-        remedy,
-    ):
+    for words in (f"has version {version}", "written by gtsam-rwhec 9.9", f"reads version {FORMAT_VERSION}", remedy):
         assert words in str(caught.value)
 
 
@@ -220,82 +214,40 @@ def test_another_version_says_what_to_do(written: Path, version: int, remedy: st
     ("change", "said"),
     [
         (
-            lambda raw: raw["certified"]["sensors"][1]["translation_m"].__setitem__(2, "x"),
-            r"\$\.certified\.sensors\[1\]\.translation_m\[2\]:.*'x'",
+            lambda raw: raw["sensors"][1]["translation_m"].__setitem__(2, "x"),
+            r"\$\.sensors\[1\]\.translation_m\[2\]:.*'x'",
         ),
-        (
-            lambda raw: raw["certified"]["sensors"][1]["translation_m"].pop(),
-            r"\$\.certified\.sensors\[1\]\.translation_m",
-        ),
-        (
-            lambda raw: raw["certified"]["targets"][0].pop("child"),
-            r"\$\.certified\.targets\[0\]\.child: Field required",
-        ),
+        (lambda raw: raw["sensors"][1]["translation_m"].pop(), r"\$\.sensors\[1\]\.translation_m"),
+        (lambda raw: raw["targets"][0].pop("child"), r"\$\.targets\[0\]\.child: Field required"),
         (lambda raw: raw["certified"].pop("certificate"), r"\$\.certified\.certificate: Field required"),
         (lambda raw: raw.update(extra=1), r"\$\.extra: Extra inputs are not permitted"),
-        (lambda raw: raw["certified"].update(cost=None), r"\$\.certified\.cost"),
-        (lambda raw: raw["certified"].update(cost="8.28"), r"\$\.certified\.cost: .*'8.28'"),
+        (lambda raw: raw["certified"]["certificate"].update(cost=None), r"\$\.certified\.certificate\.cost"),
+        (lambda raw: raw["certified"]["certificate"].update(cost="8.28"), r"certificate\.cost: .*'8.28'"),
         (lambda raw: raw["certified"]["certificate"].update(status="surely"), r"certificate\.status:.*'surely'"),
-        (lambda raw: raw["certified"].update(scale=-1.0), r"\$\.certified\.scale\.constrained.*greater than 0"),
+        (lambda raw: raw.update(scale=-1.0), r"\$\.scale\.constrained.*greater than 0"),
+        (lambda raw: raw.update(scale_mode="per_target"), r"scale_mode 'per_target' does not go with .* 1\.0"),
+        (lambda raw: raw["targets"][0]["rotation_matrix"][0].__setitem__(0, 2.0), r"tag_0 is not a rotation"),
         (
-            lambda raw: raw["certified"].update(scale_mode="per_target"),
-            r"scale_mode 'per_target' does not go with .* 1\.0",
-        ),
-        (
-            lambda raw: raw["certified"]["targets"][0]["rotation_matrix"][0].__setitem__(0, 2.0),
-            r"tag_0 is not a rotation",
-        ),
-        (
-            lambda raw: raw["certified"]["targets"][0].update(
-                rotation_matrix=[[1e200] * 3] * 3, quaternion_wxyz=[1e200] * 4
-            ),
+            lambda raw: raw["targets"][0].update(rotation_matrix=[[1e200] * 3] * 3, quaternion_wxyz=[1e200] * 4),
             r"quaternion_wxyz of tag_0 is not a rotation",
         ),
         (
-            lambda raw: raw["certified"]["targets"][0].update(quaternion_wxyz=[1.0, 0.0, 0.0, 0.0]),
-            r"\$\.certified\.targets\[0\]: rotation_matrix and quaternion_wxyz of tag_0 are different rotations",
+            lambda raw: raw["targets"][0].update(quaternion_wxyz=[1.0, 0.0, 0.0, 0.0]),
+            r"\$\.targets\[0\]: rotation_matrix and quaternion_wxyz of tag_0 are different rotations",
         ),
-        (lambda raw: raw["certified"]["targets"][0].update(child="cam_0"), r"two poses have the same name: cam_0"),
-        (lambda raw: raw["certified"]["targets"][0].update(parent="moon"), r"in several frames: moon, targetcarrier"),
-        (
-            lambda raw: raw["certified"]["residuals"][0].update(sensor="cam_9"),
-            r"pairs name frames that have no pose: cam_9",
-        ),
-        (
-            lambda raw: raw["certified"]["residuals"][3].update(number_of_measurements=1.5),
-            r"\$\.certified\.residuals\[\"tag_1\", \"cam_0\"\]\.number_of_measurements: .*1\.5",
-        ),
+        (lambda raw: raw["targets"][0].update(child="cam_0"), r"two poses have the same name: cam_0"),
+        (lambda raw: raw["targets"][0].update(parent="moon"), r"in several frames: moon, targetcarrier"),
         (lambda raw: raw["certified"]["residuals"].pop(), r"residuals and identifiability\.pairs"),
         *[
             (lambda raw, name=name: raw.pop(name), rf"\$\.{name}: Field required")
             for name in ("sensors", "targets", "scale", "scale_mode")
         ],
-        (
-            lambda raw: raw.update(sensors="junk"),
-            r"\$\.sensors: differs from \$\.certified\.sensors \(found \"junk\"\)",
-        ),
-        (lambda raw: raw.update(scale=-3), r"\$\.scale: differs from \$\.certified\.scale \(found -3\)"),
-        (lambda raw: raw.update(scale=True), r"\$\.scale: differs from \$\.certified\.scale \(found true\)"),
-        (lambda raw: raw.update(scale_mode="shared"), r"\$\.scale_mode: differs.*\"shared\""),
-        (
-            lambda raw: raw["targets"][0]["translation_m"].__setitem__(0, 99.0),
-            r"\$\.targets: differs from \$\.certified\.targets, but the file has no refined poses",
-        ),
+        (lambda raw: raw.update(sensors="junk"), r"\$\.sensors: .*'junk'"),
+        (lambda raw: raw.update(scale=True), r"\$\.scale\..*True"),
+        (lambda raw: raw["certified"].update(sensors=raw["sensors"]), r"\$\.certified\.sensors: unknown field"),
         (lambda raw: raw.update(refined=3), r"\$\.refined: .*\(found 3\)"),
         (lambda raw: raw.update(refined=[]), r"\$\.refined: .*\(found \[\]\)"),
         (lambda raw: raw.update(refined="xx"), r"\$\.refined: .*\(found 'xx'\)"),
-        (
-            lambda raw: raw["certified"]["certificate"].update(cause="no_bound"),
-            r"\$\.certified\.certificate\.status: must be 'failed' with the cause 'no_bound' \(found 'certified'\)",
-        ),
-        (
-            lambda raw: raw["certified"]["parts"][0]["certificate"].update(status="gap"),
-            r"\$\.certified\.parts\[0\]\.certificate\.status: must be 'certified' .*\(found 'gap'\)",
-        ),
-        (
-            lambda raw: raw.update(verdict="do_not_use"),
-            r"\$\.verdict: the file says 'do_not_use', but its content leads to 'use'",
-        ),
     ],
 )
 def test_a_damaged_field_is_named(written: Path, change: Callable[[dict[str, Any]], object], said: str) -> None:
@@ -304,17 +256,9 @@ def test_a_damaged_field_is_named(written: Path, change: Callable[[dict[str, Any
     assert str(written) in str(caught.value)
 
 
-def test_a_status_read_from_an_earlier_version_needs_no_cause(tmp_path: Path) -> None:
-    solution = rw.read_solution(Path(__file__).parents[1] / "golden" / "result_version_3.json")
-    assert solution.certificate.cause is Cause.NOT_RECORDED
-    assert solution.certificate.status is rw.Status.CERTIFIED
-    write_solution(solution, tmp_path / "result.json")
-    assert_same(solution, read_solution(tmp_path / "result.json"))
-
-
 def test_many_faults_are_counted(written: Path) -> None:
     with pytest.raises(FileFormatError, match=r"; and \d+ more\.$"):
-        read_solution(spoil(written, lambda raw: [pose.pop("child") for pose in raw["certified"]["targets"]]))
+        read_solution(spoil(written, lambda raw: [pose.pop("child") for pose in raw["targets"]]))
 
 
 @pytest.mark.parametrize(
@@ -353,9 +297,9 @@ def test_a_path_that_cannot_be_used(demo_solution: rw.Solution, tmp_path: Path) 
 @given(data=st.data())
 def test_any_content_gives_a_result_or_an_error_of_ours(written: Path, data: st.DataObject) -> None:
     own = written.read_bytes()
-    earlier = (GOLDEN / f"result_version_{data.draw(st.integers(1, 3))}.json").read_bytes()
-    tree = json.loads(data.draw(st.sampled_from([own, own, earlier])))
-    content = data.draw(damaged([own, earlier]) | changed_trees(tree).map(lambda t: json.dumps(t).encode()))
+    other = (GOLDEN / f"result_{data.draw(st.sampled_from(['log', 'corners', 'scales']))}.json").read_bytes()
+    tree = json.loads(data.draw(st.sampled_from([own, own, other])))
+    content = data.draw(damaged([own, other]) | changed_trees(tree).map(lambda t: json.dumps(t).encode()))
     try:
         result = parse_result(content, "any.json")
     except FileFormatError as error:

@@ -14,6 +14,7 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.fitting.refinement_from_poses import movements
 from gtsam_rwhec.simulate import Motion, Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=0.5 / np.radians(0.5) ** 2)
@@ -81,13 +82,13 @@ def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
         "cost",
         "initial_cost",
         "iterations",
-        "moved",
         "inlier_counts",
         "free_directions",
         "names",
         "degrees_of_freedom",
     ]:
         assert getattr(back, name) == getattr(refined, name), name
+    assert back.moved == movements(refined.solution, back.X, back.Y)  # from the certified poses in the file
     if len(refined.Y) > 1:
         pose, covariance = back.relative("sensor0", "sensor1")
         assert pose.equals(refined.relative("sensor0", "sensor1")[0], 1e-15)
@@ -140,27 +141,12 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
         (lambda raw: raw["refined"]["joint"]["unit"].__setitem__(3, 0.0), "$.refined.joint.unit[3]"),
         (lambda raw: raw["refined"]["joint"]["free"].pop(), "slots have 24 rows"),
         (lambda raw: raw["refined"]["joint"]["slots"].update(moon=[0, 6]), "have no value: moon"),
-        (lambda raw: raw["refined"]["frames"].popitem(), "frames and moved must have the targets and sensors"),
+        (lambda raw: raw["refined"]["frames"].popitem(), "$.refined.frames: must have"),
         (lambda raw: raw["sensors"][0].pop("translation_m"), "$.sensors[0].translation_m"),
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
         (lambda raw: raw["refined"]["noise"][1].update(degrees_of_freedom=[1.0]), "degrees_of_freedom"),
         (lambda raw: raw["refined"]["noise"][1].update(sensor="moon"), "have no pose: moon"),
-        (lambda raw: raw.pop("refined"), "differs from $.certified."),
-        (lambda raw: raw["refined"]["joint"]["slots"].pop("sensor0"), "slots: unknowns that have no rows: sensor0"),
-        (
-            lambda raw: raw["refined"]["joint"]["slots"].update(sensor0=[0, 6]),
-            "rows may neither overlap nor be left out (found [0, 6])",
-        ),
-        (
-            lambda raw: raw["refined"]["joint"]["slots"].update(sensor1=[18, 21]),
-            "$.refined.joint.slots.sensor1: must be [18, 24], because rows may neither overlap nor be left out (found "
-            "[18, 21])",
-        ),
-        (lambda raw: raw["refined"]["joint"]["slots"].update(scale=[24, 25]), "have no value: scale"),
-        (
-            lambda raw: raw["refined"]["joint"]["finite"][0].__setitem__(3, 1e9),
-            "$.refined.joint.finite[0][3]: a covariance is symmetric, but [3][0] is",
-        ),
+        (lambda raw: raw.pop("refined"), "$.certified.sensors: unknown field"),
     ],
 )
 def test_damage_is_refused_with_its_place(damage: Callable[[Any], object], said: str, tmp_path: Path) -> None:

@@ -10,18 +10,17 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
-from gtsam_rwhec.results.log_history import FrameOutliers, LogFields, SizeFields
+from gtsam_rwhec.results.log_history import LogFields, SizeFields
 from gtsam_rwhec.results.result_file import Result, read_result
 from gtsam_rwhec.results.result_judgement import judge
 
 GOLDEN = Path(__file__).parents[1] / "golden"
-CONTRADICTED = FrameOutliers(frame="cam_side", left_out=20, measurements=23)
 
 
 @pytest.fixture(scope="module")
 def result() -> Result:
     """A good calibration of a log."""
-    return read_result(GOLDEN / "result_version_3.json")
+    return read_result(GOLDEN / "result_log.json")
 
 
 def with_status(solution: rw.Solution, status: rw.Status) -> rw.Solution:
@@ -49,7 +48,7 @@ def test_the_certificate_is_asked(result: Result, status: rw.Status, verdict: Ve
 
 
 def test_what_only_refining_leaves_free_counts_too(result: Result) -> None:
-    first = read_result(GOLDEN / "result_version_1.json").solution
+    first = read_result(GOLDEN / "result_free.json").solution
     assert judge(first).grounds == (Ground.NOT_UNIQUE,)
     assert result.refined is not None
     free: list[Any] = list(first.identifiability.free_directions)
@@ -62,8 +61,18 @@ def changed(log: LogFields | None, **fields: Any) -> LogFields:
     return log.model_copy(update=fields)
 
 
+def with_cam_side_contradicted(log: LogFields | None, **fields: Any) -> LogFields:
+    """All but three of its measurements are left out."""
+    assert log is not None
+    outliers = tuple(
+        count.model_copy(update={"used": 3, "left_out": 20}) if count.sensor == "cam_side" else count
+        for count in log.outliers
+    )
+    return changed(log, outliers=outliers, **fields)
+
+
 def test_contradicted_frames_are_not_to_be_used(result: Result) -> None:
-    log = changed(result.log, contradicted=(CONTRADICTED,))
+    log = with_cam_side_contradicted(result.log)
     judgement = judge(result.solution, result.refined, log)
     assert (judgement.verdict, judgement.grounds) == (Verdict.DO_NOT_USE, (Ground.CONTRADICTED,))
     assert "20 of 23 measurements of cam_side contradict the answer" in judgement.reason
@@ -79,7 +88,7 @@ def test_a_doubted_size_is_not_to_be_used_unless_it_was_estimated(
 
 def test_the_worst_ground_decides_and_all_are_said(result: Result) -> None:
     size = SizeFields(target="tag_7", stated_m=0.1, scale=1.02, sigma=0.001, is_free=False)
-    log = changed(result.log, contradicted=(CONTRADICTED,), sizes=(size,))
+    log = with_cam_side_contradicted(result.log, sizes=(size,))
     judgement = judge(with_status(result.solution, rw.Status.GAP), result.refined, log)
     assert judgement.verdict is Verdict.DO_NOT_USE
     assert judgement.grounds == (Ground.NOT_CERTIFIED, Ground.CONTRADICTED, Ground.SIZE_DOUBTED)
