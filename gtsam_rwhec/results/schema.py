@@ -6,41 +6,28 @@ bases describe the fields. Lengths are in metres, angles in radians, times in se
 """
 
 from __future__ import annotations
+
 import json
 import math
-from collections.abc import Collection
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Annotated
-from typing import Any
-from typing import Final
-from typing import Literal
+from typing import Annotated, Any, Final, Literal
+
 import gtsam
 import numpy as np
-from pydantic import AfterValidator
-from pydantic import BaseModel
-from pydantic import BeforeValidator
-from pydantic import ConfigDict
-from pydantic import Field
-from pydantic import GetPydanticSchema
-from pydantic import model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetPydanticSchema, model_validator
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
-from gtsam_rwhec.calibration.point_uncertainty import point_sentence
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, point_sentence
+from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground, Verdict
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.refined import PairNoise
-from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.answers import Residual
-from gtsam_rwhec.solver.identification import Identifiability
-from gtsam_rwhec.solver.identification import PairIdentifiability
+from gtsam_rwhec.solver.identification import Identifiability, PairIdentifiability
 from gtsam_rwhec.solver.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"

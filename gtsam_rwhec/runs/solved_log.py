@@ -1,28 +1,26 @@
 """The solved log: the cleaned log with its solution, for viewers and for the export; written, and read back."""
 
 from __future__ import annotations
+
 from pathlib import Path
+
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import LogWriter
-from gtsam_rwhec.logs import PoseRecord
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, LogWriter, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.results.result_file import parse_result
-from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.measured_pairs import write_pairs
-from gtsam_rwhec.runs.run_log import CERTIFICATE_METADATA
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import SOLUTION_TOPIC
-from gtsam_rwhec.runs.run_log import LogMetadata
-from gtsam_rwhec.runs.run_log import image_names
-from gtsam_rwhec.runs.run_log import read_cameras
-from gtsam_rwhec.runs.run_log import read_embedded_rig
-from gtsam_rwhec.runs.run_log import records_of
-from gtsam_rwhec.runs.run_log import topics_up_to_detection
-from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.solving_stage import Solved
-from gtsam_rwhec.results.result_file import result_json
+from gtsam_rwhec.results.result_file import parse_result, result_json
+from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
+from gtsam_rwhec.runs.run_log import (
+    CERTIFICATE_METADATA,
+    RESULT_FILE,
+    SOLUTION_TOPIC,
+    LogMetadata,
+    image_names,
+    read_cameras,
+    read_embedded_rig,
+    records_of,
+    topics_up_to_detection,
+)
+from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
 
 #: A calibrated frame's name gets this ending if the raw log has transforms of a frame with the same name.
 CALIBRATED = "_calibrated"

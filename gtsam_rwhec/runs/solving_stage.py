@@ -1,69 +1,49 @@
 """The third stage: from synchronised pairs to a certified, refined calibration with checked sizes and time offsets."""
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import replace
+
+from dataclasses import dataclass, replace
 from pathlib import Path
+
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.misreadings import Reading
 from gtsam_rwhec.calibration.outliers import Outliers
-from gtsam_rwhec.calibration.verdict import OUTLIERS
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.log_history import OutlierCount
-from gtsam_rwhec.results.log_history import SizeFields
-from gtsam_rwhec.results.log_history import TimeOffsetFields
+from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields
 from gtsam_rwhec.results.removed_measurements import RemovalReason
-from gtsam_rwhec.results.result_judgement import judge
-from gtsam_rwhec.results.result_judgement import short_of_measurements
-from gtsam_rwhec.rig import GivenSection
-from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.results.result_judgement import judge, short_of_measurements
+from gtsam_rwhec.rig import GivenSection, Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_solving
 from gtsam_rwhec.runs.comparable_noise import with_comparable_noise
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
-from gtsam_rwhec.runs.doubted_intrinsics import finding_against
-from gtsam_rwhec.runs.doubted_shapes import continued_boards
-from gtsam_rwhec.runs.doubted_shapes import doubted_shapes
+from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
+from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.first_answer import first_answer
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.log_findings import estimated_sizes
-from gtsam_rwhec.runs.log_findings import in_rig_file
-from gtsam_rwhec.runs.log_findings import known_to_nothing
-from gtsam_rwhec.runs.log_findings import may_be_exchanged
-from gtsam_rwhec.runs.log_findings import moved_of_left_out
-from gtsam_rwhec.runs.log_findings import not_of_late_clocks
-from gtsam_rwhec.runs.log_findings import not_of_marked_outliers
-from gtsam_rwhec.runs.log_findings import with_cures
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.measured_pairs import poses_used
-from gtsam_rwhec.runs.measured_pairs import problem_of
-from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.run_log import CLEANING_METADATA
-from gtsam_rwhec.runs.run_log import read_cleaning_report
-from gtsam_rwhec.runs.run_log import read_metadata
-from gtsam_rwhec.runs.solving_rounds import Pairs
-from gtsam_rwhec.runs.solving_rounds import Purpose
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds
-from gtsam_rwhec.runs.solving_rounds import sigma_of
-from gtsam_rwhec.runs.solving_rounds import without_outlier_marks
+from gtsam_rwhec.runs.log_findings import (
+    estimated_sizes,
+    in_rig_file,
+    known_to_nothing,
+    may_be_exchanged,
+    moved_of_left_out,
+    not_of_late_clocks,
+    not_of_marked_outliers,
+    with_cures,
+)
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
+from gtsam_rwhec.runs.run_log import CLEANING_METADATA, read_cleaning_report, read_metadata
+from gtsam_rwhec.runs.solving_rounds import Pairs, Purpose, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.runs.turned_images import turned_images
 from gtsam_rwhec.solver.solution import Solution
+
 
 @dataclass(frozen=True, eq=False)
 class Solved:
