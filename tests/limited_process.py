@@ -6,7 +6,6 @@ hang.
 """
 
 from __future__ import annotations
-
 import json
 import os
 import signal
@@ -143,7 +142,13 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
 
 def _serve() -> None:
     import rosbags.highlevel
-    import rosbags.typesys  # noqa: F401
+    import rosbags.typesys
+
+    import gtsam_rwhec.detect.images
+    import gtsam_rwhec.logs.image_folder
+    import gtsam_rwhec.logs.mcap_writer
+    import gtsam_rwhec.logs.ros_bags
+    import gtsam_rwhec.logs.transforms  # noqa: F401
 
     import gtsam_rwhec.detect.images
     import gtsam_rwhec.logs.image_folder
