@@ -31,8 +31,8 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.methods import evangelista2023
-from gtsam_rwhec.methods.corner_costs import Corners
+from gtsam_rwhec.methods import corner_methods
+from gtsam_rwhec.methods.corner_methods import Corners
 from gtsam_rwhec.methods.reprojection import certified_start
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
@@ -94,7 +94,7 @@ def ours(observations: rw.Observations, carrier: tuple[float, float]) -> tuple[F
         return Found(corners.cost(frames), seconds), carrier
     scale = observations.corner_px / refined.graph.model.corner_px
     told = (scale * carrier[0], scale * carrier[1])
-    return Found(evangelista2023.cost_at(corners, frames, refined.point.A, told), seconds), told
+    return Found(corner_methods.cost_at(corners, frames, refined.point.A, told), seconds), told
 
 
 def compared(words: str, carrier: tuple[float, float], cells: int, *, large: bool) -> list[Row]:

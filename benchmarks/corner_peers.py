@@ -17,9 +17,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import block_diag, csr_matrix, hstack, vstack
 
 from gtsam_rwhec.fitting.corner_residuals import Stack
-from gtsam_rwhec.methods.corner_costs import Corners
-from gtsam_rwhec.methods.evangelista2023 import edges
-from gtsam_rwhec.methods.tabb2017_rp1 import frames_of
+from gtsam_rwhec.methods.corner_methods import Corners, edges, frames_of
 
 Array = np.ndarray
 #: Of scipy's tolerances; Ceres has 1e-6 for the cost, which leaves 1e-4 of a deviation.

@@ -139,14 +139,14 @@ def cost_rows(problems: int, starts: int) -> list[Row]:
         rng = np.random.default_rng([i, 20])
         r = recording(MOTIONS[i % len(MOTIONS)], rng)
         alpha = float(10.0 ** rng.uniform(-1.5, 1.3))
-        best = rw.handeye.solve(r.C, r.H, method="dqopt", alpha=alpha)
+        best = rw.methods.solve_hand_eye(r.C, r.H, method="dqopt", alpha=alpha)
         unproven += not best.is_optimal
         optimum = cost_8(r, best.X.matrix(), alpha)
         for name, of_name in ratios.items():
-            X = rw.handeye.solve(r.C, r.H, method=name, alpha=alpha, rng=rng).X.matrix()
+            X = rw.methods.solve_hand_eye(r.C, r.H, method=name, alpha=alpha, rng=rng).X.matrix()
             of_name[i] = cost_8(r, X, alpha) / optimum
         again = [
-            cost_8(r, rw.handeye.solve(r.C, r.H, method="dqnloptrnd", alpha=alpha, rng=rng).X.matrix(), alpha)
+            cost_8(r, rw.methods.solve_hand_eye(r.C, r.H, method="dqnloptrnd", alpha=alpha, rng=rng).X.matrix(), alpha)
             for _ in range(starts - 1)
         ]
         stopped[i] = stopped_early(r, alpha, rng) / optimum
@@ -202,7 +202,10 @@ def cost_rows(problems: int, starts: int) -> list[Row]:
 def time_rows(repetitions: int) -> list[Row]:
     """DQOpt, from arrays of N = 100 relative poses to the answer, against our Dan and OpenCV's."""
     r = recording("hand-held", np.random.default_rng(0))
-    calls = {name: (lambda name=name: rw.handeye.solve(r.C, r.H, method=name)) for name in ("dqopt", "dan", "dq2ndord")}
+    calls = {
+        name: (lambda name=name: rw.methods.solve_hand_eye(r.C, r.H, method=name))
+        for name in ("dqopt", "dan", "dq2ndord")
+    }
     times = interleaved(repetitions, calls)
     ratio, seconds = times.ratio("dqopt", "dan"), times.median("dqopt")
     rows = [

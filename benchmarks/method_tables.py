@@ -41,10 +41,10 @@ from tables_2_to_5 import EXPERIMENTS
 
 from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.methods import METHODS, MethodOptions, run
-from gtsam_rwhec.methods.absolute import Stack
+from gtsam_rwhec.methods.closed_forms import start_of
 from gtsam_rwhec.methods.horn2023 import solve_dual_quaternions
-from gtsam_rwhec.methods.linear_methods import start_of
-from gtsam_rwhec.methods.local_on_manifold import LomOptions, local_on_manifold
+from gtsam_rwhec.methods.iterative_methods import LomOptions, local_on_manifold
+from gtsam_rwhec.methods.linear_systems import Stack
 from gtsam_rwhec.simulate import CalibrationErrors, FrameDistance, Simulation, frame_distance
 from gtsam_rwhec.simulate.simulation import PosesAndScale
 

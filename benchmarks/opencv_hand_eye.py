@@ -24,7 +24,7 @@ from interleaved import Times, in_words, interleaved
 from rich.progress import track
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.compat import opencv as ours
+from gtsam_rwhec.methods import opencv as ours
 from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, general
 
 HAND_EYE = {"Tsai": 0, "Park": 1, "Horaud": 2, "Andreff": 3, "Daniilidis": 4}

@@ -80,9 +80,7 @@ from . import detect as detect
 from .runs import calibrate_log as calibrate_log
 
 # Other methods, other libraries' calls, and problems whose truth is known.
-from . import compat as compat
 from . import datasets as datasets
-from . import handeye as handeye
 from . import methods as methods
 from . import simulate as simulate
 

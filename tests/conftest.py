@@ -13,7 +13,7 @@ from places import REPOSITORY
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/detect/test_other_opencv.py brings OpenCV 4.
-BESIDE_OPENCV_4 = ["compat/test_beside_opencv4.py", "methods/test_opencv4.py"]
+BESIDE_OPENCV_4 = ["methods/test_beside_opencv4.py", "methods/test_opencv4.py"]
 collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OPENCV_4
 
 #: Packages whose functions users reach only through calls that hold the limit of one BLAS thread.

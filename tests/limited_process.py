@@ -141,8 +141,6 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _serve() -> None:
-    import rosbags.highlevel
-    import rosbags.typesys
 
     import gtsam_rwhec.detect.images
     import gtsam_rwhec.logs.image_folder

@@ -20,8 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from reports import BLUE, GREEN, ORANGE, VERMILLION, arguments_of, plain, save_picture, save_text
 
-from gtsam_rwhec.handeye import DualQuaternionCost
-from gtsam_rwhec.handeye.saddle import minimum
+from gtsam_rwhec.methods import DualQuaternionCost
+from gtsam_rwhec.methods.dq_saddle import minimum
 
 COLOURS = (BLUE, ORANGE, GREEN, VERMILLION)
 WANTED = (8, 6, 4, 6, 4, 2, 0)

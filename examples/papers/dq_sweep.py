@@ -1,4 +1,4 @@
-"""Methods of ``gtsam_rwhec.handeye`` over many alphas: a sample's moments are taken once, whatever alpha is."""
+"""Methods of ``A X = X B`` over many alphas: a sample's moments are taken once, whatever alpha is."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 from dq_scenarios import Array, Sample
 
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.handeye import METHODS, motions_of
-from gtsam_rwhec.handeye.cost import motion_moments
-from gtsam_rwhec.handeye.daniilidis import squared, unit_combination
-from gtsam_rwhec.handeye.dual_quaternions import to_transform
-from gtsam_rwhec.handeye.request import Request
-from gtsam_rwhec.methods.estimate import Outcome
+from gtsam_rwhec.methods import motions_of
+from gtsam_rwhec.methods.dq_descent import squared, unit_combination
+from gtsam_rwhec.methods.dual_quaternion_cost import motion_moments, to_transform
+from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS
+from gtsam_rwhec.methods.hand_eye_request import Request
+from gtsam_rwhec.methods.method import Outcome
 
 #: The paper's names, in the order of its Table 2.
 NAMES = {
@@ -62,7 +62,7 @@ def dan_rows(request: Request) -> Outcome[Array]:
 
 def function_of(name: str) -> Callable[[Request], Outcome[Array]]:
     """The method behind a name of ``NAMES``."""
-    return METHODS[NAMES[name]].function if NAMES[name] else dan_rows
+    return HAND_EYE_METHODS[NAMES[name]].function if NAMES[name] else dan_rows
 
 
 def errors(sample: Sample, names: Sequence[str], alphas: Sequence[float] | Array = ALPHAS) -> Array:

@@ -9,7 +9,7 @@ hand-held motion then have the paper's size (at alpha = 1/m DQ2ndOrd's is a thou
 agreement is no independent check. DQNLOptRnd's is not the paper's: ours ends in no local minimum at these defaults.
 The relative cost is (alg - DQOpt) / (alg + DQOpt), signed, so that no run may be below zero by more than rounding.
 Times are of two calls: from the matrices S, W and M, as the paper's pseudo-code (Appendix E) starts, and of
-``handeye.solve`` from arrays of poses, its checks and its proof included; one after the other in one process.
+``solve_hand_eye`` from arrays of poses, its checks and its proof included; one after the other in one process.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from reports import (
 )
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.handeye import METHODS
-from gtsam_rwhec.handeye.dual_quaternions import from_transforms
-from gtsam_rwhec.handeye.motion_costs import squared_residuals
+from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
+from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS
+from gtsam_rwhec.methods.motions import squared_residuals
 
 COMPARED = ("DQNLOpt", "DQNLOptRnd", "DQ2ndOrd", "DQConvRlx", "DQ2Steps")
 TIMED = ("DQOpt", "DQ2ndOrd", "DQConvRlx", "DQ2Steps", "Dan")
@@ -57,7 +57,7 @@ def relative_costs(seeds: list[np.random.SeedSequence], motion: str, degrees: fl
         (request,) = requests(simulated, [alpha], int(rng.integers(2**31)))
         costs = []
         for name in ("DQOpt", *COMPARED):
-            (q,), (q_dual,) = from_transforms(METHODS[NAMES[name]].function(request).X[None])
+            (q,), (q_dual,) = from_transforms(HAND_EYE_METHODS[NAMES[name]].function(request).X[None])
             rotation, translation = squared_residuals(request.motions, q, q_dual)
             costs.append(rotation + alpha**2 * translation)
         rows.append([(cost - costs[0]) / (cost + costs[0]) for cost in costs[1:]])
@@ -72,11 +72,11 @@ def times(count: int, seed: np.random.SeedSequence, degrees: float, cm: float, a
         simulated = sample(MOTIONS[run % 2], rng, sigma_rad=np.radians(degrees), sigma_m=0.01 * cm)
         for place, name in enumerate(TIMED):
             (request,) = requests(simulated, [alpha])
-            function = METHODS[NAMES[name]].function
+            function = HAND_EYE_METHODS[NAMES[name]].function
             begin = time.perf_counter()
             function(request)
             middle = time.perf_counter()
-            rw.handeye.solve(simulated.C, simulated.H, NAMES[name], alpha=alpha)
+            rw.methods.solve_hand_eye(simulated.C, simulated.H, NAMES[name], alpha=alpha)
             found[run, place] = 1e6 * (middle - begin), 1e6 * (time.perf_counter() - middle)
     return found
 

@@ -45,8 +45,8 @@ from paper_tables import COLUMNS, Experiment, Runs, cell_of, compare, simulated
 from tables_2_to_5 import EXPERIMENTS
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.methods.linear_methods import start_of
-from gtsam_rwhec.methods.local_on_manifold import LomOptions, local_on_manifold
+from gtsam_rwhec.methods.closed_forms import start_of
+from gtsam_rwhec.methods.iterative_methods import LomOptions, local_on_manifold
 from gtsam_rwhec.simulate import CalibrationErrors, Simulation
 
 CHUNK = 10

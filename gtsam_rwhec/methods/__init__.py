@@ -1,4 +1,4 @@
-"""Every published method for A X = Y B behind one call: ``run(name, problem)``, and what each is in ``METHODS``."""
+"""Every published method for A X = Y B and A X = X B, and OpenCV's calls: one record of methods, one of answers."""
 
 from gtsam_rwhec.files.optional_packages import lazy_names
 

@@ -1,29 +1,196 @@
 """The answers of all methods that can solve a problem: cost, residuals, time, and distance from the lower bound."""
 
 from __future__ import annotations
-
 import math
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-
+from collections.abc import Iterable
+from collections.abc import Mapping
+from dataclasses import dataclass
+from dataclasses import replace
 import gtsam
 import numpy as np
-
-from gtsam_rwhec.errors import FrameError, OptionError, RwhecError
-from gtsam_rwhec.files.progress import Progress, check_progress
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import check_progress
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.methods import certified
-from gtsam_rwhec.methods.applicability import check_problem, refusal
-from gtsam_rwhec.methods.chained import Chained, PairSolver, chained, solver_of, undetermined_pairs
-from gtsam_rwhec.methods.estimate import Estimate
-from gtsam_rwhec.methods.method import Method, MethodOptions, Takes, check_options
-from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
+from gtsam_rwhec.methods.method import Method
+from gtsam_rwhec.methods.method import MethodOptions
+from gtsam_rwhec.methods.method import Takes
+from gtsam_rwhec.methods.method import check_options
+from gtsam_rwhec.methods.registry import METHODS
+from gtsam_rwhec.methods.registry import estimate_of
+from gtsam_rwhec.methods.registry import method_of
+from gtsam_rwhec.methods.registry import run
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.solution import Solution
+import dataclasses
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.poses import one_transform
+from gtsam_rwhec.methods.certified import CERTIFIED
+from gtsam_rwhec.methods.certified import outcome_of
+from gtsam_rwhec.methods.certified import quiet_solution
+from gtsam_rwhec.methods.hand_eye import solve_hand_eye
+from gtsam_rwhec.methods.method import Estimate
+from gtsam_rwhec.methods.method import Outcome
+from gtsam_rwhec.methods.method import check_problem
+from gtsam_rwhec.methods.method import refusal
+from gtsam_rwhec.results.schema import CONVENTIONS
+from gtsam_rwhec.results.schema import SENSOR_CARRIER
+from gtsam_rwhec.results.schema import TARGET_CARRIER
+from gtsam_rwhec.results.schema import pose_rows
+
+#: X and Y of the one pair of a problem, metres.
+PairSolver = Callable[[Problem], tuple[PoseLike, PoseLike]]
+Poses = dict[str, gtsam.Pose3]
+
+
+@dataclass(frozen=True)
+class Chained:
+    """A method for one pair, on every pair of a tree.
+
+    Attributes
+    ----------
+    method : str
+        The method's name.
+    tree : tuple of Pair
+        The pairs whose answers count, in the order in which the tree took them.
+    X, Y : dict of str to gtsam.Pose3
+        The frames that the tree reaches.
+    failed : dict of Pair to str
+        Pairs that the tree avoids because the method has no answer for them, with the reason.
+    unreached : tuple of str
+        Frames that are in no pair that the tree can take.
+    estimate : Estimate or None
+        The answer under the joint objective; None where frames are unreached.
+    off_mm, off_deg : float
+        The largest difference of a reached frame from the joint answer; nan without a frame.
+    """
+
+    method: str
+    tree: tuple[Pair, ...]
+    X: Poses
+    Y: Poses
+    failed: dict[Pair, str]
+    unreached: tuple[str, ...]
+    estimate: Estimate[Poses] | None
+    off_mm: float
+    off_deg: float
+
+
+def undetermined_pairs(problem: Problem, solution: Solution) -> tuple[Pair, ...]:
+    """The pairs whose own measurements do not determine their frames: no tree takes them."""
+    alone = solution.identifiability.pairs
+    return tuple(pair for pair in problem.pairs if not pair.is_motion and not alone[pair].is_unique)
+
+
+def solver_of(method: Method[[Problem, MethodOptions]], options: MethodOptions) -> PairSolver:
+    """A method for A X = Y B as a solver of one pair; it raises what the method raises, or its refusal."""
+
+    def solved(problem: Problem) -> tuple[PoseLike, PoseLike]:
+        error = refusal(method, problem)
+        if error is not None:
+            raise error
+        found = method.function(problem, options)
+        (pair,) = problem.pairs
+        return found.X[pair.target], found.Y[pair.sensor]
+
+    return solved
+
+
+def solved_pair(problem: Problem, method: str) -> tuple[Array, Array]:
+    """X and Y (4, 4) of the one pair of a problem, metres; raises what ``solve_hand_eye`` raises.
+
+    From A_i X = Y B_i of two following measurements, C X = X H with C = A_j^-1 A_i and H = B_j^-1 B_i.
+    """
+    (pair,) = problem.pairs
+    raw = problem.measurements(*pair)
+    C = np.linalg.inv(raw.A[1:]) @ raw.A[:-1]
+    H = np.linalg.inv(raw.B[1:]) @ raw.B[:-1]
+    X = solve_hand_eye(C, H, method).X.matrix()
+    Ys = raw.A @ X @ np.linalg.inv(raw.B)
+    U, _, Vt = np.linalg.svd(Ys[:, :3, :3].sum(axis=0))
+    Y = np.eye(4)
+    Y[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt  # the rotation nearest to their mean
+    Y[:3, 3] = Ys[:, :3, 3].mean(axis=0)
+    return X, Y
+
+
+#: Solvers of one pair by A X = X B, by their names in comparisons.
+PAIR_SOLVERS: dict[str, PairSolver] = {
+    f"AX=XB {name}": partial(solved_pair, method=name) for name in ("dan", "dqopt", "dqnlopt")
+}
+
+
+def chained(name: str, solver: PairSolver, problem: Problem, solution: Solution) -> Chained:
+    """Solve the pairs of the best tree by a method for one pair.
+
+    Parameters
+    ----------
+    name : str
+        The method's name.
+    solver : callable
+        Solves a problem of one pair.
+    problem : Problem
+        Of known scale, with raw measurements, without priors.
+    solution : Solution
+        The joint answer: it says which pairs are determined alone, and differences are from it.
+    """
+    start = time.perf_counter()
+    avoided = set(undetermined_pairs(problem, solution))
+    candidates = [pair for pair in problem.pairs if not pair.is_motion and pair not in avoided]
+    candidates.sort(key=lambda pair: problem.moments(*pair).count, reverse=True)  # stable: the first of equals
+    X: Poses = {}
+    Y: Poses = {}
+    tree: list[Pair] = []
+    failed: dict[Pair, str] = {}
+    while (pair := _next(candidates, X, Y)) is not None:
+        candidates.remove(pair)
+        try:
+            of_pair = problem.with_measurements({pair: problem.measurements(*pair)})
+            found_X, found_Y = solver(of_pair)
+        except (RwhecError, np.linalg.LinAlgError) as error:
+            failed[pair] = str(error)
+            continue
+        tree.append(pair)
+        X.setdefault(pair.target, gtsam.Pose3(one_transform(found_X, pair.target)))
+        Y.setdefault(pair.sensor, gtsam.Pose3(one_transform(found_Y, pair.sensor)))
+    seconds = time.perf_counter() - start
+    unreached = tuple(name for name in (*problem.targets, *problem.sensors) if name not in X and name not in Y)
+    estimate = None if unreached else estimate_of(name, problem, Outcome(X, Y), seconds)
+    differences = [solution.X[t].between(pose) for t, pose in X.items()]
+    differences += [solution.Y[s].between(pose) for s, pose in Y.items()]
+    off_m = [float(np.linalg.norm(T.translation())) for T in differences]
+    off_rad = [float(np.linalg.norm(gtsam.Rot3.Logmap(T.rotation()))) for T in differences]
+    return Chained(
+        method=name,
+        tree=tuple(tree),
+        X=X,
+        Y=Y,
+        failed=failed,
+        unreached=unreached,
+        estimate=estimate,
+        off_mm=1e3 * max(off_m, default=math.nan),
+        off_deg=math.degrees(max(off_rad, default=math.nan)),
+    )
+
+
+def _next(candidates: list[Pair], X: Mapping[str, object], Y: Mapping[str, object]) -> Pair | None:
+    """The heaviest pair from a frame of the tree to another; without one, the heaviest that begins another tree."""
+    new = [pair for pair in candidates if (pair.target in X) + (pair.sensor in Y) < 2]
+    touching = [pair for pair in new if pair.target in X or pair.sensor in Y]
+    return next(iter(touching or new), None)
 
 
 @dataclass(frozen=True)
@@ -100,7 +267,6 @@ def compare(
     options: MethodOptions | None = None,
     *,
     methods: Iterable[str] | None = None,
-    pair_solvers: Mapping[str, PairSolver] | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
     """Solve a problem by every method that can solve it, and by those for one pair on each pair of the best tree.
@@ -111,9 +277,8 @@ def compare(
     options : MethodOptions, optional
         The same for all methods.
     methods : iterable of str, optional
-        Names; all methods if left out. The certified method always runs, for its bound.
-    pair_solvers : mapping of str to callable, optional
-        Other methods for one pair, to be chained too: ``gtsam_rwhec.handeye.PAIR_SOLVERS``.
+        Keys of ``METHODS``, and of ``PAIR_SOLVERS`` for A X = X B, pair by pair; all if left out. The certified
+        method always runs, for its bound.
     progress : callable, optional
         Called with each method's name when the method begins.
 
@@ -128,26 +293,28 @@ def compare(
         raise OptionError(f"methods={brief(methods)}; give a list of names: ['shah2013']")
     check_options(options)
     check_progress(progress)
-    chosen = dict.fromkeys(method_of(name) for name in (METHODS if methods is None else methods))
+    names = [*METHODS, *PAIR_SOLVERS] if methods is None else list(methods)
+    of_motions = {name: PAIR_SOLVERS[name] for name in names if isinstance(name, str) and name in PAIR_SOLVERS}
+    chosen = dict.fromkeys(method_of(name) for name in names if not (isinstance(name, str) and name in PAIR_SOLVERS))
     options = options or MethodOptions()
-    check_problem(certified.METHOD, problem)
+    check_problem(CERTIFIED, problem)
     if progress is not None:
         progress("certified")
     start = time.perf_counter()
     solution, error = None, None
     try:
-        solution = certified.quiet_solution(problem, options)
+        solution = quiet_solution(problem, options)
     except RwhecError as raised:
         error = raised
     seconds = time.perf_counter() - start
-    rows = [_compared(method, problem, options, progress) for method in chosen if method is not certified.METHOD]
-    if certified.METHOD in chosen:
+    rows = [_compared(method, problem, options, progress) for method in chosen if method is not CERTIFIED]
+    if CERTIFIED in chosen:
         estimate = None
         if solution is not None:
-            estimate = estimate_of("certified", problem, certified.outcome_of(solution), seconds)
-        rows.append(Compared(certified.METHOD, estimate, error))
+            estimate = estimate_of("certified", problem, outcome_of(solution), seconds)
+        rows.append(Compared(CERTIFIED, estimate, error))
     rows.sort(key=lambda row: math.inf if row.estimate is None else row.estimate.cost)
-    trees, undetermined = _chained(problem, solution, rows, options, pair_solvers or {}, progress)
+    trees, undetermined = _chained(problem, solution, rows, options, of_motions, progress)
     return Comparison(tuple(rows), solution, error, trees, undetermined)
 
 
@@ -190,3 +357,84 @@ def _compared(
         return Compared(method, run(method.name, problem, options))
     except RwhecError as raised:
         return Compared(method, error=raised)
+
+
+FORMAT = "gtsam-rwhec comparison"
+FORMAT_VERSION = 1
+
+
+def comparison_fields(comparison: Comparison) -> dict[str, Any]:
+    """The file's fields: the lower bound, and each method with its answer or the reason why it has no answer."""
+    certificate = comparison.certificate
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "conventions": {name: CONVENTIONS[name] for name in ("pose", "model", "scale", "units")},
+        "objective": None if certificate is None else str(certificate.objective),
+        "certificate": None if certificate is None else str(certificate),
+        "no_certificate": None if comparison.error is None else str(comparison.error),
+        "lower_bound": None if certificate is None else _finite(certificate.lower_bound),
+        "tolerance": None if certificate is None else certificate.tolerance,
+        "methods": [_row(comparison, row) for row in comparison.rows],
+        "chained": [_chained_row(row) for row in comparison.chained],
+        "pairs_that_no_tree_takes": list(map(str, comparison.undetermined)),
+    }
+
+
+def write_comparison(comparison: Comparison, path: str | Path) -> None:
+    """Write the JSON file.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written; the message says why.
+    """
+    content = json.dumps(comparison_fields(comparison), indent=2, allow_nan=False) + "\n"
+    write_atomically(path, content.encode("utf-8"))
+
+
+def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
+    method, estimate = row.method, row.estimate
+    fields: dict[str, Any] = {
+        "method": method.name,
+        "source": method.source,
+        "assumes": method.assumes,
+        "properties": dataclasses.asdict(method.properties),
+        "reason": None if row.error is None else str(row.error),
+    }
+    if estimate is None:
+        return fields | {"answer": None}
+    return fields | {
+        "answer": {
+            "cost": estimate.cost,
+            "gap": comparison.gap(row),
+            "is_optimal": comparison.is_optimal(row),
+            "translation_rms_m": _finite(row.translation_rms_m),
+            "rotation_rms_rad": _finite(row.rotation_rms_rad),
+            "seconds": estimate.seconds,
+            "starts_from": estimate.starts_from,
+            "notes": list(estimate.notes),
+            "free_directions": [str(direction) for direction in estimate.free_directions],
+            "scale": estimate.scale,
+            "targets": pose_rows(TARGET_CARRIER, estimate.X),
+            "sensors": pose_rows(SENSOR_CARRIER, estimate.Y),
+        }
+    }
+
+
+def _chained_row(row: Chained) -> dict[str, Any]:
+    return {
+        "method": row.method,
+        "tree": list(map(str, row.tree)),
+        "failed": {str(pair): why for pair, why in row.failed.items()},
+        "unreached": list(row.unreached),
+        "cost": None if row.estimate is None else row.estimate.cost,
+        "off_mm": _finite(row.off_mm),
+        "off_deg": _finite(row.off_deg),
+        "targets": pose_rows(TARGET_CARRIER, row.X),
+        "sensors": pose_rows(SENSOR_CARRIER, row.Y),
+    }
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

@@ -1,24 +1,145 @@
 """The record of a calibration method: its name, its source, what it assumes, what it takes.
 
-The record serves A X = Y B (``gtsam_rwhec.methods``) and A X = X B (``gtsam_rwhec.handeye``). ``run`` and
-``handeye.solve`` check the input against the record, call the method's function for an ``Outcome``, and make an
+The record serves A X = Y B and A X = X B. ``run`` and
+``solve_hand_eye`` check the input against the record, call the method's function for an ``Outcome``, and make an
 ``Estimate`` of the outcome. In A X = Y B targets' poses are X and sensors' poses are Y.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from numbers import Real
-from typing import Any, Generic, Literal, ParamSpec
+from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
-from gtsam_rwhec.errors import FrameError, OptionError
+import gtsam
+
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, PriorError, RwhecError, ScaleError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_whole
-from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.problem.knowledge import checked_scale
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.residuals import Residual
+
+Poses = Mapping[str, PoseLike]
+X = TypeVar("X")
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[X]):
+    """What a method's function returns; X and Y are poses by name, or X the one pose (4, 4) of A X = X B, metres.
+
+    ``cost`` is the method's own cost (None when it is the cost by which the call compares all methods),
+    ``lower_bound`` a proven bound on it. ``is_optimal`` says whether the bound proves the answer, where the method has
+    its own rule. ``free_directions`` are given where the method finds them itself. The rest is as in ``Estimate``.
+    """
+
+    X: X
+    Y: Poses = field(default_factory=dict)
+    scale: float | Mapping[str, float] = 1.0
+    cost: float | None = None
+    cost_name: str = ""
+    lower_bound: float | None = None
+    is_optimal: bool | None = None
+    free_directions: tuple[FreeDirection, ...] = ()
+    starts_from: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What a method proves of its own cost.
+
+    Attributes
+    ----------
+    cost : float
+        The answer's cost.
+    cost_name : str
+        The name of this cost, which may differ from ``Estimate.cost_name``.
+    lower_bound : float
+        No answer costs less.
+    is_optimal : bool
+        Whether the gap is closed, up to rounding.
+    """
+
+    cost: float
+    cost_name: str
+    lower_bound: float
+    is_optimal: bool
+
+    @property
+    def gap(self) -> float:
+        """cost - lower_bound."""
+        return self.cost - self.lower_bound
+
+
+@dataclass(frozen=True)
+class Estimate(Generic[X]):
+    """A method's answer; all methods' answers are evaluated alike.
+
+    Attributes
+    ----------
+    method : str
+        The method's name.
+    X : dict of str to gtsam.Pose3, or gtsam.Pose3
+        T_targetcarrier_target of each target, metres. For A X = X B it is one pose: T_c_h with C_i X = X H_i.
+    Y : dict of str to gtsam.Pose3
+        T_sensorcarrier_sensor of each sensor, metres; empty for A X = X B.
+    scale : float or dict of str to float
+        t_B (t_C of C X = X H) = scale * (true length); 1 when known.
+    cost : float
+        From ``methods.run``: J of the certified objective (eq. 18), whatever cost the method itself minimised. From
+        ``solve_hand_eye``: the cost that ``cost_name`` names.
+    cost_name : str
+    proof : Proof or None
+        None where the method proves nothing.
+    free_directions : tuple of FreeDirection
+        What the measurements leave undetermined, by this answer's residuals.
+    seconds : float
+        The method's own time; from ``solve_hand_eye`` with checks and evaluation.
+    residuals : dict of (target, sensor) to Residual
+        Empty for A X = X B.
+    alpha : float or None
+        1/m, the weight of translations in A X = X B, given or estimated; None for A X = Y B.
+    starts_from : str or None
+        What an iteration started from; None for closed forms and global methods.
+    notes : tuple of str
+        The method's remarks on this answer.
+    """
+
+    method: str
+    X: X
+    Y: dict[str, gtsam.Pose3]
+    scale: float | dict[str, float]
+    cost: float
+    cost_name: str
+    proof: Proof | None
+    free_directions: tuple[FreeDirection, ...]
+    seconds: float
+    residuals: dict[Pair, Residual] = field(default_factory=dict)
+    alpha: float | None = None
+    starts_from: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lower_bound(self) -> float | None:
+        """``proof.lower_bound``; None where the method proves nothing."""
+        return None if self.proof is None else self.proof.lower_bound
+
+    @property
+    def gap(self) -> float | None:
+        """``proof.gap``; None where the method proves nothing."""
+        return None if self.proof is None else self.proof.gap
+
+    @property
+    def is_optimal(self) -> bool | None:
+        """``proof.is_optimal``; None where the method proves nothing."""
+        return None if self.proof is None else self.proof.is_optimal
+
 
 Arguments = ParamSpec("Arguments")
 #: Frames that a method solves for at once (RWHEC paper, Table 1). Empty: one X and one Y; "Xs": several Xs and one Y.
@@ -79,7 +200,7 @@ class Method(Generic[Arguments]):
     name : str
         Its key in ``METHODS``.
     function : callable
-        Makes an ``Outcome`` from (problem, options) for A X = Y B, from a ``handeye.Request`` for A X = X B.
+        Makes an ``Outcome`` from (problem, options) for A X = Y B, from a ``Request`` for A X = X B.
     properties : Properties
     source : str
         The publication.
@@ -153,3 +274,76 @@ def checked_start(
         if missing:
             raise FrameError(f"the start's {what} has no {missing[0]}; it has {', '.join(poses) or 'none'}")
     return X, Y, checked_scale(scale, "the start's scale (1.0 if it is known)")
+
+
+#: A X = Y B of one X and one Y takes this many measurements: they give two motions about axes that are not parallel.
+FEWEST = 3
+#: A method must take this for each kind of scale.
+_FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
+    "known": frozenset(),
+    "shared": frozenset({Takes.SHARED_SCALE}),
+    "per_target": frozenset({Takes.SCALE_PER_TARGET}),
+}
+
+
+def refusal(method: Method[Any], problem: Problem) -> RwhecError | None:
+    """The error with which a method refuses a problem; None if it takes the problem."""
+    if not isinstance(method, Method) or not isinstance(problem, Problem):
+        check_problem(method, problem)  # raises: such a call is wrong, whatever the method can do
+    try:
+        check_problem(method, problem)
+    except RwhecError as error:
+        return error
+    return None
+
+
+def check_problem(method: Method[Any], problem: Problem) -> None:
+    """Refuse a problem that the method cannot solve.
+
+    Raises CountError, FrameError, MeasurementsNotKeptError, OptionError, PriorError or ScaleError, or what the method's
+    own check raises.
+    """
+    if not isinstance(method, Method):
+        raise OptionError(f"the method is a {type(method).__name__}; give a record of gtsam_rwhec.methods.METHODS")
+    takes = method.takes
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    problem.require_pairs()
+    if not takes >= _FOR_SCALE[problem.scale]:
+        scales = [mode for mode, needed in _FOR_SCALE.items() if takes >= needed]
+        raise ScaleError(
+            f"this method takes scale={' or '.join(map(repr, scales))}, and the problem has scale={problem.scale!r}"
+        )
+    motions = [pair.sensor for pair in problem.pairs if pair.is_motion]
+    if motions and Takes.MOTIONS not in takes:
+        raise FrameError(f"this method solves A X = Y B, and {motions[0]} has motions of its own (A Y = Y B)")
+    if (problem.fixed or problem.priors) and Takes.PRIORS not in takes:
+        named = ", ".join(dict.fromkeys([*problem.fixed, *problem.priors]))
+        raise PriorError(f"this method takes neither fixed frames nor priors, and the problem has some for {named}")
+    _check_frames(method, problem)
+    if Takes.MOMENTS not in takes:
+        problem.require_raw_measurements("this method")
+    if method.check is not None:
+        method.check(problem)
+
+
+def _check_frames(method: Method[Any], problem: Problem) -> None:
+    targets, sensors = len(problem.targets), len(problem.sensors)
+    alone = "one target and one sensor" + (", or one sensor's motions" if Takes.MOTIONS in method.takes else "")
+    can, what = {
+        "": (len(problem.pairs) == 1, alone),
+        "Xs": (sensors == 1, "several targets and one sensor"),
+        "Xs or Ys": (min(targets, sensors) <= 1, "several targets or several sensors, not both"),
+        "Xs and Ys": (True, ""),
+    }["Xs and Ys" if Takes.CORNERS in method.takes else method.properties.multiple]
+    if not can:
+        pairs = len(problem.pairs)
+        raise FrameError(
+            f"this method solves for {what}; the problem has {targets} target{'s' * (targets != 1)}, {sensors} "
+            f"sensor{'s' * (sensors != 1)} and {pairs} pair{'s' * (pairs != 1)}"
+        )
+    if targets == sensors == 1 and Takes.PRIORS not in method.takes and problem.number_of_measurements < FEWEST:
+        raise CountError(
+            f"the problem has {problem.number_of_measurements} measurements; one target and one sensor take at least "
+            f"{FEWEST}, turned about axes that are not parallel"
+        )

@@ -1,34 +1,91 @@
-"""All methods by name, and the call that runs a method."""
+"""All methods for A X = Y B by name, the call that runs one, and any answer under the certified objective."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
-from gtsam_rwhec.methods import (
-    certified,
-    dornaika1998,
-    heller2014,
-    horn2023,
-    image_methods,
-    li2010,
-    linear_methods,
-    local_on_manifold,
-    strobl2006,
-    tabb2017,
-    wise2020,
-    zhuang1994,
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.identifiability.identification import identify
+from gtsam_rwhec.methods.certified import CERTIFIED
+from gtsam_rwhec.methods.closed_forms import DORNAIKA_CLOSED, DUAL_QUATERNIONS, KRONECKER, SHAH, WANG, ZHUANG
+from gtsam_rwhec.methods.global_rotations import HELLER, HELLER_MATRIX, WISE
+from gtsam_rwhec.methods.horn2023 import HORN
+from gtsam_rwhec.methods.iterative_methods import C1, C1_SEPARABLE, C2, C2_SEPARABLE, DORNAIKA, LOM, STROBL
+from gtsam_rwhec.methods.method import (
+    Estimate,
+    Method,
+    MethodOptions,
+    Outcome,
+    Poses,
+    Proof,
+    check_options,
+    check_problem,
 )
-from gtsam_rwhec.methods.applicability import check_problem
-from gtsam_rwhec.methods.estimate import Estimate, Outcome, Poses, Proof
-from gtsam_rwhec.methods.evaluation import evaluate
-from gtsam_rwhec.methods.method import Method, MethodOptions, check_options
+from gtsam_rwhec.methods.reprojection import EVANGELISTA, RP1
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.part_form import PartForm
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
+from gtsam_rwhec.solver.variables import given_answer
+from gtsam_rwhec.solving.arguments import check_against_knowledge, check_types
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an answer costs, how well it fits, and what it leaves free.
+
+    The cost is J (eq. 18) with priors, in the inverse form where the certified solver uses the inverse form. Larger
+    residuals leave more directions free.
+    """
+
+    cost: float
+    residuals: dict[Pair, Residual]
+    free_directions: tuple[FreeDirection, ...]
+
+
+@np.errstate(all="ignore")
+def evaluate(
+    problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
+) -> Evaluation:
+    """Evaluate an answer; arguments and errors are those of ``cost_of_answer``."""
+    check_types(problem, None)
+    parts = parts_of(problem)
+    check_against_knowledge(problem, X, Y, scale)
+    cost = 0.0
+    residuals: dict[Pair, Residual] = {}
+    free: list[FreeDirection] = []
+    for part in parts:
+        answer = given_answer(part, X, Y, scale)
+        cost += max(PartForm.of(part).evaluated(answer).cost, 0.0)
+        poses = PairPoses.of(part, answer)
+        J_t, J_R = costs_of_pairs(part, poses)
+        residuals |= residuals_of_pairs(part, poses, J_t, J_R)
+        free += identify(part, poses, J_t, J_R).free_directions
+    return Evaluation(cost, {pair: residuals[pair] for pair in problem.pairs}, tuple(free))
+
+
+def cost_of_answer(
+    problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
+) -> float:
+    """J of an answer: X = T_targetcarrier_target and Y = T_sensorcarrier_sensor by name, metres, and the scale.
+
+    Raises
+    ------
+    FrameError, PoseError, PriorError, ScaleError
+        When the answer lacks a frame, or contradicts what the problem fixes.
+    """
+    return evaluate(problem, X, Y, scale).cost
+
 
 #: The cost by which all answers are compared.
 COST_NAME = "J (RWHEC paper, eq. 18)"
@@ -36,28 +93,28 @@ COST_NAME = "J (RWHEC paper, eq. 18)"
 METHODS: dict[str, Method[[Problem, MethodOptions]]] = {
     method.name: method
     for method in (
-        zhuang1994.METHOD,
-        dornaika1998.CLOSED,
-        li2010.KRONECKER,
-        li2010.DUAL_QUATERNIONS,
-        linear_methods.SHAH,
-        linear_methods.WANG,
-        dornaika1998.NONLINEAR,
-        local_on_manifold.METHOD,
-        strobl2006.METHOD,
-        horn2023.METHOD,
-        tabb2017.C1,
-        tabb2017.C2,
-        tabb2017.C1_SEPARABLE,
-        tabb2017.C2_SEPARABLE,
-        image_methods.RP1,
-        wise2020.METHOD,
-        heller2014.METHOD,
-        heller2014.MATRIX,
-        image_methods.EVANGELISTA,
-        certified.METHOD,
+        ZHUANG,
+        DORNAIKA_CLOSED,
+        KRONECKER,
+        DUAL_QUATERNIONS,
+        SHAH,
+        WANG,
+        DORNAIKA,
+        LOM,
+        STROBL,
+        HORN,
+        C1,
+        C2,
+        C1_SEPARABLE,
+        C2_SEPARABLE,
+        RP1,
+        WISE,
+        HELLER,
+        HELLER_MATRIX,
+        EVANGELISTA,
+        CERTIFIED,
     )
-}
+}  # fmt: skip
 
 
 @one_blas_thread()

@@ -15,21 +15,34 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.errors import CameraError, OptionError, RwhecError
+from gtsam_rwhec.errors import CameraError, FrameError, OptionError, RwhecError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_checks import check_arguments
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
-from gtsam_rwhec.fitting.observations import Observations, solved_with_chosen_poses
+from gtsam_rwhec.fitting.observations import (
+    Observations,
+    check_corners_everywhere,
+    observations_of,
+    solved_with_chosen_poses,
+)
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, one_transform, to_pose3
-from gtsam_rwhec.methods import evangelista2023, tabb2017_rp1
 from gtsam_rwhec.methods.certified import quiet_solution
-from gtsam_rwhec.methods.corner_costs import Corners, Minimum
-from gtsam_rwhec.methods.estimate import Poses
-from gtsam_rwhec.methods.linear_methods import start_of
-from gtsam_rwhec.methods.method import MethodOptions, check_options, checked_start
-from gtsam_rwhec.methods.tabb2017 import Parameterisation
+from gtsam_rwhec.methods.closed_forms import start_of
+from gtsam_rwhec.methods.corner_methods import Corners, Minimum, cost_at, evangelista_minimum, rp1_minimum
+from gtsam_rwhec.methods.iterative_methods import TABB_SOURCE, Parameterisation
+from gtsam_rwhec.methods.method import (
+    Method,
+    MethodOptions,
+    Outcome,
+    Poses,
+    Properties,
+    Takes,
+    check_options,
+    checked_start,
+)
+from gtsam_rwhec.problem.problem import Problem
 
 #: The name of ``rw.refine_corners`` in tables.
 OURS = "refine_corners"
@@ -205,9 +218,9 @@ def certified_start(observations: Observations, options: MethodOptions | None = 
 
 def _descent(name: str, parameterisation: Parameterisation, carrier: CarrierNoise | None) -> Descend:
     if name == "tabb2017_rp1":
-        return partial(tabb2017_rp1.minimum, parameterisation=parameterisation)
+        return partial(rp1_minimum, parameterisation=parameterisation)
     if name == "evangelista2023":
-        return partial(evangelista2023.minimum, carrier=_deviations(carrier))
+        return partial(evangelista_minimum, carrier=_deviations(carrier))
     raise OptionError(f"method {brief(name)} is not one of {', '.join((*NAMES, OURS))}")
 
 
@@ -235,7 +248,7 @@ def _ours(observations: Observations, carrier: CarrierNoise | None) -> Descend:
         deviations = _deviations(carrier)
         cost = corners.cost(frames)
         if deviations is not None:
-            cost = evangelista2023.cost_at(corners, frames, refined.point.A, deviations)
+            cost = cost_at(corners, frames, refined.point.A, deviations)
         return Minimum(frames, cost, refined.iterations, refined.last_step < 0.1)
 
     return descent
@@ -278,3 +291,54 @@ def _start(observations: Observations, options: MethodOptions) -> tuple[Poses, P
         observations, lambda problem: start_of(problem, options), lambda answer: answer[:2]
     )
     return X, Y, f"{words} of the images' poses"
+
+
+def check_corners(problem: Problem) -> None:
+    """Refuse a problem of poses: FrameError without any corners, CountError where measurements have none."""
+    if not problem.boards:
+        raise FrameError(
+            f"this method minimises reprojection errors, and the problem's {problem.number_of_measurements} "
+            "measurements are poses; give corners in pixels, by problem.add_corners, or as rw.Observations to "
+            "gtsam_rwhec.methods.reprojection.run or compare"
+        )
+    check_corners_everywhere(problem)
+
+
+def by_corners(problem: Problem, options: MethodOptions, name: str) -> Outcome[Poses]:
+    """The answer for the corners that a problem holds."""
+    answer = run(name, observations_of(problem), options)
+    notes = () if answer.converged else (f"not converged after {answer.iterations} steps",)
+    return Outcome(
+        answer.X,
+        answer.Y,
+        starts_from=answer.starts_from,
+        notes=(f"{answer.rms_px:.3g} px rms by the measured A", *notes),
+    )
+
+
+def _method(name: str, properties: Properties, source: str, assumes: str) -> Method[[Problem, MethodOptions]]:
+    return Method(
+        name=name,
+        function=partial(by_corners, name=name),
+        properties=properties,
+        source=source,
+        assumes=assumes,
+        takes=frozenset({Takes.CORNERS}),
+        check=check_corners,
+    )
+
+
+EVANGELISTA = _method(
+    "evangelista2023",
+    Properties("SE(3)", multiple="Xs"),
+    "D. Evangelista, E. Olivastri, D. Allegri, E. Menegatti and A. Pretto, A graph-based optimization framework for "
+    "hand-eye calibration for multi-camera setups, ICRA 2023",
+    "Corners in pixels, equally accurate, of cameras whose intrinsics are known. Deviations of the robot's poses: by "
+    "default a metre and two radians for each pixel. A start near the answer.",
+)
+RP1 = _method(
+    "tabb2017_rp1",
+    Properties("Euler angles, rotation vectors or quaternions", multiple="Xs or Ys"),
+    TABB_SOURCE,
+    "Corners in pixels, of cameras whose intrinsics are known. A start near the answer.",
+)

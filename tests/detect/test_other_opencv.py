@@ -40,7 +40,7 @@ def test_the_other_opencv(share: str, other_opencv: Path) -> None:
         tests = [path for path in tests if path.stem in ("test_codes", "test_intrinsics_files", "test_targets")]
         assert len(tests) == 3
     if OTHER == 4:
-        tests += [REPOSITORY / "tests" / "compat" / "test_beside_opencv4.py"]
+        tests += [REPOSITORY / "tests" / "methods" / "test_beside_opencv4.py"]
         tests += [REPOSITORY / "tests" / "methods" / "test_opencv4.py"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(other_opencv), os.environ.get("PYTHONPATH", "")])}
     version = subprocess.run(

@@ -14,9 +14,9 @@ import pytest
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.compat import opencv
 from gtsam_rwhec.errors import NotUniqueWarning, RwhecError, WeightsWarning
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.methods import opencv
 from gtsam_rwhec.simulate import Noise, general
 
 #: Threads that each test begins with, more than one on any machine.
@@ -102,7 +102,7 @@ def test_one_thread_in_methods_without_progress(monkeypatch: pytest.MonkeyPatch)
     A, B = raw.A, raw.B
     calls: list[Callable[[], object]] = [
         lambda: rw.methods.run("shah2013", problem),
-        lambda: rw.handeye.solve(np.linalg.inv(A[:-1]) @ A[1:], B[:-1] @ np.linalg.inv(B[1:])),
+        lambda: rw.methods.solve_hand_eye(np.linalg.inv(A[:-1]) @ A[1:], B[:-1] @ np.linalg.inv(B[1:])),
         lambda: opencv.calibrateHandEye(A[:, :3, :3], A[:, :3, 3], B[:, :3, :3], B[:, :3, 3]),
         lambda: opencv.calibrateRobotWorldHandEye(A[:, :3, :3], A[:, :3, 3], B[:, :3, :3], B[:, :3, 3]),
     ]

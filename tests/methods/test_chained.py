@@ -1,24 +1,22 @@
 """Methods for one pair on every pair of the best tree: the tree, what it avoids, and the gap to the joint answer."""
 
 from __future__ import annotations
-
 import io
 import json
-
 import numpy as np
 import pytest
 from rich.console import Console
-
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.handeye.on_pairs import PAIR_SOLVERS
-from gtsam_rwhec.methods.chained import chained
 from gtsam_rwhec.methods.comparison import Comparison
-from gtsam_rwhec.methods.comparison_file import comparison_fields
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.comparison_report import print_comparison
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.simulate import general
+from gtsam_rwhec.methods.comparison import PAIR_SOLVERS
+from gtsam_rwhec.methods.comparison import chained
+from gtsam_rwhec.methods.comparison import comparison_fields
 
 NOISE = Noise(sigma_m=0.01, kappa=1250.0)
 QUICK = ("shah2013", "li2010_dq", "certified", "lom")
@@ -100,13 +98,13 @@ def test_pairs_that_are_not_determined_alone_are_in_no_tree() -> None:
 
 def test_all_are_the_truth_without_noise_and_dearer_than_the_joint_answer_with_it() -> None:
     exact, joint = of_counts(COUNTS, None)
-    result = rw.methods.compare(exact, methods=QUICK, pair_solvers=PAIR_SOLVERS)
+    result = rw.methods.compare(exact, methods=[*QUICK, *PAIR_SOLVERS])
     assert {row.method for row in result.chained} == {"shah2013", "li2010_dq", *PAIR_SOLVERS}
     for row in result.chained:
         assert row.off_mm < 1e-4, row.method
         assert row.off_deg < 1e-5, row.method
     noisy, joint = of_counts(COUNTS)
-    result = rw.methods.compare(noisy, methods=QUICK, pair_solvers=PAIR_SOLVERS)
+    result = rw.methods.compare(noisy, methods=[*QUICK, *PAIR_SOLVERS])
     costs = [row.estimate.cost for row in result.chained if row.estimate is not None]
     assert len(costs) == len(PAIR_SOLVERS) + 2
     assert costs == sorted(costs)

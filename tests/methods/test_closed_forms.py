@@ -10,7 +10,7 @@ from method_problems import exchanged, four_targets, general_pair, largest_error
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.methods import METHODS, MethodOptions, refusal, run
-from gtsam_rwhec.methods.absolute import Stack, linear_translations, rotation_products
+from gtsam_rwhec.methods.linear_systems import Stack, linear_translations, rotation_products
 from gtsam_rwhec.simulate import Noise
 
 CLOSED = ("zhuang1994", "dornaika1998_closed", "li2010_kronecker", "li2010_dq", "shah2013", "wang2022")

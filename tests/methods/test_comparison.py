@@ -15,7 +15,7 @@ from rich.console import Console
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, FileFormatError, OptionError
 from gtsam_rwhec.methods import METHODS, Comparison, compare, run
-from gtsam_rwhec.methods.comparison_file import comparison_fields, write_comparison
+from gtsam_rwhec.methods.comparison import comparison_fields, write_comparison
 from gtsam_rwhec.report.comparison_report import print_comparison
 
 QUICK = ("shah2013", "wang2022", "dornaika1998", "lom", "certified", "zhuang1994")

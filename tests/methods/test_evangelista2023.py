@@ -12,9 +12,9 @@ from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods import MethodOptions, evangelista2023, run
+from gtsam_rwhec.methods import MethodOptions, corner_methods, run
 from gtsam_rwhec.methods import reprojection as methods
-from gtsam_rwhec.methods.corner_costs import Corners
+from gtsam_rwhec.methods.corner_methods import Corners
 from gtsam_rwhec.simulate.simulation import frame_distance
 
 
@@ -32,16 +32,16 @@ def test_the_gradient_is_the_derivative_and_the_step_is_newtons() -> None:
     frames = np.array([*X.values(), *Y.values()]) @ se3.expmap(1e-2 * generator.standard_normal((4, 6)))
     pairs = [(stack, *corners.frames_of(stack)) for stack in corners.stacks]
     B = np.concatenate([se3.inverse(frames[j]) @ corners.A[stack.instant] @ frames[i] for stack, i, j in pairs])
-    graph = evangelista2023.Graph(frames, B @ se3.expmap(1e-3 * generator.standard_normal((len(B), 6))))
+    graph = corner_methods.Graph(frames, B @ se3.expmap(1e-3 * generator.standard_normal((len(B), 6))))
     deviations = (1e-3, 5e-4)
 
     def cost(step: Array) -> float:
         moves = se3.expmap(step.reshape(-1, 6))
-        there = evangelista2023.Graph(graph.frames @ moves[:4], graph.B @ moves[4:])
-        return evangelista2023.linear_model(corners, there, deviations).cost
+        there = corner_methods.Graph(graph.frames @ moves[:4], graph.B @ moves[4:])
+        return corner_methods.graph_model(corners, there, deviations).cost
 
-    here = evangelista2023.linear_model(corners, graph, deviations)
-    assert isinstance(here, evangelista2023.Bordered)
+    here = corner_methods.graph_model(corners, graph, deviations)
+    assert isinstance(here, corner_methods.Bordered)
     gradient = np.concatenate([here.g, here.g_B.ravel()])
     for k in (*range(24), 24, 31, 50):
         step = np.zeros(len(gradient))

@@ -1,25 +1,29 @@
 """Heller 2014: the polynomial, its moments, both relaxations, where the second is not enough."""
 
 from __future__ import annotations
-
 from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from method_problems import one_pair
 from rwhec_factors import se3
-from test_wise2020 import cost_of, motions
-
+from test_wise2020 import cost_of
+from test_wise2020 import motions
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import OptionError, ScaleError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.methods import quaternion_moments, run
-from gtsam_rwhec.methods.heller2014 import Parameterisation, global_minimum
-from gtsam_rwhec.methods.quaternion_moments import PRODUCTS, _moment_places, products_to_rotation
-from gtsam_rwhec.methods.unit_weights import UnitForm
+from gtsam_rwhec.methods import run
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.rotations import random_rotations, vec
+from gtsam_rwhec.solver.rotations import random_rotations
+from gtsam_rwhec.solver.rotations import vec
+from gtsam_rwhec.methods import global_rotations
+from gtsam_rwhec.methods.global_rotations import PRODUCTS
+from gtsam_rwhec.methods.global_rotations import Parameterisation
+from gtsam_rwhec.methods.global_rotations import UnitForm
+from gtsam_rwhec.methods.global_rotations import _moment_places
+from gtsam_rwhec.methods.global_rotations import global_minimum
+from gtsam_rwhec.methods.global_rotations import products_to_rotation
 
 BOTH: tuple[Parameterisation, ...] = ("quaternion", "matrix")
 
@@ -101,8 +105,8 @@ def test_a_wrong_solver_cannot_make_a_wrong_bound(monkeypatch: pytest.MonkeyPatc
     form = unrelated(0)
     best = global_minimum(form).cost
     for steps in (3, 6, 9):
-        monkeypatch.setattr(quaternion_moments, "STEPS", steps)
-        assert quaternion_moments.solve_moments(form.reduced.Q).lower_bound <= best
+        monkeypatch.setattr(global_rotations, "STEPS", steps)
+        assert global_rotations.solve_moments(form.reduced.Q).lower_bound <= best
 
 
 @pytest.mark.parametrize("name", ["heller2014", "heller2014_matrix"])

@@ -11,24 +11,22 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.quaternions import conjugate, left, of_rotations
 from gtsam_rwhec.methods import run
-from gtsam_rwhec.methods.absolute import Stack
-from gtsam_rwhec.methods.dual_quaternion_relaxation import (
-    multipliers_of,
-    polished,
-    pose_chart,
-    relaxed,
-    rounded,
-    vector_of,
-)
 from gtsam_rwhec.methods.horn2023 import (
     DualQuaternionAnswer,
     Signs,
     form_of,
     horn2023,
+    multipliers_of,
+    polished,
+    pose_chart,
+    relaxed,
     residual_rows,
+    rounded,
     signed_quaternions,
     solve_dual_quaternions,
+    vector_of,
 )
+from gtsam_rwhec.methods.linear_systems import Stack
 from gtsam_rwhec.methods.method import MethodOptions
 from gtsam_rwhec.simulate import Noise, Simulation
 

@@ -7,8 +7,7 @@ import pytest
 from method_problems import general_pair
 
 from gtsam_rwhec.geometry.quaternions import left, of_rotations, right
-from gtsam_rwhec.methods.absolute import Stack
-from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
+from gtsam_rwhec.methods.linear_systems import Stack, paired_quaternions
 
 
 @pytest.mark.parametrize("seed", range(5))

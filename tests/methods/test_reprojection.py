@@ -15,7 +15,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.methods import MethodOptions, compare, run
 from gtsam_rwhec.methods import reprojection as methods
-from gtsam_rwhec.methods.corner_costs import Corners
+from gtsam_rwhec.methods.corner_methods import Corners
 from gtsam_rwhec.simulate.simulation import frame_distance
 
 

@@ -9,8 +9,8 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.methods import MethodOptions, run
-from gtsam_rwhec.methods.absolute import Stack
-from gtsam_rwhec.methods.strobl2006 import METHOD, errors, reweighed
+from gtsam_rwhec.methods.iterative_methods import STROBL, errors, reweighed
+from gtsam_rwhec.methods.linear_systems import Stack
 from gtsam_rwhec.simulate import Noise
 
 
@@ -61,5 +61,5 @@ def test_a_given_start_is_taken_and_named() -> None:
     assert run("strobl2006", simulation.problem).starts_from == "wang2022"
     assert "deg" in found.notes[0]
     assert largest_errors(simulation, found)[0] < 0.05
-    assert METHOD.properties.joint
-    assert METHOD.properties.probabilistic
+    assert STROBL.properties.joint
+    assert STROBL.properties.probabilistic

@@ -10,9 +10,8 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import run
-from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.methods.method import MethodOptions
-from gtsam_rwhec.methods.tabb2017 import C1, CHARTS, Cost, Mode, Parameterisation, tabb2017
+from gtsam_rwhec.methods.iterative_methods import C1, CHARTS, Cost, Mode, Parameterisation, tabb2017
+from gtsam_rwhec.methods.method import MethodOptions, Outcome, Poses
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.rotations import random_rotations, vec

@@ -13,10 +13,10 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods import MethodOptions, tabb2017_rp1
+from gtsam_rwhec.methods import MethodOptions, corner_methods
 from gtsam_rwhec.methods import reprojection as methods
-from gtsam_rwhec.methods.corner_costs import Corners
-from gtsam_rwhec.methods.tabb2017 import CHARTS, Parameterisation
+from gtsam_rwhec.methods.corner_methods import Corners
+from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
 
 EVERY: tuple[Parameterisation, ...] = get_args(Parameterisation)
 
@@ -34,18 +34,18 @@ def without_images(observations: Observations, sensor: str, images: int) -> Obse
 def test_gradient_and_hessian_are_the_derivatives(parameterisation: Parameterisation) -> None:
     observations, X, Y = seen(0.0, 0, images=4)
     corners = Corners.of(without_images(observations, "right", 2))
-    weights = tabb2017_rp1.weights_of(corners)
+    weights = corner_methods.weights_of(corners)
     generator = np.random.default_rng(1)
 
     def parameters(frames: Array) -> Array:
         return np.concatenate([CHARTS[parameterisation][0](frames[:, :3, :3]), frames[:, :3, 3]], axis=1)
 
     def cost(p: Array) -> float:
-        return tabb2017_rp1.linear_model(corners, weights, p, parameterisation).cost
+        return corner_methods.rp1_model(corners, weights, p, parameterisation).cost
 
     truth = np.array([*X.values(), *Y.values()])
     p = parameters(truth @ se3.expmap(1e-2 * generator.standard_normal((4, 6))))
-    here = tabb2017_rp1.linear_model(corners, weights, p, parameterisation)
+    here = corner_methods.rp1_model(corners, weights, p, parameterisation)
     for k in range(p.size):
         step = np.zeros(p.size)
         step[k] = 1e-6
@@ -55,7 +55,7 @@ def test_gradient_and_hessian_are_the_derivatives(parameterisation: Parameterisa
     p, direction, size = parameters(truth), generator.standard_normal(p.size), 1e-5
     step = size * direction.reshape(p.shape)
     bend = (cost(p + step) + cost(p - step) - 2.0 * cost(p)) / size**2
-    H = tabb2017_rp1.linear_model(corners, weights, p, parameterisation).H
+    H = corner_methods.rp1_model(corners, weights, p, parameterisation).H
     assert direction @ H @ direction == pytest.approx(bend, rel=1e-4)
 
 
@@ -86,7 +86,7 @@ def test_the_cost_is_chi_square_and_one_minimum_for_all_parameters() -> None:
 def test_a_camera_with_fewer_images_weighs_as_much_in_all() -> None:
     observations, _, _ = seen(0.3, 5)
     fewer = without_images(observations, "right", 6)
-    assert tabb2017_rp1.weights_of(Corners.of(fewer)) == {"left": 0.5, "right": 1.0}
+    assert corner_methods.weights_of(Corners.of(fewer)) == {"left": 0.5, "right": 1.0}
     answer = methods.run("tabb2017_rp1", fewer)
     assert answer.cost < answer.reprojection_cost
 

@@ -11,8 +11,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import run
-from gtsam_rwhec.methods.unit_weights import UnitForm
-from gtsam_rwhec.methods.wise2020 import certified_rotations
+from gtsam_rwhec.methods.global_rotations import UnitForm, certified_rotations
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.rotations import random_rotations
 

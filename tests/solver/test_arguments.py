@@ -1,21 +1,18 @@
 """Arguments of `solve`, `certify` and the other calls: what cannot be used is refused in words, without a TypeError."""
 
 from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
-
 import gtsam
 import numpy as np
 import pytest
-
 import gtsam_rwhec as rw
 from gtsam_rwhec import errors
-from gtsam_rwhec.compat import opencv
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.simulate import general
 from gtsam_rwhec.solver.solve_options import SolveOptions
-
+from gtsam_rwhec.methods import opencv
 
 class Thing:
     """Neither a number nor a pose; with the same name in every process."""
@@ -137,7 +134,7 @@ def test_no_pose(pose: Any) -> None:
         lambda: rw.solve(KNOWN, "local", initial=(SOLVED.X, SOLVED.Y | {"sensor0": pose}, 1.0)),
         lambda: rw.Problem().fix("cam", pose),
         lambda: rw.Problem().add_prior("cam", pose, 0.1),
-        lambda: rw.handeye.DualQuaternionPrior(pose, 1.0, 1.0),
+        lambda: rw.methods.DualQuaternionPrior(pose, 1.0, 1.0),
     ):
         with pytest.raises(errors.PoseError, match=r"give|leave|check"):
             call()
@@ -217,14 +214,14 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "cross validate folds": lambda odd: rw.cross_validate(KNOWN, odd),
     "cross validate by": lambda odd: rw.cross_validate(KNOWN, by=odd),
     "cross validate progress": lambda odd: rw.cross_validate(KNOWN, progress=odd),
-    "handeye C": lambda odd: rw.handeye.solve(odd, RAW.B),
-    "handeye method": lambda odd: rw.handeye.solve(RAW.A, RAW.B, odd),
-    "handeye order": lambda odd: rw.handeye.solve(RAW.A, RAW.B, order=odd),
-    "handeye weights": lambda odd: rw.handeye.solve(RAW.A, RAW.B, weights=odd),
-    "handeye covariances": lambda odd: rw.handeye.solve(RAW.A, RAW.B, covariances=odd),
-    "handeye prior": lambda odd: rw.handeye.solve(RAW.A, RAW.B, prior=odd),
-    "handeye scale": lambda odd: rw.handeye.solve(RAW.A, RAW.B, scale=odd),
-    "a prior's form": lambda odd: rw.handeye.DualQuaternionPrior(np.eye(4), 1.0, 1.0, odd),
+    "handeye C": lambda odd: rw.methods.solve_hand_eye(odd, RAW.B),
+    "handeye method": lambda odd: rw.methods.solve_hand_eye(RAW.A, RAW.B, odd),
+    "handeye order": lambda odd: rw.methods.solve_hand_eye(RAW.A, RAW.B, order=odd),
+    "handeye weights": lambda odd: rw.methods.solve_hand_eye(RAW.A, RAW.B, weights=odd),
+    "handeye covariances": lambda odd: rw.methods.solve_hand_eye(RAW.A, RAW.B, covariances=odd),
+    "handeye prior": lambda odd: rw.methods.solve_hand_eye(RAW.A, RAW.B, prior=odd),
+    "handeye scale": lambda odd: rw.methods.solve_hand_eye(RAW.A, RAW.B, scale=odd),
+    "a prior's form": lambda odd: rw.methods.DualQuaternionPrior(np.eye(4), 1.0, 1.0, odd),
     "run name": lambda odd: rw.methods.run(odd, KNOWN),
     "run problem": lambda odd: rw.methods.run("certified", odd),
     "run options": lambda odd: rw.methods.run("certified", KNOWN, odd),

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import distance, hand_held, pair, poses
+
+from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
+from gtsam_rwhec.methods import dual_quaternion_cost as cost_module
+from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms, residuals
+from gtsam_rwhec.methods.hand_eye import solve_hand_eye
+from gtsam_rwhec.methods.motions import motions_of
+
+
+def test_rows_are_sums_and_differences() -> None:
+    s = hand_held(20, 0)
+    rows = motions_of(s.C, s.H).rows
+    q_C, dual_C = from_transforms(s.C)
+    q_H, dual_H = from_transforms(s.H)
+    expected = np.vstack([(q_C + q_H).T[:3], (q_C - q_H).T, (dual_C + dual_H).T[:3], (dual_C - dual_H).T])
+    clear = q_C[:, 3] + q_H[:, 3] > 0.2
+    assert clear.sum() > 15
+    assert np.abs(rows - expected)[:, clear].max() < 1e-14
+
+
+def test_pose3_and_quaternion_rows_are_the_same_motions() -> None:
+    s = hand_held(10, 1)
+    rows = motions_of(s.C, s.H).rows
+    assert motions_of([gtsam.Pose3(T) for T in s.C], [gtsam.Pose3(T) for T in s.H]).rows == pytest.approx(rows)
+    for order, columns in (("xyzw", [0, 1, 2, 3]), ("wxyz", [3, 0, 1, 2])):
+        both = [np.hstack([Rotation.from_matrix(T[:, :3, :3]).as_quat()[:, columns], T[:, :3, 3]]) for T in (s.C, s.H)]
+        assert motions_of(*both, order=order).rows == pytest.approx(rows)
+
+
+def test_the_callers_signs_do_not_matter() -> None:
+    s = hand_held(60, 2, largest_rad=np.pi)
+    rng = np.random.default_rng(3)
+    given = [np.hstack([Rotation.from_matrix(T[:, :3, :3]).as_quat(), T[:, :3, 3]]) for T in (s.C, s.H)]
+    first = solve_hand_eye(*given, order="xyzw")
+    for _ in range(5):
+        signs = rng.choice([-1.0, 1.0], (2, 60, 1))
+        again = solve_hand_eye(
+            *[np.hstack([sign * rows[:, :4], rows[:, 4:]]) for sign, rows in zip(signs, given, strict=True)],
+            order="xyzw",
+        )
+        assert again.X.equals(first.X, 1e-12)
+        assert again.cost == pytest.approx(first.cost, rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_half_turns_get_the_sign_that_agrees_with_the_rest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    axes = rng.normal(size=(40, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    angles = np.where(np.arange(40) < 20, np.pi, rng.uniform(0.3, 2.0, 40))
+    s = pair(poses(axes * angles[:, None], rng.uniform(-1, 1, (40, 3))), rng, 0.01, 0.01)
+    rows = motions_of(s.C, s.H).rows
+    (q,), (q_dual,) = from_transforms(s.X[None])
+    assert np.linalg.norm(residuals(rows, q, q_dual), axis=0).max() < 0.2
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("count", [3, 10])
+def test_half_turns_only(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    axes = rng.normal(size=(count, 3))
+    axes *= np.pi / np.linalg.norm(axes, axis=1)[:, None]
+    s = pair(poses(axes, rng.uniform(-1, 1, (count, 3))), rng, 1e-4, 1e-4)
+    angle, length = distance(solve_hand_eye(s.C, s.H).X, s.X)
+    assert angle < 0.01
+    assert length < 0.01
+
+
+def test_numbers_that_do_not_match() -> None:
+    s = hand_held(5, 0)
+    with pytest.raises(CountError, match="C has 5 motions and H has 4"):
+        motions_of(s.C, s.H[:4])
+    with pytest.raises(CountError, match="1 motion given; AX = XB needs two"):
+        motions_of(s.C[:1], s.H[:1])
+    with pytest.raises(CountError, match="0 motions given"):
+        motions_of([], [])
+
+
+def test_what_is_no_pose_is_refused_with_its_place() -> None:
+    s = hand_held(5, 0)
+    bad = s.H.copy()
+    bad[3, 0, 3] = np.nan
+    with pytest.raises(PoseError, match=r"H: measurement 3 has an entry that is NaN"):
+        motions_of(s.C, bad)
+    with pytest.raises(PoseError, match="C: rows of 7 need the order of the quaternion"):
+        motions_of(np.ones((3, 7)), np.ones((3, 7)))
+
+
+def test_blocks_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    s = hand_held(50, 4, largest_rad=np.pi)
+    whole = motions_of(s.C, s.H).rows
+    monkeypatch.setattr(cost_module, "BLOCK", 16)
+    assert np.array_equal(motions_of(s.C, s.H).rows, whole)
+    bad = s.C.copy()
+    bad[40, :3, :3] *= 1.1
+    with pytest.raises(PoseError, match="C: the rotation of measurement 40 is off"):
+        motions_of(bad, s.H)
+
+
+def test_motions_that_do_not_move() -> None:
+    still = np.tile(np.eye(4), (4, 1, 1))
+    with pytest.raises(UnderdeterminedError, match="all 4 motions are the identity"):
+        motions_of(still, still)

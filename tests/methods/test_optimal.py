@@ -1,0 +1,255 @@
+from __future__ import annotations
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from simulated import distance
+from simulated import hand_held
+from simulated import pair
+from simulated import planar
+from simulated import poses
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.solver.free_directions import FreeKind
+from gtsam_rwhec.solver.free_directions import FreeReason
+from gtsam_rwhec.methods import DualQuaternionPrior
+from gtsam_rwhec.methods.dq_saddle import HIDDEN
+from gtsam_rwhec.methods.dq_saddle import best_dual
+from gtsam_rwhec.methods.dq_saddle import bracket
+from gtsam_rwhec.methods.dq_saddle import minimum
+from gtsam_rwhec.methods.dq_saddle import search
+from gtsam_rwhec.methods.dqopt import bound_at
+from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
+from gtsam_rwhec.methods.dual_quaternion_cost import residuals
+from gtsam_rwhec.methods.dual_quaternion_cost import to_transform
+from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS
+from gtsam_rwhec.methods.hand_eye import solve_hand_eye
+from gtsam_rwhec.methods.motions import Motions
+from gtsam_rwhec.methods.motions import cost_of
+from gtsam_rwhec.methods.motions import motions_of
+from gtsam_rwhec.methods.motions import squared_residuals
+
+def cost_at(motions: Motions, X: np.ndarray, alpha: float) -> float:
+    (q,), (q_dual,) = from_transforms(X[None])
+    rotation, translation = squared_residuals(motions, q, q_dual)
+    return rotation + alpha**2 * translation
+
+
+def nonlinear_costs(motions: Motions, alpha: float, starts: int, rng: np.random.Generator) -> list[float]:
+    weights = np.r_[np.ones(4), np.full(4, alpha)][:, None]
+    found = []
+    for _ in range(starts):
+        start = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3) * 2), rng.normal(size=3))
+
+        def error(xi: np.ndarray, start: gtsam.Pose3 = start) -> np.ndarray:
+            (q,), (q_dual,) = from_transforms(start.retract(xi).matrix()[None])
+            return (weights * residuals(motions.rows, q, q_dual)).ravel()
+
+        found.append(2.0 * least_squares(error, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15).cost)
+    return found
+
+
+@pytest.mark.parametrize("make", [hand_held, planar])
+@pytest.mark.parametrize("seed", range(3))
+def test_no_start_of_nonlinear_least_squares_does_better(make, seed: int) -> None:
+    s = make(25, seed, 0.05, 0.05)
+    r = solve_hand_eye(s.C, s.H, alpha=0.8)
+    motions = motions_of(s.C, s.H)
+    assert r.cost == pytest.approx(cost_at(motions, r.X.matrix(), 0.8), rel=1e-12)
+    best = min(nonlinear_costs(motions, 0.8, 6, np.random.default_rng(seed)))
+    assert r.cost <= best * (1 + 1e-12)
+    assert r.cost == pytest.approx(best, rel=1e-6)
+    assert r.is_optimal
+    assert r.lower_bound <= r.cost
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.integers(3, 200),
+    st.floats(-6, -0.5),
+    st.floats(-6, 0),
+    st.floats(-3, 3),
+    st.sampled_from([0.02, 0.5, 3.1]),
+)
+def test_the_bound_is_attained(
+    seed: int, count: int, log_rad: float, log_m: float, log_alpha: float, largest: float
+) -> None:
+    s = hand_held(count, seed, 10**log_rad, 10**log_m, largest)
+    r = solve_hand_eye(s.C, s.H, alpha=10**log_alpha)
+    # Where three exact rotations carry large translation errors, M's weakest direction is near the rounding that the
+    # proof must allow for, and the gap is what that rounding makes of the cost.
+    weakest, *_, strongest = cost_of(motions_of(s.C, s.H), 10**log_alpha).spectrum[0]
+    assert r.is_optimal or r.gap <= 16.0 * HIDDEN * strongest / weakest * r.cost
+    assert r.lower_bound <= r.cost
+    assert r.gap == r.cost - r.lower_bound
+
+
+def test_the_gap_is_that_of_rounding_where_rotations_are_nearly_exact() -> None:
+    s = hand_held(3, 6297, 1e-6, 1.0, 0.5)
+    r = solve_hand_eye(s.C, s.H)
+    cost = cost_of(motions_of(s.C, s.H))
+    assert minimum(cost).values[0] == pytest.approx(r.cost, rel=1e-12)  # the minimum is found
+    assert not r.is_optimal  # and rounding hides the proof
+    assert r.gap < 0.01 * r.cost
+
+
+def test_the_bound_is_below_every_pose() -> None:
+    s = hand_held(10, 4, 0.2, 0.3)
+    motions = motions_of(s.C, s.H)
+    cost = cost_of(motions)
+    bound = bound_at(cost, minimum(cost))
+    rng = np.random.default_rng(5)
+    assert bound > 0.0
+    around = solve_hand_eye(s.C, s.H).X
+    for size in (1e-6, 1e-3, 0.1, 3.0):
+        for _ in range(50):
+            assert cost_at(motions, around.retract(size * rng.normal(size=6)).matrix(), 1.0) >= bound
+
+
+def test_lambda_0_is_concave_and_its_derivative_is_that_of_eq_18() -> None:
+    s = hand_held(12, 6, 0.1, 0.1)
+    cost = cost_of(motions_of(s.C, s.H))
+    low, high = bracket(cost.Z1, cost.Z2)
+    mu, values, _, q = search(cost.Z0, cost.Z1, cost.Z2)
+    assert low <= mu <= high
+    assert abs(q @ cost.Z2 @ (mu * np.eye(4) - cost.W.T) @ q) < 1e-12  # q . q', eq. 11
+    grid = np.linspace(low, high, 201)
+    curve = np.array([np.linalg.eigvalsh(cost.Z(m))[0] for m in grid])
+    assert curve.max() <= values[0] + 1e-12
+    assert np.diff(curve, 2).max() < 1e-12
+    for m in grid[::40]:
+        q_m = np.linalg.eigh(cost.Z(m))[1][:, 0]
+        step = 1e-6 * (high - low)
+        slope = (np.linalg.eigvalsh(cost.Z(m + step))[0] - np.linalg.eigvalsh(cost.Z(m - step))[0]) / (2 * step)
+        assert slope == pytest.approx(-2.0 * q_m @ cost.Z2 @ (m * np.eye(4) - cost.W.T) @ q_m, rel=1e-4, abs=1e-7)
+
+
+def test_two_eigenvalues_that_meet() -> None:
+    """A kink: the search closes in on it, and the answer is the vector of the plane that meets the constraint."""
+    Z0, Z2 = np.diag([1.0, 1.5, 9.0, 9.0]), np.diag([0.1, 0.1, 0.1, 0.1])
+    Z1 = np.diag([1.0, -1.0, 0.0, 0.0])
+    mu, values, _, q = search(Z0, Z1, Z2)
+    assert mu == pytest.approx(0.25)
+    assert values[0] == pytest.approx(values[1])
+    assert abs(q @ (mu * Z2 - 0.5 * Z1) @ q) < 1e-9
+
+
+def test_best_dual_is_eq_20() -> None:
+    s = hand_held(12, 7)
+    cost = cost_of(motions_of(s.C, s.H))
+    q = np.random.default_rng(0).normal(size=4)
+    q /= np.linalg.norm(q)
+    expected = cost.Z2 @ (0.5 * (q @ cost.Z1 @ q) / (q @ cost.Z2 @ q) * np.eye(4) - cost.W.T) @ q
+    assert best_dual(cost, q) == pytest.approx(expected, rel=1e-9)
+    assert abs(best_dual(cost, q) @ q) < 1e-15
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4])
+def test_little_noise_and_none(noise: float) -> None:
+    s = hand_held(30, 8, noise, noise)
+    r = solve_hand_eye(s.C, s.H)
+    angle, length = distance(r.X, s.X)
+    assert max(angle, length) < 2.0 * noise + 1e-13
+    assert r.is_optimal
+    assert r.free_directions == ()
+    assert r.cost < 150 * noise**2 + 1e-25
+
+
+def test_two_motions_suffice() -> None:
+    s = hand_held(2, 9, 0.0, 0.0)
+    assert max(distance(solve_hand_eye(s.C, s.H).X, s.X)) < 1e-12
+
+
+def test_pure_translation_leaves_the_translation() -> None:
+    rng = np.random.default_rng(10)
+    s = pair(poses(np.zeros((20, 3)), rng.normal(size=(20, 3))), rng, 0.0, 0.0)
+    r = solve_hand_eye(s.C, s.H)
+    assert distance(r.X, s.X)[0] < 1e-12
+    assert np.abs(r.X.translation()).max() < 1e-12
+    assert [free.kind for free in r.free_directions] == [FreeKind.TRANSLATION] * 3
+    assert {free.reason for free in r.free_directions} == {FreeReason.NO_ROTATION}
+    noisy = pair(poses(np.zeros((500, 3)), rng.normal(size=(500, 3))), rng, 0.01, 0.01)
+    assert [free.kind for free in solve_hand_eye(noisy.C, noisy.H).free_directions] == [FreeKind.TRANSLATION] * 3
+
+
+def test_planar_motion_leaves_the_height() -> None:
+    rng = np.random.default_rng(11)
+    H = poses(np.outer(rng.uniform(-1, 1, 20), [0, 0, 1.0]), rng.normal(size=(20, 3)) * [1, 1, 0])
+    X = poses(np.array([[0.0, 0.0, 0.4]]), np.array([[0.1, 0.2, 0.3]]))[0]
+    s = pair(H, rng, 0.0, 0.0, X)
+    r = solve_hand_eye(s.C, s.H)
+    assert distance(r.X, s.X)[0] < 1e-12
+    assert r.X.translation() == pytest.approx([0.1, 0.2, 0.0], abs=1e-12)
+    assert list(map(str, r.free_directions)) == [
+        "translation of h along its own z axis: the motion turned about one axis only"
+    ]
+    assert r.is_optimal
+
+
+def test_one_axis_without_moving_leaves_two_directions() -> None:
+    rng = np.random.default_rng(12)
+    H = poses(np.outer(rng.uniform(-1, 1, 20), [1.0, 0, 0]), np.zeros((20, 3)))
+    s = pair(H, rng, 0.0, 0.0, np.eye(4))
+    r = solve_hand_eye(s.C, s.H)
+    assert r.cost < 1e-25
+    assert [str(free).split(":")[0] for free in r.free_directions] == [
+        "rotation of h about its own x axis",
+        "translation of h along its own x axis",
+    ]
+
+
+def test_the_known_origin_does_not_matter() -> None:
+    """Turning c's and h's frames turns X and leaves the cost."""
+    s = hand_held(20, 13, 0.1, 0.1)
+    r = solve_hand_eye(s.C, s.H)
+    turn = poses(np.array([[0.3, -2.0, 1.0]]), np.zeros((1, 3)))[0]
+    turned = solve_hand_eye(turn @ s.C @ turn.T, s.H)
+    assert turned.cost == pytest.approx(r.cost, rel=1e-11)
+    assert turned.X.matrix() == pytest.approx(turn @ r.X.matrix(), abs=1e-10)
+
+
+def test_weights_are_repeated_motions() -> None:
+    s = hand_held(15, 14, 0.1, 0.1)
+    repeats = np.arange(15) % 3
+    r = solve_hand_eye(s.C, s.H, weights=repeats)
+    again = solve_hand_eye(np.repeat(s.C, repeats, axis=0), np.repeat(s.H, repeats, axis=0))
+    assert r.cost == pytest.approx(again.cost, rel=1e-11)
+    assert r.X.equals(again.X, 1e-11)
+
+
+def test_covariances_and_prior_have_their_cost() -> None:
+    s = hand_held(15, 15, 0.1, 0.1)
+    r = solve_hand_eye(s.C, s.H, covariances=np.diag([1.0] * 4 + [4.0] * 4))
+    assert r.cost == pytest.approx(solve_hand_eye(s.C, s.H, alpha=0.5).cost, rel=1e-11)
+    prior = DualQuaternionPrior(gtsam.Pose3(s.X), 3.0, 2.0)
+    with_prior = solve_hand_eye(s.C, s.H, prior=prior)
+    assert with_prior.is_optimal
+    (q,), (q_dual,) = from_transforms(with_prior.X.matrix()[None])
+    without = solve_hand_eye(s.C, s.H)
+    assert with_prior.cost > without.cost
+    motions = motions_of(s.C, s.H)
+    assert with_prior.cost == pytest.approx(cost_at(motions, with_prior.X.matrix(), 1.0) + prior.value(q, q_dual))
+
+
+def test_unknown_methods_and_options() -> None:
+    s = hand_held(5, 0)
+    with pytest.raises(OptionError, match="method='best' is not known; choose one of dqopt"):
+        solve_hand_eye(s.C, s.H, method="best")
+    with pytest.raises(OptionError, match="scale='free'"):
+        solve_hand_eye(s.C, s.H, scale="free")
+    with pytest.raises(OptionError, match="cannot take an unknown scale"):
+        solve_hand_eye(s.C, s.H, scale="unknown")
+    for name, method in HAND_EYE_METHODS.items():
+        assert name == method.name
+        assert method.assumes
+        assert method.source
+
+
+def test_to_transform_of_the_answer_is_a_rotation() -> None:
+    s = hand_held(5, 16)
+    found = minimum(cost_of(motions_of(s.C, s.H)))
+    R = to_transform(found.q, found.q_dual)[:3, :3]
+    assert pytest.approx(np.eye(3), abs=1e-15) == R.T @ R
