@@ -26,6 +26,7 @@ as the text has them: every mean within four combined standard errors.
 """
 
 from __future__ import annotations
+
 import argparse
 import functools
 import math
@@ -34,24 +35,15 @@ import sys
 import time
 from dataclasses import dataclass
 from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
-from paper_tables import BAR
-from paper_tables import Experiment
-from paper_tables import Runs
-from paper_tables import in_parallel
-from paper_tables import largest_difference
-from paper_tables import print_table
-from paper_tables import simulated
-from paper_tables import wide_console
+from paper_tables import BAR, Experiment, Runs, in_parallel, largest_difference, print_table, simulated, wide_console
 from rwhec_factors.se3 import pose
+
+from gtsam_rwhec.methods.iterative_methods import LomOptions, LomWeights, local_on_manifold
 from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate.simulated_noise import random_directions
-from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
-from gtsam_rwhec.methods.iterative_methods import LomOptions
-from gtsam_rwhec.methods.iterative_methods import LomWeights
-from gtsam_rwhec.methods.iterative_methods import local_on_manifold
+from gtsam_rwhec.simulate.simulated_noise import random_directions, random_poses, rotations_of_vectors
 
 Start = Literal["close", "random"]
 Reading = Literal["stated", "inferred"]

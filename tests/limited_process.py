@@ -6,6 +6,8 @@ hang.
 """
 
 from __future__ import annotations
+
+import importlib
 import json
 import os
 import signal
@@ -141,19 +143,11 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _serve() -> None:
-
-    import gtsam_rwhec.detect.images
-    import gtsam_rwhec.logs.image_folder
-    import gtsam_rwhec.logs.mcap_writer
-    import gtsam_rwhec.logs.ros_bags
-    import gtsam_rwhec.logs.transforms  # noqa: F401
-
-    import gtsam_rwhec.detect.images
-    import gtsam_rwhec.logs.image_folder
-    import gtsam_rwhec.logs.mcap_writer
-    import gtsam_rwhec.logs.ros_bags
-    import gtsam_rwhec.logs.tf_buffer  # noqa: F401
-
+    for module in (
+        "rosbags.highlevel", "rosbags.typesys", "gtsam_rwhec.detect.images", "gtsam_rwhec.logs.image_folder",
+        "gtsam_rwhec.logs.mcap_writer", "gtsam_rwhec.logs.ros_bags", "gtsam_rwhec.logs.transforms",
+    ):  # fmt: skip
+        importlib.import_module(module)
     for line in sys.stdin:
         how, path, options = json.loads(line)
         source, sink = os.pipe()

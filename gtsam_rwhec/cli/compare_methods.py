@@ -1,23 +1,26 @@
 """``gtsam-rwhec compare``: compare published methods on one set of measurements."""
 
 from __future__ import annotations
+
 import warnings
 from pathlib import Path
 from typing import Annotated
+
 import typer
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import ExitStatus
-from gtsam_rwhec.cli.failures import check_output
-from gtsam_rwhec.cli.failures import exit_status
-from gtsam_rwhec.cli.shared_options import FOLDER_OF_CSV
-from gtsam_rwhec.cli.shared_options import KappaOption
-from gtsam_rwhec.cli.shared_options import ScaleOption
-from gtsam_rwhec.cli.shared_options import SensorsOption
-from gtsam_rwhec.cli.shared_options import SigmaOption
-from gtsam_rwhec.cli.shared_options import TargetsOption
+from gtsam_rwhec.cli.failures import ExitStatus, check_output, exit_status
+from gtsam_rwhec.cli.shared_options import (
+    FOLDER_OF_CSV,
+    KappaOption,
+    ScaleOption,
+    SensorsOption,
+    SigmaOption,
+    TargetsOption,
+)
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.files.terminal_text import say
-from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.files.terminal_text import say, shown_path
+
 
 def _names_of_methods(beginning: str) -> list[str]:
     return [name for name in rw.methods.METHODS if name.startswith(beginning)]

@@ -1,55 +1,44 @@
 """The answers of all methods that can solve a problem: cost, residuals, time, and distance from the lower bound."""
 
 from __future__ import annotations
-import math
-import time
-from collections.abc import Iterable
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
-import gtsam
-import numpy as np
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import check_progress
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.methods.method import Method
-from gtsam_rwhec.methods.method import MethodOptions
-from gtsam_rwhec.methods.method import Takes
-from gtsam_rwhec.methods.method import check_options
-from gtsam_rwhec.methods.registry import METHODS
-from gtsam_rwhec.methods.registry import estimate_of
-from gtsam_rwhec.methods.registry import method_of
-from gtsam_rwhec.methods.registry import run
-from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.solution import Solution
+
 import dataclasses
 import json
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.geometry.poses import one_transform
-from gtsam_rwhec.methods.certified import CERTIFIED
-from gtsam_rwhec.methods.certified import outcome_of
-from gtsam_rwhec.methods.certified import quiet_solution
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.errors import FrameError, OptionError, RwhecError
+from gtsam_rwhec.files.progress import Progress, check_progress
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.whole_files import write_atomically
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.methods.certified import CERTIFIED, outcome_of, quiet_solution
 from gtsam_rwhec.methods.hand_eye import solve_hand_eye
-from gtsam_rwhec.methods.method import Estimate
-from gtsam_rwhec.methods.method import Outcome
-from gtsam_rwhec.methods.method import check_problem
-from gtsam_rwhec.methods.method import refusal
-from gtsam_rwhec.results.schema import CONVENTIONS
-from gtsam_rwhec.results.schema import SENSOR_CARRIER
-from gtsam_rwhec.results.schema import TARGET_CARRIER
-from gtsam_rwhec.results.schema import pose_rows
+from gtsam_rwhec.methods.method import (
+    Estimate,
+    Method,
+    MethodOptions,
+    Outcome,
+    Takes,
+    check_options,
+    check_problem,
+    refusal,
+)
+from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.results.schema import CONVENTIONS, SENSOR_CARRIER, TARGET_CARRIER, pose_rows
+from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solver.solution import Solution
 
 #: X and Y of the one pair of a problem, metres.
 PairSolver = Callable[[Problem], tuple[PoseLike, PoseLike]]

@@ -21,17 +21,22 @@ from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties, Takes
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.answers import answer_of, as_point
 from gtsam_rwhec.solver.bound import lower_bound
-from gtsam_rwhec.solver.conic_solver import solve_conic, triangle, unstacked
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.interior_point import Relaxation
-from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_clarabel
+from gtsam_rwhec.solver.relaxation import (
+    Relaxation,
+    round_to_rotations,
+    solve_by_clarabel,
+    solve_conic,
+    triangle,
+    unstacked,
+)
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, project, unvec
-from gtsam_rwhec.solver.variables import answer_of, as_point
+from gtsam_rwhec.solver.small_dual import scatter
 
 #: The name of this cost in ``Estimate.proof``.
 COST = "J with all weights 1"

@@ -13,11 +13,11 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.quaternions import conjugate, left, to_rotations
 from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
-from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
-from gtsam_rwhec.identifiability.threshold import free_threshold
 from gtsam_rwhec.methods.dq_saddle import best_translation
 from gtsam_rwhec.methods.dual_quaternion_cost import DualQuaternionCost, from_transforms, times_vectors
 from gtsam_rwhec.methods.motions import LARGEST, Motions
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.solver.noise_bounds import free_threshold
 
 PriorForm = Literal["imaginary", "distance"]
 #: G of eq. 26 selects the imaginary parts.

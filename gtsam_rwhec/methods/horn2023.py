@@ -35,7 +35,7 @@ from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
 from gtsam_rwhec.methods.linear_systems import Stack, agreement, paired_quaternions
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.conic_solver import solve_conic, stacked, unstacked
+from gtsam_rwhec.solver.relaxation import solve_conic, stacked, unstacked
 
 #: The relaxation is solved for at most this many frames. A cone of 8 n takes a dense block of order 4 n (8 n + 1)
 #: squared.

@@ -1,24 +1,23 @@
 """The solution of normal equations whose unknowns have different units."""
 
 from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
+
 import numpy as np
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.errors import UnderdeterminedError
+
+from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import left, of_rotations
+from gtsam_rwhec.methods.method import Outcome, Poses
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
-from gtsam_rwhec.problem.moments import Gauge
-from gtsam_rwhec.problem.moments import Moments
+from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.full_form import edge_forms
 from gtsam_rwhec.solver.parts import connected_components
 from gtsam_rwhec.solver.rotations import project
-from gtsam_rwhec.geometry.quaternions import left
-from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.methods.method import Outcome
-from gtsam_rwhec.methods.method import Poses
 
 #: Up to this smallest eigenvalue over the largest, normal equations are singular: exact data leave a direction free.
 FREE = 1e-10

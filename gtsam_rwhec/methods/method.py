@@ -19,11 +19,11 @@ from gtsam_rwhec.errors import CountError, FrameError, OptionError, PriorError, 
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_whole
-from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.residuals import Residual
+from gtsam_rwhec.solver.answers import Residual
+from gtsam_rwhec.solver.free_directions import FreeDirection
 
 Poses = Mapping[str, PoseLike]
 X = TypeVar("X")

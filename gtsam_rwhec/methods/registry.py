@@ -13,8 +13,6 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
-from gtsam_rwhec.identifiability.free_directions import FreeDirection
-from gtsam_rwhec.identifiability.identification import identify
 from gtsam_rwhec.methods.certified import CERTIFIED
 from gtsam_rwhec.methods.closed_forms import DORNAIKA_CLOSED, DUAL_QUATERNIONS, KRONECKER, SHAH, WANG, ZHUANG
 from gtsam_rwhec.methods.global_rotations import HELLER, HELLER_MATRIX, WISE
@@ -31,13 +29,14 @@ from gtsam_rwhec.methods.method import (
     check_problem,
 )
 from gtsam_rwhec.methods.reprojection import EVANGELISTA, RP1
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.answers import PairPoses, Residual, costs_of_pairs, given_answer, residuals_of_pairs
+from gtsam_rwhec.solver.free_directions import FreeDirection
+from gtsam_rwhec.solver.identification import identify
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
-from gtsam_rwhec.solver.variables import given_answer
-from gtsam_rwhec.solving.arguments import check_against_knowledge, check_types
+from gtsam_rwhec.solver.solve_options import check_against_knowledge, check_types
 
 
 @dataclass(frozen=True)

@@ -1,22 +1,21 @@
 """Methods for one pair on every pair of the best tree: the tree, what it avoids, and the gap to the joint answer."""
 
 from __future__ import annotations
+
 import io
 import json
+
 import numpy as np
 import pytest
 from rich.console import Console
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.methods.comparison import Comparison
+from gtsam_rwhec.methods.comparison import PAIR_SOLVERS, Comparison, chained, comparison_fields
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.comparison_report import print_comparison
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.methods.comparison import PAIR_SOLVERS
-from gtsam_rwhec.methods.comparison import chained
-from gtsam_rwhec.methods.comparison import comparison_fields
+from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.01, kappa=1250.0)
 QUICK = ("shah2013", "li2010_dq", "certified", "lom")

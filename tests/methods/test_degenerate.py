@@ -1,20 +1,14 @@
 from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
-from simulated import Simulated
-from simulated import distance
-from simulated import hand_held
-from simulated import pair
-from simulated import planar
-from simulated import poses
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.methods import Estimate
+from simulated import Simulated, distance, hand_held, pair, planar, poses
+
+from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.methods import DualQuaternionPrior, Estimate
+from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS, solve_hand_eye
 from gtsam_rwhec.solver.free_directions import FreeKind
-from gtsam_rwhec.methods import DualQuaternionPrior
-from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS
-from gtsam_rwhec.methods.hand_eye import solve_hand_eye
 
 HEIGHT = "translation of h along its own z axis: the motion turned about one axis only"
 #: Not turned, so that c's axes have the names of h's.

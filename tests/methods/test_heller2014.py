@@ -1,29 +1,30 @@
 """Heller 2014: the polynomial, its moments, both relaxations, where the second is not enough."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from method_problems import one_pair
 from rwhec_factors import se3
-from test_wise2020 import cost_of
-from test_wise2020 import motions
+from test_wise2020 import cost_of, motions
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.methods import run
+from gtsam_rwhec.methods import global_rotations, run
+from gtsam_rwhec.methods.global_rotations import (
+    PRODUCTS,
+    Parameterisation,
+    UnitForm,
+    _moment_places,
+    global_minimum,
+    products_to_rotation,
+)
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.rotations import random_rotations
-from gtsam_rwhec.solver.rotations import vec
-from gtsam_rwhec.methods import global_rotations
-from gtsam_rwhec.methods.global_rotations import PRODUCTS
-from gtsam_rwhec.methods.global_rotations import Parameterisation
-from gtsam_rwhec.methods.global_rotations import UnitForm
-from gtsam_rwhec.methods.global_rotations import _moment_places
-from gtsam_rwhec.methods.global_rotations import global_minimum
-from gtsam_rwhec.methods.global_rotations import products_to_rotation
+from gtsam_rwhec.solver.rotations import random_rotations, vec
 
 BOTH: tuple[Parameterisation, ...] = ("quaternion", "matrix")
 

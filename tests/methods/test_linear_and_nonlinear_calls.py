@@ -2,17 +2,13 @@
 
 import numpy as np
 import pytest
-from simulated import distance
-from simulated import hand_held
-from simulated import planar
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.solver.free_directions import FreeKind
+from simulated import distance, hand_held, planar
+
+from gtsam_rwhec.errors import CountError, OptionError, UnderdeterminedError
 from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
-from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS
-from gtsam_rwhec.methods.hand_eye import solve_hand_eye
+from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS, solve_hand_eye
 from gtsam_rwhec.methods.hand_eye_request import DualQuaternionPrior
+from gtsam_rwhec.solver.free_directions import FreeKind
 
 NAMES = ["dan", "dqnlopt", "dqnloptrnd", "chvecopt", "quatvecopt", "certified"]
 

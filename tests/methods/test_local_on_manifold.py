@@ -1,33 +1,28 @@
 """LOM: the paper's residual and weights (Appendix C), and where it ends from close and from poor starts."""
 
 from __future__ import annotations
+
 import math
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 from refinement_problems import rig
 from rwhec_factors.se3 import pose
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import PriorError
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import frame_distance
-from gtsam_rwhec.simulate import sphere
-from gtsam_rwhec.simulate.simulated_noise import random_directions
-from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
-from gtsam_rwhec.methods.iterative_methods import FrameKeys
-from gtsam_rwhec.methods.iterative_methods import LomOptions
-from gtsam_rwhec.methods.iterative_methods import LomSolution
-from gtsam_rwhec.methods.iterative_methods import local_on_manifold
-from gtsam_rwhec.methods.iterative_methods import lom_factor
-from gtsam_rwhec.methods.iterative_methods import standard_deviations
+from gtsam_rwhec.errors import FrameError, MeasurementsNotKeptError, NoiseError, OptionError, PriorError, ScaleError
+from gtsam_rwhec.methods.iterative_methods import (
+    FrameKeys,
+    LomOptions,
+    LomSolution,
+    local_on_manifold,
+    lom_factor,
+    standard_deviations,
+)
+from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, sphere
+from gtsam_rwhec.simulate.simulated_noise import random_directions, random_poses, rotations_of_vectors
 
 X, Y, SCALE = FrameKeys(0, 1), FrameKeys(2, 3), 4
 

@@ -1,35 +1,22 @@
 from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from simulated import distance
-from simulated import hand_held
-from simulated import pair
-from simulated import planar
-from simulated import poses
+from simulated import distance, hand_held, pair, planar, poses
+
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.solver.free_directions import FreeKind
-from gtsam_rwhec.solver.free_directions import FreeReason
 from gtsam_rwhec.methods import DualQuaternionPrior
-from gtsam_rwhec.methods.dq_saddle import HIDDEN
-from gtsam_rwhec.methods.dq_saddle import best_dual
-from gtsam_rwhec.methods.dq_saddle import bracket
-from gtsam_rwhec.methods.dq_saddle import minimum
-from gtsam_rwhec.methods.dq_saddle import search
+from gtsam_rwhec.methods.dq_saddle import HIDDEN, best_dual, bracket, minimum, search
 from gtsam_rwhec.methods.dqopt import bound_at
-from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
-from gtsam_rwhec.methods.dual_quaternion_cost import residuals
-from gtsam_rwhec.methods.dual_quaternion_cost import to_transform
-from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS
-from gtsam_rwhec.methods.hand_eye import solve_hand_eye
-from gtsam_rwhec.methods.motions import Motions
-from gtsam_rwhec.methods.motions import cost_of
-from gtsam_rwhec.methods.motions import motions_of
-from gtsam_rwhec.methods.motions import squared_residuals
+from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms, residuals, to_transform
+from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS, solve_hand_eye
+from gtsam_rwhec.methods.motions import Motions, cost_of, motions_of, squared_residuals
+from gtsam_rwhec.solver.free_directions import FreeKind, FreeReason
+
 
 def cost_at(motions: Motions, X: np.ndarray, alpha: float) -> float:
     (q,), (q_dual,) = from_transforms(X[None])

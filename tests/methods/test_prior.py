@@ -1,24 +1,18 @@
 from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
 from rwhec_factors import dual_quaternion_prior_factor
 from scipy.optimize import minimize
-from simulated import distance
-from simulated import hand_held
-from simulated import pair
-from simulated import poses
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import PoseError
-from gtsam_rwhec.errors import PriorError
-from gtsam_rwhec.methods import Estimate
-from gtsam_rwhec.solver.free_directions import FreeKind
-from gtsam_rwhec.methods import DualQuaternionPrior
-from gtsam_rwhec.methods import cost_of
-from gtsam_rwhec.methods import motions_of
+from simulated import distance, hand_held, pair, poses
+
+from gtsam_rwhec.errors import OptionError, PoseError, PriorError
+from gtsam_rwhec.methods import DualQuaternionPrior, Estimate, cost_of, motions_of
 from gtsam_rwhec.methods.dqopt import on_sphere
 from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
 from gtsam_rwhec.methods.hand_eye import solve_hand_eye
+from gtsam_rwhec.solver.free_directions import FreeKind
 
 FORMS = ["imaginary", "distance"]
 

@@ -1,18 +1,21 @@
 """Arguments of `solve`, `certify` and the other calls: what cannot be used is refused in words, without a TypeError."""
 
 from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
+
 import gtsam_rwhec as rw
 from gtsam_rwhec import errors
-from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.solver.solve_options import SolveOptions
 from gtsam_rwhec.methods import opencv
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver.solve_options import SolveOptions
+
 
 class Thing:
     """Neither a number nor a pose; with the same name in every process."""
