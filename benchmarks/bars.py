@@ -1,14 +1,20 @@
-"""What the benchmarks print: rows of a figure, its bar, whether it is met, and the last figure that was stored."""
+"""What the benchmarks print: rows of a figure, its bar, and whether it is met.
+
+Whoever imports this module also finds the helpers of the tests, whose simulated rigs and logs the benchmarks share.
+"""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass
-from importlib.metadata import version
+from pathlib import Path
 
-from figures import Figure, compared, machine_class, stored, write
 from rich.console import Console
 from rich.table import Table
+
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+sys.path += [str(TESTS), *sorted(str(folder) for folder in TESTS.iterdir() if folder.is_dir())]
 
 
 @dataclass(frozen=True)
@@ -22,17 +28,12 @@ class Row:
 
 
 def benchmark_parser(description: str | None) -> argparse.ArgumentParser:
-    """A parser with what all benchmarks take."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--store", action="store_true", help="write the figures to benchmarks/figures.json")
-    return parser
+    """A parser that prints a script's docstring as it stands."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
-def print_rows(title: str, rows: list[Row], *, store: bool = False) -> int:
-    """Print the rows as a table beside the last stored figures; 1 if a bar is missed, else 0: a script's exit status.
-
-    With `store` they become the last ones.
-    """
+def print_rows(title: str, rows: list[Row]) -> int:
+    """Print the rows as a table; 1 if a bar is missed, else 0: a script's exit status."""
     console = Console()
     if not console.is_terminal:  # in a pipe the width is unknown; nothing of the table may be cut
         console = Console(width=180)
@@ -41,18 +42,8 @@ def print_rows(title: str, rows: list[Row], *, store: bool = False) -> int:
     table.add_column("figure", justify="right", overflow="fold")
     table.add_column("bar", justify="right", overflow="fold")
     table.add_column("met", justify="center", no_wrap=True)
-    table.add_column("against the last", overflow="fold")
-    last, found = stored(), {}
-    above = ""
     for row in rows:
-        # A row that is set in belongs to the one above it.
-        above = above if row.what.startswith(" ") else row.what
-        name = f"{title} | {above}" + (f" | {row.what.strip()}" if row.what.startswith(" ") else "")
-        now = Figure(row.figure, row.bar, row.met, version("gtsam-rwhec"), machine_class())
-        found[name] = now
         verdict = {None: "", True: "[green]yes[/green]", False: "[bold red]NO[/bold red]"}[row.met]
-        table.add_row(row.what, row.figure, row.bar, verdict, compared(now, last.get(name)))
+        table.add_row(row.what, row.figure, row.bar, verdict)
     console.print(table)
-    if store:
-        console.print(f"Stored in {write(found)}.")
     return int(any(row.met is False for row in rows))

@@ -81,7 +81,7 @@ def main() -> int:
     parser = benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=5, help="calls after the first (default: 5)")
     arguments = parser.parse_args()
-    return print_rows("Time of rw.calibrate", rows(arguments.runs), store=arguments.store)
+    return print_rows("Time of rw.calibrate", rows(arguments.runs))
 
 
 if __name__ == "__main__":

@@ -311,7 +311,7 @@ def main() -> int:
     arguments = parser.parse_args()
     found = list(runs_of(arguments.runs, arguments.seed, arguments.workers, arguments.keep))
     title = f"Changes, {arguments.runs} pairs of logs of each of {len(KINDS)} kinds"
-    return print_rows(title, rows(found), store=arguments.store)
+    return print_rows(title, rows(found))
 
 
 if __name__ == "__main__":

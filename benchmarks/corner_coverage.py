@@ -14,16 +14,13 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from pathlib import Path
 
+import bars
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+import simulated_cells
 from binomial import Share
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
-import simulated_cells
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import Stated
@@ -89,7 +86,7 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="the first run's")
@@ -109,8 +106,8 @@ def main() -> int:
                 low, high = share.interval()
                 ratio = np.mean([ratio for _, ratio in each])
                 figure = f"{100 * share.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}], ratio {ratio:.2f}"
-                rows.append(Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
-    return print_rows("95 % ellipsoids of a refinement from corners", rows, store=given.store)
+                rows.append(bars.Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
+    return bars.print_rows("95 % ellipsoids of a refinement from corners", rows)
 
 
 if __name__ == "__main__":

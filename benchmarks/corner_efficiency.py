@@ -21,16 +21,13 @@ import warnings
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
+import bars
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+import simulated_cells
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
-import simulated_cells
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NoiseError, RwhecWarning
@@ -161,7 +158,7 @@ def squared(
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", default="", help="the geometries whose name has these words")
@@ -175,18 +172,18 @@ def main() -> int:
                     squares[what].append(each)
             for what, each in squares.items():
                 rows += rows_of(f"{name}: {what}", np.array(each))
-    return print_rows("mean squared errors over the Cramer-Rao bound", rows, store=given.store)
+    return bars.print_rows("mean squared errors over the Cramer-Rao bound", rows)
 
 
-def rows_of(what: str, squares: np.ndarray) -> list[Row]:
+def rows_of(what: str, squares: np.ndarray) -> list[bars.Row]:
     """Whether 5 % over the bound is outside of the mean's 99 % interval; and the gain over the poses."""
     corners, poses = squares.T
     mean, half = corners.mean(), interval(corners)
-    rows = [Row(what, f"{mean:.3f} +- {half:.3f}", f"<= {MOST:g}", bool(mean - half <= MOST))]
+    rows = [bars.Row(what, f"{mean:.3f} +- {half:.3f}", f"<= {MOST:g}", bool(mean - half <= MOST))]
     if np.isfinite(poses).all():
         figure = f"{poses.mean():.3g} ({poses.mean() / mean:.3g} times ours)"
         worse = corners - poses
-        rows.append(Row("  of a refinement from poses", figure, ">= 1", bool(worse.mean() <= interval(worse))))
+        rows.append(bars.Row("  of a refinement from poses", figure, ">= 1", bool(worse.mean() <= interval(worse))))
     return rows
 
 

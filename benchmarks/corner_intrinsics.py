@@ -16,21 +16,18 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
+import bars
 import cv2
 import numpy as np
 import simulated_cells
-from bars import Row, benchmark_parser, print_rows
 from loky import ProcessPoolExecutor
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE, parameters_of
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def in_pixels(parameters: np.ndarray) -> np.ndarray:
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", default="", help="the kinds whose name has these words")
@@ -113,17 +110,17 @@ def main() -> int:
             ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
             for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
                 rows.append(row(f"{name}: {what}", ours[:, columns].sum(axis=1), theirs[:, columns].sum(axis=1), kind))
-    return print_rows("intrinsics' errors over OpenCV's", rows, store=given.store)
+    return bars.print_rows("intrinsics' errors over OpenCV's", rows)
 
 
-def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> Row:
+def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> bars.Row:
     """The ratio, with its bar, of squared errors run by run."""
     worse = ours - theirs
     half = 2.58 * worse.std() / np.sqrt(len(worse))
     sizes = np.sqrt([ours.mean(), theirs.mean()])
     figure = f"{sizes[0] / sizes[1]:.2f} ({sizes[0]:.3g} px, {sizes[1]:.3g} px)"
     met = worse.mean() < -half if kind.knows_the_arm else worse.mean() <= half
-    return Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
+    return bars.Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The graph of corners against one of GTSAM's own factors: time and memory of the same optimum and covariance.
 
-    python benchmarks/corner_native.py [--views 250] [--store]
+    python benchmarks/corner_native.py [--views 250]
 
 Four cameras with 250 images each of a board of 70 corners; poses, intrinsics and the carriers' noisy poses are free,
 the board is as stated, the noise is known. Each graph is built, optimised by Levenberg-Marquardt from the same start to
@@ -15,15 +15,12 @@ import resource
 import sys
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-import gtsam
-import numpy as np
-from bars import Row, benchmark_parser, print_rows
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
+import bars
 import corner_times
+import gtsam
 import native_graph
+import numpy as np
 import simulated_models
 from rwhec_factors import se3
 
@@ -81,7 +78,7 @@ def measured(kind: str, views: int) -> Measured:
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--views", type=int, default=250)
     given = parser.parse_args()
     found = {}
@@ -92,19 +89,19 @@ def main() -> int:
     rows = []
     for name, each in (("one factor an image", ours), ("GTSAM's own, one a corner", native)):
         parts = f"{each.build_s:.1f} + {each.optimise_s:.1f} + {each.covariance_s:.1f} s"
-        rows.append(Row(name, f"{each.total_s:.1f} s"))
-        rows.append(Row("  to build, optimise, and have the covariance", parts))
-        rows.append(Row("  steps", f"{each.iterations}"))
-        rows.append(Row("  memory of the process", f"{each.memory / 1e9:.2f} GB"))
+        rows.append(bars.Row(name, f"{each.total_s:.1f} s"))
+        rows.append(bars.Row("  to build, optimise, and have the covariance", parts))
+        rows.append(bars.Row("  steps", f"{each.iterations}"))
+        rows.append(bars.Row("  memory of the process", f"{each.memory / 1e9:.2f} GB"))
     off = np.abs(ours.off - native.off).max()
     apart = np.abs(ours.deviations / native.deviations - 1.0).max()
     rows += [
-        Row("poses apart (rad, m)", f"{off:.0e}", "<= 1e-6", bool(off <= 1e-6)),
-        Row("deviations apart, a share", f"{apart:.0e}", "<= 1e-6", bool(apart <= 1e-6)),
-        Row("time of GTSAM's own over ours", f"{native.total_s / ours.total_s:.1f}"),
-        Row("memory of GTSAM's own over ours", f"{native.memory / ours.memory:.1f}"),
+        bars.Row("poses apart (rad, m)", f"{off:.0e}", "<= 1e-6", bool(off <= 1e-6)),
+        bars.Row("deviations apart, a share", f"{apart:.0e}", "<= 1e-6", bool(apart <= 1e-6)),
+        bars.Row("time of GTSAM's own over ours", f"{native.total_s / ours.total_s:.1f}"),
+        bars.Row("memory of GTSAM's own over ours", f"{native.memory / ours.memory:.1f}"),
     ]
-    return print_rows("GTSAM's own factors of corners", rows, store=given.store)
+    return bars.print_rows("GTSAM's own factors of corners", rows)
 
 
 if __name__ == "__main__":

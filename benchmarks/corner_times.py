@@ -1,6 +1,6 @@
 """Refinement from corners: time and memory of a large cell.
 
-    python benchmarks/corner_times.py [--views 250] [--store]
+    python benchmarks/corner_times.py [--views 250]
 
 Four cameras with 250 images each of a board of 70 corners; intrinsics, the board's size and warp, and the carriers'
 poses are all free, the noise is estimated; the joint covariance is part of it. Then the same with every tenth corner
@@ -14,19 +14,15 @@ import resource
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
+import bars
 import numpy as np
 import simulated_cells
 import simulated_clocks
-from bars import Row, benchmark_parser, print_rows
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.observations import Views
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
-
 
 BOARD = Checkerboard("board", 10, 7, 0.03)
 OPTIONS = rw.CornerOptions(stated="calibration", size_share=1e-3, warp_m=1e-3)
@@ -73,7 +69,7 @@ def timed(given: simulated_cells.Cell, options: rw.CornerOptions = OPTIONS) -> t
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--views", type=int, default=250)
     given = parser.parse_args()
     large = large_cell(given.views)
@@ -87,21 +83,21 @@ def main() -> int:
     board_most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     left_out = sum(int(mask.sum()) for mask in wrong.left_out.values())
     rows = [
-        Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
-        Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
-        Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
-        Row(f"every clock free too, {len(late.joint)} unknowns", f"{late_clock:.1f} s ({late_own:.1f} s)"),
-        Row(
+        bars.Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
+        bars.Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
+        bars.Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
+        bars.Row(f"every clock free too, {len(late.joint)} unknowns", f"{late_clock:.1f} s ({late_own:.1f} s)"),
+        bars.Row(
             f"and every corner of the board, {len(board.joint)} unknowns",
             f"{board_clock:.1f} s ({board_own:.1f} s), {board_most / 1e9:.2f} GB",
         ),
-        Row(
+        bars.Row(
             "every tenth corner misread", f"{wrong_clock:.1f} s ({wrong_own:.1f} s)", f"<= {BAR_OUTLIERS_S:g} s",
             wrong_clock <= BAR_OUTLIERS_S,
         ),
-        Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
+        bars.Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
     ]  # fmt: skip
-    return print_rows("refinement from corners", rows, store=given.store)
+    return bars.print_rows("refinement from corners", rows)
 
 
 if __name__ == "__main__":

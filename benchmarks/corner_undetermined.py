@@ -13,17 +13,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
+import bars
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+import placements
+import simulated_cells
 from binomial import Share
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
-import placements
-import simulated_cells
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import Stated
@@ -99,25 +96,25 @@ def one(name: str, seed: int) -> dict[str, bool]:
     return found
 
 
-def rows_of(name: str, found: list[dict[str, bool]]) -> list[Row]:
+def rows_of(name: str, found: list[dict[str, bool]]) -> list[bars.Row]:
     """What a kind has in the table."""
     refused = Share.of([each["refused"] for each in found])
     if KINDS[name].is_refused:
-        return [Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
-    rows = [Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
+        return [bars.Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
+    rows = [bars.Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
     for what in [what for what in found[0] if what != "refused"]:
         share = Share.of([each[what] for each in found if not each["refused"]])
         is_coverage = what in ("target", "sensor", "intrinsics")
         bar, met = (">= 93 %", share.meets(LEAST, 1.0)) if is_coverage else ("100 %", share.value == 1.0)
         if what == "named":
             what = f"{', '.join(KINDS[name].named)} named as held by the prior, or widened"
-        rows.append(Row(f"  {what}", str(share), bar, met))
+        rows.append(bars.Row(f"  {what}", str(share), bar, met))
     return rows
 
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=60)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="the first run's")
@@ -129,7 +126,7 @@ def main() -> int:
             if any(word in name for word in given.kinds):
                 seeds = range(given.seed, given.seed + given.runs)
                 rows += rows_of(name, list(pool.map(one, [name] * given.runs, seeds, chunksize=5)))
-    return print_rows("intrinsics that the images do not tell", rows, store=given.store)
+    return bars.print_rows("intrinsics that the images do not tell", rows)
 
 
 if __name__ == "__main__":

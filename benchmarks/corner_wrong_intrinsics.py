@@ -17,12 +17,11 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
+import bars
 import numpy as np
 import placements
 import simulated_cells
-from bars import Row, benchmark_parser, print_rows
 from binomial import Share
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
@@ -33,9 +32,6 @@ from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.fitting.stated_intrinsics import PARTS, TOLD, free_model, parameters_of, prior_of
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "reprojection"))
-
 
 LEVEL, LEAST = 0.95, 0.93
 #: Beyond so many innovation deviations a contradiction must be flagged in this share of runs; falsely in so many.
@@ -168,7 +164,7 @@ def _told_deviations(refined: RefinedIntrinsics, stated: Camera, told: Stated) -
     return float(np.sqrt(worst))
 
 
-def rows_of(name: str, found: list[Found]) -> list[Row]:
+def rows_of(name: str, found: list[Found]) -> list[bars.Row]:
     """What a cell of the table has."""
     kind, rows = KINDS[name.split(": ")[1]], []
     is_right = kind.drawn or not kind.wrong
@@ -179,24 +175,24 @@ def rows_of(name: str, found: list[Found]) -> list[Row]:
         unless = Share.of([each.inside[frame] or each.named(frame) for each, frame in frames])
         figure = f"{share}; or named {100 * unless.value:.1f} %" if of_calibration else str(share)
         bar = ">= 93 %" + (", or held by the prior" if of_calibration else "")
-        rows.append(Row(f"{name}: {what}", figure, bar, (unless if of_calibration else share).meets(LEAST, 1.0)))
+        rows.append(bars.Row(f"{name}: {what}", figure, bar, (unless if of_calibration else share).meets(LEAST, 1.0)))
     flags = np.array([flag for each in found for flag in each.flagged.values()])
     deviations = np.array([deviation for each in found for deviation in each.innovation.values()])
     if is_right:
         share = Share.of(flags.tolist())
-        rows.append(Row("  flagged falsely", str(share), "<= 1 %", share.meets(0.0, FALSELY)))
+        rows.append(bars.Row("  flagged falsely", str(share), "<= 1 %", share.meets(0.0, FALSELY)))
     elif (deviations > FAR).any():
         share = Share.of(flags[deviations > FAR].tolist())
-        rows.append(Row("  flagged beyond 5 deviations", str(share), ">= 95 %", share.meets(FLAGGED, 1.0)))
+        rows.append(bars.Row("  flagged beyond 5 deviations", str(share), ">= 95 %", share.meets(FLAGGED, 1.0)))
     held = np.mean([any(each.held.values()) for each in found])
     figure = f"{100 * flags.mean():.0f} %; {np.median(deviations):.2g}; {100 * held:.0f} %"
-    rows.append(Row("  flagged; median of innovation's deviations; named as held", figure))
+    rows.append(bars.Row("  flagged; median of innovation's deviations; named as held", figure))
     return rows
 
 
 def main() -> int:
     """Run, and print a table."""
-    parser = benchmark_parser(__doc__)
+    parser = bars.benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=400)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="the first run's")
@@ -210,7 +206,7 @@ def main() -> int:
             seeds = range(given.seed, given.seed + given.runs)
             found = list(pool.map(one, *zip(*[(*name.split(": "), seed) for seed in seeds], strict=True), chunksize=5))
             rows += rows_of(name, found)
-    return print_rows("95 % ellipsoids where stated intrinsics are wrong", rows, store=given.store)
+    return bars.print_rows("95 % ellipsoids where stated intrinsics are wrong", rows)
 
 
 if __name__ == "__main__":

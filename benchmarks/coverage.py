@@ -334,7 +334,7 @@ def main() -> int:
         if arguments.plot is not None:
             console.print(f"Written to {plot(results, arguments.plot)}.")
     if arguments.efficiency_runs:
-        status = max(status, print_rows("Efficiency", efficiency(arguments.efficiency_runs), store=arguments.store))
+        status = max(status, print_rows("Efficiency", efficiency(arguments.efficiency_runs)))
     return status
 
 

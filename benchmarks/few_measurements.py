@@ -1,6 +1,6 @@
 """From 2 to 40 measurements: is motion about one axis ever called unique, and is rich motion recognised?
 
-    python benchmarks/few_measurements.py [--quick] [--store] [--trials 2000] [--counts 2 3 ... 40] [--seed 7]
+    python benchmarks/few_measurements.py [--quick] [--trials 2000] [--counts 2 3 ... 40] [--seed 7]
 
 Random rigs: one pair, two targets, two sensors, both, motions of a sensor, and both kinds together; known, shared and
 own scales; noise of 0.01 to 2 degrees in B and up to 1 degree in A, in both or in one of them, about either origin of
@@ -271,7 +271,7 @@ def main() -> int:
     arguments = parser.parse_args()
     counts, trials = ([2, 3, 4, 5, 6, 8, 12, 20, 40], 60) if arguments.quick else (arguments.counts, arguments.trials)
     title = f"Few measurements{', a small part' if arguments.quick else ''}"
-    return print_rows(title, rows(counts, trials, arguments.seed), store=arguments.store)
+    return print_rows(title, rows(counts, trials, arguments.seed))
 
 
 if __name__ == "__main__":

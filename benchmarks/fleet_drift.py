@@ -254,7 +254,7 @@ def main() -> int:
     given = parser.parse_args()
     title = f"Drift of fleets, {given.robots} robots of each kind"
     found = list(campaign(given))
-    return print_rows(title, pooled(found) + table(found), store=given.store)
+    return print_rows(title, pooled(found) + table(found))
 
 
 if __name__ == "__main__":

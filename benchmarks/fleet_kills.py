@@ -23,14 +23,12 @@ from pathlib import Path
 
 import psutil
 from bars import Row, benchmark_parser, print_rows
+from fleets import write_fleet
+from kept_outcomes import Kept, counts_of
 
 from gtsam_rwhec import fleet
 from gtsam_rwhec.errors import FleetError
 from gtsam_rwhec.fleet.dask_engine import DaskEngine
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fleet"))
-from fleets import write_fleet
-from kept_outcomes import Kept, counts_of
 
 #: Files below these hold moments and measurements. Answers have seconds in them.
 FOLDERS = ("partials", "merged")
@@ -140,7 +138,7 @@ def main() -> int:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         found = rows(arguments, Path(temporary))
-    return print_rows("fleets: killed on the way", found, store=arguments.store)
+    return print_rows("fleets: killed on the way", found)
 
 
 if __name__ == "__main__":

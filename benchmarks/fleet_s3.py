@@ -14,14 +14,12 @@ import tempfile
 from pathlib import Path
 
 from bars import Row, benchmark_parser, print_rows
+from mixed_log import TOPICS, write_mixed_log
+from s3_server import BUCKET, s3_server
 
 from gtsam_rwhec.fleet import stores
 from gtsam_rwhec.fleet.log_parts import Needed, local_copy_of_topics, needed_of
 from gtsam_rwhec.logs import open_log
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fleet"))
-from mixed_log import TOPICS, write_mixed_log
-from s3_server import BUCKET, s3_server
 
 
 def rows(arguments: argparse.Namespace) -> list[Row]:
@@ -58,7 +56,7 @@ def main() -> int:
     parser.add_argument("--logs", type=int, default=5)
     parser.add_argument("--seconds", type=int, default=120, help="of a log")
     arguments = parser.parse_args()
-    return print_rows("fleets: bytes from s3", rows(arguments), store=arguments.store)
+    return print_rows("fleets: bytes from s3", rows(arguments))
 
 
 if __name__ == "__main__":

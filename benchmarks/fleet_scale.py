@@ -24,14 +24,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 from bars import Row, benchmark_parser, print_rows
+from fleets import write_fleet
+from kept_outcomes import Kept
 
 from gtsam_rwhec import fleet
 from gtsam_rwhec.fleet.dask_engine import DaskEngine
 from gtsam_rwhec.fleet.tasks import Receipt, Task
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fleet"))
-from fleets import write_fleet
-from kept_outcomes import Kept
 
 MIB = 1 << 20
 #: The model's cluster.
@@ -147,7 +145,7 @@ def main() -> int:
     else:
         with tempfile.TemporaryDirectory() as temporary:
             found = rows(arguments, Path(temporary))
-    return print_rows("fleets: two workers", found, store=arguments.store)
+    return print_rows("fleets: two workers", found)
 
 
 if __name__ == "__main__":

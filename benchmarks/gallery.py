@@ -172,7 +172,7 @@ def main() -> int:
         given.out,
         kinds,
     )
-    return print_rows(f"Gallery of failures, {given.runs} seeds from {given.seed}", rows(found), store=given.store)
+    return print_rows(f"Gallery of failures, {given.runs} seeds from {given.seed}", rows(found))
 
 
 if __name__ == "__main__":

@@ -117,7 +117,7 @@ def main() -> int:
     if not arguments.no_times:
         result += time_rows(3)
     title = f"KinHEC {arguments.tier}, {len(seeds)} seed{'s' * (len(seeds) > 1)}, {arguments.offsets} offsets"
-    return print_rows(title, result, store=arguments.store)
+    return print_rows(title, result)
 
 
 if __name__ == "__main__":

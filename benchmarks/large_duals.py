@@ -1,6 +1,6 @@
 """Problems of 130 to 400 frames that the multipliers of R'R = I do not prove: how many are proven now, and how.
 
-    python benchmarks/large_duals.py [--problems 100] [--most 400] [--kinds star chain ...] [--seed 1] [--store]
+    python benchmarks/large_duals.py [--problems 100] [--most 400] [--kinds star chain ...] [--seed 1]
 
 Drawn at random: stars, stars of several sensors, chains, and graphs with 2 % of the pairs, of 2 to 6 measurements a
 pair; with noise of 20 to 50 degrees and 10 to 50 cm, or with noise of half a degree and 10 to 40 % of measurements that
@@ -119,9 +119,7 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    return print_rows(
-        "Large duals", rows(arguments.problems, arguments.most, arguments.kinds, arguments.seed), store=arguments.store
-    )
+    return print_rows("Large duals", rows(arguments.problems, arguments.most, arguments.kinds, arguments.seed))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Graphs with thousands of frames: time, memory and verdict of ``rw.solve``, each graph in a process of its own.
 
-    python benchmarks/large_graphs.py [--case NAME ...] [--share 1.0] [--keep-measurements] [--store]
+    python benchmarks/large_graphs.py [--case NAME ...] [--share 1.0] [--keep-measurements]
 
 The graphs (--case), each with ten measurements a pair:
 
@@ -230,7 +230,7 @@ def main() -> int:
         print(json.dumps(asdict(run(arguments.alone, arguments.share, arguments.keep_measurements))))
         return 0
     table = rows(arguments.case or list(BARS), arguments.share, arguments.keep_measurements)
-    return print_rows("Large graphs", table, store=arguments.store)
+    return print_rows("Large graphs", table)
 
 
 if __name__ == "__main__":

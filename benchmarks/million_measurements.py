@@ -101,7 +101,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--repetitions", type=int, default=9)
     arguments = parser.parse_args()
-    return print_rows("Many measurements", rows(arguments.count, arguments.repetitions), store=arguments.store)
+    return print_rows("Many measurements", rows(arguments.count, arguments.repetitions))
 
 
 if __name__ == "__main__":

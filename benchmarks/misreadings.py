@@ -11,7 +11,6 @@ Exits with 1 if a bar is missed.
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
 from collections import Counter
@@ -31,8 +30,6 @@ from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.simulate import Motion, Noise, cameras, general, sphere
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver.solution import Solution
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 DEMO = Path(__file__).resolve().parents[1] / "data" / "demo"
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
@@ -201,7 +198,7 @@ def main() -> int:
     total = accusations.total()
     rows.append(Row("good problems accused", f"{total} of {arguments.good}", "0", total == 0))
     rows.append(Row("seconds of a good problem, with making and solving it", f"{seconds / max(arguments.good, 1):.3f}"))
-    return print_rows("Misreadings", rows, store=arguments.store)
+    return print_rows("Misreadings", rows)
 
 
 if __name__ == "__main__":

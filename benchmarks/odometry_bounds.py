@@ -78,7 +78,7 @@ def main() -> int:
     parser.add_argument("--one-clock", action="store_true", help="no time offsets, and none estimated")
     given = parser.parse_args()
     found = rows(given.runs, given.seconds, given.outliers, clocks=not given.one_clock)
-    return print_rows("six odometries", found, store=given.store)
+    return print_rows("six odometries", found)
 
 
 if __name__ == "__main__":

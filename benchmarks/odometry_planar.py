@@ -52,7 +52,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=200, help="drives of each kind")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a drive")
     given = parser.parse_args()
-    return print_rows("planar odometries", rows(given.runs, given.seconds), store=given.store)
+    return print_rows("planar odometries", rows(given.runs, given.seconds))
 
 
 if __name__ == "__main__":

@@ -77,9 +77,7 @@ def main() -> int:
     parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=51)
     arguments = parser.parse_args()
-    return print_rows(
-        f"One X, one Y, against OpenCV {cv2.__version__}", rows(arguments.repetitions), store=arguments.store
-    )
+    return print_rows(f"One X, one Y, against OpenCV {cv2.__version__}", rows(arguments.repetitions))
 
 
 if __name__ == "__main__":

@@ -297,7 +297,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write outliers.png there")
     arguments = parser.parse_args()
-    return print_rows("Outliers", rows(arguments.seeds, arguments.plot), store=arguments.store)
+    return print_rows("Outliers", rows(arguments.seeds, arguments.plot))
 
 
 if __name__ == "__main__":

@@ -236,7 +236,7 @@ def main() -> int:
     for name in wanted:
         found = outcomes(name, arguments.images, arguments.seed, arguments.jobs, arguments.keep)
         title = f"{name}, {arguments.images} rendered images, seed {arguments.seed}"
-        status |= print_rows(title, rows(found, KINDS[name]()), store=arguments.store)
+        status |= print_rows(title, rows(found, KINDS[name]()))
     return status
 
 

@@ -1,6 +1,6 @@
 """What the report costs beyond the calibration: seconds of the processor, and megabytes.
 
-    python benchmarks/report_cost.py [--store] [--profile]
+    python benchmarks/report_cost.py [--profile]
 
 Counted is all that is done for it: evidence, figures, page, and the import of what draws them, each report in a process
 of its own. Every number of both pages is compared with the JSON beside them. ``--profile`` prints where the time goes.
@@ -18,8 +18,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
@@ -120,7 +118,7 @@ def main() -> int:
     if arguments.of is not None:
         print(json.dumps(measured(arguments.of, is_profiled=arguments.profile)))
         return 0
-    return print_rows("Report", rows(), store=arguments.store)
+    return print_rows("Report", rows())
 
 
 if __name__ == "__main__":

@@ -191,7 +191,7 @@ def main() -> int:
     parser.add_argument("--scale", nargs="+", choices=("known", "shared"), default=("known", "shared"))
     arguments = parser.parse_args()
     rows = [row for scale in arguments.scale for row in rows_of(scale, arguments.starts)]
-    return print_rows("The real dataset's 73 pairs, each alone", rows, store=arguments.store)
+    return print_rows("The real dataset's 73 pairs, each alone", rows)
 
 
 if __name__ == "__main__":

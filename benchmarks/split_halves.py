@@ -109,7 +109,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one for each core)")
     arguments = parser.parse_args()
     found = rows(arguments.runs, arguments.frames, arguments.jobs)
-    return print_rows(f"Split halves, {arguments.runs} logs", found, store=arguments.store)
+    return print_rows(f"Split halves, {arguments.runs} logs", found)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How fast a program starts, beside one that imports gtsam alone.
 
-    python benchmarks/start_time.py [--repetitions 15] [--store]
+    python benchmarks/start_time.py [--repetitions 15]
 
 Every repetition starts each program once, in turns; a ratio is the median over the repetitions. The third row has no
 bar: what a name costs when it is first asked for is no part of the import, and must not hide there.
@@ -50,7 +50,7 @@ def main() -> int:
     parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=15)
     arguments = parser.parse_args()
-    return print_rows("Start", rows(arguments.repetitions), store=arguments.store)
+    return print_rows("Start", rows(arguments.repetitions))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """From folders to a result: 1,004 images of 1080p from four cameras, as `gtsam-rwhec calibrate` takes them.
 
-    python benchmarks/thousand_images.py [--folder FOLDER] [--each 251] [--store]
+    python benchmarks/thousand_images.py [--folder FOLDER] [--each 251]
 
 The images are those of ``workcell_camera2`` and renderings like them (`four_cameras`). The command runs as a process,
 in the environment that a user has; its time is on the clock, its memory the greatest sum over all of its processes of
@@ -140,7 +140,7 @@ def main() -> int:
                 rows.append(Row(f"{name} off the truth", f"{1e3 * np.linalg.norm(wrong[:3, 3]):.2f} mm, {turn:.3f}°"))
         else:
             print(done.words)
-        return print_rows(f"{cell.images} images, four cameras, from folders to result", rows, store=given.store)
+        return print_rows(f"{cell.images} images, four cameras, from folders to result", rows)
 
 
 if __name__ == "__main__":

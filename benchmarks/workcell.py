@@ -130,7 +130,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if not FOLDER.is_dir():
         parser.error(f"{FOLDER} does not exist: set GTSAM_RWHEC_DATA to the folder that holds workcell_camera2")
-    return print_rows("Workcell", rows(arguments.repetitions), store=arguments.store)
+    return print_rows("Workcell", rows(arguments.repetitions))
 
 
 if __name__ == "__main__":

@@ -230,9 +230,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one for each core)")
     arguments = parser.parse_args()
     return print_rows(
-        f"Wrong assumptions, {arguments.runs} runs a row",
-        rows(arguments.runs, arguments.jobs, arguments.rows),
-        store=arguments.store,
+        f"Wrong assumptions, {arguments.runs} runs a row", rows(arguments.runs, arguments.jobs, arguments.rows)
     )
 
 

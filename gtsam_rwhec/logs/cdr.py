@@ -5,7 +5,7 @@ the messages of a topic nearly always have the same strings and lengths. So this
 Another message of the same length, with the same bytes in its strings and counts, has its numbers at the same places.
 The numbers of all these messages are read as columns of one array, without a step of Python for each message.
 
-Why no library: measured on 2026-11-21 (benchmarks/own_code_against_libraries.py), microseconds a message, ours
+Why no library: measured on 2026-11-21, microseconds a message, ours
 with the records made, mcap-ros2-support 0.6.0 and rosbags 0.11.9 decoding only: PoseStamped 1.3, 18, 13; TFMessage 2.5,
 24, 19; Odometry 4.9, 100, 44; AprilTagDetectionArray 10, 65, 49. Without decoding, reading a log takes 7 to 9 us a
 message. Decoding may take three times as long; with either library Odometry takes six times as long or more.

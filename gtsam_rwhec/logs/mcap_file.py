@@ -2,8 +2,7 @@
 
 The `mcap` package reads single records, and its `Summary` holds the index. Its readers are not used, with mcap 1.6.0
 measured: 14 of the 40 hostile files in tests/logs take more memory or time of them than `files/budgets.py` allows, they
-lose all messages of a file with one damaged chunk or one that breaks off, and a message takes 8 us, here 1 us
-(benchmarks/own_code_against_libraries.py).
+lose all messages of a file with one damaged chunk or one that breaks off, and a message takes 8 us, here 1 us.
 """
 
 from __future__ import annotations
