@@ -17,18 +17,18 @@ least squares that is let run reaches DQOpt's cost from every start. The paper's
 """
 
 from __future__ import annotations
+
 import time
 from dataclasses import dataclass
+
 import cv2
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
-from interleaved import in_words
-from interleaved import interleaved
+from bars import Row, benchmark_parser, print_rows
+from interleaved import in_words, interleaved
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+
 import gtsam_rwhec as rw
 
 Array = NDArray[np.float64]

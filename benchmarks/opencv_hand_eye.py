@@ -13,23 +13,19 @@ they are OpenCV's own.
 """
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Callable
+
 import cv2
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
-from interleaved import Times
-from interleaved import in_words
-from interleaved import interleaved
+from bars import Row, benchmark_parser, print_rows
+from interleaved import Times, in_words, interleaved
 from rich.progress import track
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.methods import opencv as ours
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import frame_distance
-from gtsam_rwhec.simulate import general
+from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, general
 
 HAND_EYE = {"Tsai": 0, "Park": 1, "Horaud": 2, "Andreff": 3, "Daniilidis": 4}
 ROBOT_WORLD = {"Shah": 0, "Li": 1}
