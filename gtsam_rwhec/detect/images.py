@@ -1,7 +1,8 @@
 """Width and height of compressed images from their headers, to refuse huge images before OpenCV decodes them.
 
-The stated size must not be smaller than the size that OpenCV decodes. Measured on 2026-11-22: if a TIFF gives its width twice, imagesize 2.0.1 takes the last
-width and OpenCV the first. Of 771 damaged images that OpenCV 5 decodes, Pillow 13.0.0 refuses 5 and this module none.
+The stated size must not be smaller than the size that OpenCV decodes. Measured on 2026-11-22: if a TIFF gives its width
+twice, imagesize 2.0.1 takes the last width and OpenCV the first. Of 771 damaged images that OpenCV 5 decodes, Pillow
+13.0.0 refuses 5 and this module none.
 """
 
 from __future__ import annotations
