@@ -145,7 +145,7 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
 def _serve() -> None:
     for module in (
         "rosbags.highlevel", "rosbags.typesys", "gtsam_rwhec.detect.images", "gtsam_rwhec.logs.image_folder",
-        "gtsam_rwhec.logs.mcap_writer", "gtsam_rwhec.logs.ros_bags", "gtsam_rwhec.logs.transforms",
+        "gtsam_rwhec.logs.mcap_writer", "gtsam_rwhec.logs.ros_bags", "gtsam_rwhec.logs.tf_buffer",
     ):  # fmt: skip
         importlib.import_module(module)
     for line in sys.stdin:
