@@ -61,7 +61,6 @@ class IntrinsicsEvidence:
 
     Attributes
     ----------
-    stated, fitted : Camera
     sigma : (4,) or (6,) array
         Standard deviations of the fitted fx, fy, cx, cy, pixels, and of two coefficients of distortion where they are
         fitted too.
@@ -69,7 +68,6 @@ class IntrinsicsEvidence:
         Root mean squares of the reprojection errors, pixels, each with the poses that fit best.
     probability : float
         That right intrinsics lead to so large a change.
-    views : int
     reach : float
         Largest normalised radius of a corner that was seen.
     """

@@ -67,7 +67,6 @@ class ShapeEvidence:
         Root mean squares of the reprojection errors, pixels, each with the poses that fit best.
     probability : float
         That a board of the stated shape leads to so large a change.
-    views : int
     extent_m : float
         Largest side of the box around the board, metres.
     """
@@ -106,7 +105,6 @@ def evidence_of_shape(
 
     Parameters
     ----------
-    camera : Camera
     corners : (n, 3) array
         The board's corners as stated, metres.
     hypotheses : mapping to (n, 3, q) arrays

@@ -60,7 +60,6 @@ def plane_poses(
 
     Parameters
     ----------
-    camera : Camera
     corners_m : sequence of (n_i, 3) arrays
         In each target's frame, in one plane or not. A target with fewer than four corners has no pose (nan).
     corners_px : sequence of (n_i, 2) arrays

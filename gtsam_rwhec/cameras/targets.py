@@ -74,14 +74,12 @@ class TagGrid:
 
     Attributes
     ----------
-    name : str
     family : str
         A key of `FAMILIES`.
     columns, rows : int
         Numbers of tags.
     tag_m, gap_m : float
         Side of a tag's black square, and the white gap between two tags, metres.
-    first_id : int
     ids : tuple of int
         Of all tags, left to right, from the top; if it is empty, they count from `first_id`.
     """
@@ -126,7 +124,6 @@ class BundleTag:
 
     Attributes
     ----------
-    id : int
     size_m : float
         Side of the black square, metres.
     t_m : tuple of 3 floats
@@ -160,10 +157,8 @@ class Bundle:
 
     Attributes
     ----------
-    name : str
     family : str
         A key of `FAMILIES`.
-    tags : tuple of BundleTag
     """
 
     name: str
@@ -208,10 +203,8 @@ class Tag:
 
     Attributes
     ----------
-    name : str
     family : str
         A key of `FAMILIES`.
-    id : int
     size_m : float
         Side of the black square, metres.
     """
@@ -247,7 +240,6 @@ class Charuco:
 
     Attributes
     ----------
-    name : str
     family : str
         A key of `FAMILIES`.
     columns, rows : int
@@ -295,7 +287,6 @@ class AprilGrid:
 
     Attributes
     ----------
-    name : str
     family : str
         A key of `FAMILIES`.
     columns, rows : int
@@ -304,7 +295,6 @@ class AprilGrid:
         Side of a tag's black square, metres.
     spacing : float
         Gap between tags over tag_m.
-    first_id : int
     """
 
     name: str
@@ -351,7 +341,6 @@ class Checkerboard:
 
     Attributes
     ----------
-    name : str
     columns, rows : int
         Numbers of inner corners.
     square_m : float
@@ -401,7 +390,6 @@ class CircleGrid:
 
     Attributes
     ----------
-    name : str
     columns, rows : int
         Numbers of circles: in a row, and rows. OpenCV's patternSize (4, 11) is 4 columns and 11 rows.
     spacing_m : float

@@ -165,7 +165,6 @@ class EstimatedIntrinsics:
 
     Attributes
     ----------
-    camera : Camera
     sigma : (4,) array
         Standard deviations of fx, fy, cx and cy, pixels, by the corners' residuals.
     rms_px : float

@@ -65,7 +65,6 @@ class Outline:
     ----------
     corners : (n, 2) array
         Its corners, as shares of the image's width.
-    is_used : bool
     """
 
     corners: Array
@@ -86,14 +85,12 @@ class Tile:
 
     Attributes
     ----------
-    outcome : Outcome
     name : str
         The image's file name, or its stamp.
     words : str
         What is to be said: targets and reasons.
     gray : (height, WIDTH) array or None
         The small picture; None where the image cannot be decoded.
-    outlines : tuple of Outline
     detail : Detail or None
         The first target, larger, where it is small in the image.
     """

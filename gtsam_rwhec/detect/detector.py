@@ -159,14 +159,7 @@ _Kind: TypeAlias = tuple[str, int]
 
 
 class Detector:
-    """Finds a camera's targets in its images. Two threads must not use one detector at once.
-
-    Parameters
-    ----------
-    camera : Camera
-    targets : sequence of Target
-    options : DetectionOptions
-    """
+    """Finds a camera's targets in its images. Two threads must not use one detector at once."""
 
     def __init__(self, camera: Camera, targets: Sequence[Target], options: DetectionOptions | None = None) -> None:
         self.camera = camera

@@ -35,12 +35,10 @@ class Words:
     ----------
     place : (float, float)
         Left end and top of its letters, pixels.
-    text : str
     size : int
         Height of its letters with their gaps, pixels.
     colour : (int, int, int)
         Blue, green, red.
-    is_bold : bool
     outline : Colour or None
         A line of this colour around each letter, for text over an image.
     """

@@ -71,7 +71,6 @@ def fitted_corners(gray: Gray, on_image: Callable[[Array], Array], rows: int, co
     on_image : callable
         Pixels (..., 2), right to one or two, of places (..., 2) on the board, in squares to the right and down from the
         first corner.
-    rows, columns : int
     """
     first = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     at, sigma = first, None

@@ -222,7 +222,6 @@ def refine_corners(
         The number of each tag's image.
     corners_px : (N, 4, 2) array
         Corners in order around the tag, right to a pixel or two.
-    camera : Camera
     modules : int
         Modules along a side with both borders: they tell where the code begins.
     """

@@ -178,8 +178,6 @@ class SeenTag:
 
     Attributes
     ----------
-    family : str
-    id : int
     is_double : bool
         Whether the tag has an AprilGrid's double border.
     middle_px : (2,) array

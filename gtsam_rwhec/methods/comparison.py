@@ -262,7 +262,6 @@ def compare(
 
     Parameters
     ----------
-    problem : Problem
     options : MethodOptions, optional
         The same for all methods.
     methods : iterable of str, optional

@@ -119,7 +119,6 @@ def local_on_manifold(
         The start, T_targetcarrier_target by target and T_sensorcarrier_sensor by sensor, in true metres.
     scale : float
         The start's alpha; not used when the scale is known.
-    options : LomOptions, optional
 
     Raises
     ------

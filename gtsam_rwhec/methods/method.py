@@ -94,7 +94,6 @@ class Estimate(Generic[X]):
     cost : float
         From ``methods.run``: J of the certified objective (eq. 18), whatever cost the method itself minimised. From
         ``solve_hand_eye``: the cost that ``cost_name`` names.
-    cost_name : str
     proof : Proof or None
         None where the method proves nothing.
     free_directions : tuple of FreeDirection
@@ -201,12 +200,10 @@ class Method(Generic[Arguments]):
         Its key in ``METHODS``.
     function : callable
         Makes an ``Outcome`` from (problem, options) for A X = Y B, from a ``Request`` for A X = X B.
-    properties : Properties
     source : str
         The publication.
     assumes : str
         What must hold for a correct answer, and where the method fails.
-    takes : frozenset of Takes
     check : callable, optional
         Raises a ``RwhecError`` for a problem that the method cannot solve for another reason.
     """

@@ -275,7 +275,6 @@ def cost_of(
 
     Parameters
     ----------
-    motions : Motions
     alpha : float
         Positive, 1/m; not used with ``covariances``.
     weights : (N,) array, optional

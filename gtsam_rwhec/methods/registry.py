@@ -124,8 +124,6 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     ----------
     name : str
         A key of ``METHODS``.
-    problem : Problem
-    options : MethodOptions, optional
 
     Raises
     ------

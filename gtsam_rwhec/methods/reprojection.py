@@ -58,7 +58,6 @@ class ReprojectionAnswer:
 
     Attributes
     ----------
-    method : str
     X, Y : dict of str to gtsam.Pose3
         T_targetcarrier_target and T_sensorcarrier_sensor, metres.
     cost : float
@@ -68,11 +67,8 @@ class ReprojectionAnswer:
         Infinite where a corner that was seen is behind its camera.
     rms_px : float
         Root mean square length of these errors, pixels.
-    iterations : int
-    converged : bool
     seconds : float
         Of the descent, without the start.
-    starts_from : str
     """
 
     method: str
@@ -135,8 +131,6 @@ def run(
     Parameters
     ----------
     name : "evangelista2023" or "tabb2017_rp1"
-    observations : Observations
-    options : MethodOptions, optional
     parameterisation : "axis-angle", "euler" or "quaternion"
         Of rp1's rotations.
     carrier : CarrierNoise, optional
@@ -173,11 +167,8 @@ def compare(
 
     Parameters
     ----------
-    observations : Observations
-    options : MethodOptions, optional
     carrier : CarrierNoise, optional
         The noise of A, for Evangelista's graph and for ours; left out, A is exact for ours.
-    methods : iterable of str
 
     Raises
     ------
