@@ -34,20 +34,11 @@ ROUNDS = 10
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """The turns of n images of a track.
+    """The turns of n images of a track."""
 
-    Attributes
-    ----------
-    which : (n,) array of int
-        Turns about the board's z, in steps of 2 pi / ways.
-    margin : (n,) array
-        By how much the track's log-likelihood exceeds that with another turn of this image.
-    R_A, R_B : (n, 3, 3) arrays
-        Rotations of the carriers and of the turned board, of the images whose carriers' poses are known.
-    """
-
-    which: np.ndarray
-    margin: Array
+    which: np.ndarray  #: (n,): turns about the board's z, in steps of 2 pi / ways
+    margin: Array  #: (n,): by how much the track's log-likelihood exceeds that with another turn of this image
+    #: (n, 3, 3): rotations of the carriers and of the turned board, of the images whose carriers' poses are known
     R_A: Array
     R_B: Array
 

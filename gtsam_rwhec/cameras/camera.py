@@ -38,25 +38,16 @@ MOST_PIXELS = 1 << 28
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera."""
 
-    Attributes
-    ----------
-    width, height : int
-        Size of the images, pixels.
-    model : str
-        "pinhole", "radtan", "equidistant" (OpenCV's fisheye) or "unified" (OpenCV's omnidir, Kalibr's omni-radtan).
-    K : (3, 3) array
-        Camera matrix, pixels.
-    D : (n,) array
-        OpenCV's distortion coefficients. "radtan": k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]]; "equidistant":
-        k1, k2, k3, k4; "unified": xi, k1, k2, p1, p2.
-    """
-
+    #: Size of the images, pixels
     width: int
     height: int
+    #: "pinhole", "radtan", "equidistant" (OpenCV's fisheye) or "unified" (OpenCV's omnidir, Kalibr's omni-radtan)
     model: Model
-    K: Array
+    K: Array  #: (3, 3): camera matrix, pixels
+    #: (n,): openCV's distortion coefficients. "radtan": k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]];
+    #: "equidistant": k1, k2, k3, k4; "unified": xi, k1, k2, p1, p2.
     D: Array
 
     @staticmethod

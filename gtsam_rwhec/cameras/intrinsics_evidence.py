@@ -57,29 +57,19 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsEvidence:
-    """What the corners of a sensor say about its stated intrinsics.
-
-    Attributes
-    ----------
-    sigma : (4,) or (6,) array
-        Standard deviations of the fitted fx, fy, cx, cy, pixels, and of two coefficients of distortion where they are
-        fitted too.
-    stated_px, fitted_px : float
-        Root mean squares of the reprojection errors, pixels, each with the poses that fit best.
-    probability : float
-        That right intrinsics lead to so large a change.
-    reach : float
-        Largest normalised radius of a corner that was seen.
-    """
+    """What the corners of a sensor say about its stated intrinsics."""
 
     stated: Camera
     fitted: Camera
+    #: (4,) or (6,): standard deviations of the fitted fx, fy, cx, cy, pixels, and of two coefficients of distortion
+    #: where they are fitted too
     sigma: Array
+    #: Root mean squares of the reprojection errors, pixels, each with the poses that fit best
     stated_px: float
     fitted_px: float
-    probability: float
+    probability: float  #: That right intrinsics lead to so large a change
     views: int
-    reach: float
+    reach: float  #: Largest normalised radius of a corner that was seen
 
     @property
     def contradicts(self) -> bool:

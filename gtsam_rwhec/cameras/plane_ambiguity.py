@@ -35,17 +35,11 @@ SAME_RAD = float(np.radians(0.2))
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The candidates chosen in n images of a track.
+    """The candidates chosen in n images of a track."""
 
-    Attributes
-    ----------
-    which : (n,) array of int
-        The chosen candidate, 0 or 1.
-    margin : (n,) array
-        By how much the chosen track's log-likelihood exceeds that of the best track with this image's other candidate.
-    """
-
-    which: np.ndarray
+    which: np.ndarray  #: (n,): the chosen candidate, 0 or 1
+    #: (n,): by how much the chosen track's log-likelihood exceeds that of the best track with this image's other
+    #: candidate
     margin: Array
 
 

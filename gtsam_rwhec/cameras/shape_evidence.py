@@ -51,36 +51,21 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class ShapeEvidence:
-    """What the views say about one hypothesis.
+    """What the views say about one hypothesis."""
 
-    Attributes
-    ----------
-    key : pair of str and int
-        The hypothesis.
-    theta, sigma : (q,) arrays
-        The numbers that fit best, and their standard deviations.
-    moved_m : float
-        Largest distance by which a corner is moved, less two standard deviations; metres.
-    moved_px : float
-        The same in the median view, pixels; of a gap its change, since a tag's edges beside it are what tells it.
-    stated_px, fitted_px : float
-        Root mean squares of the reprojection errors, pixels, each with the poses that fit best.
-    probability : float
-        That a board of the stated shape leads to so large a change.
-    extent_m : float
-        Largest side of the box around the board, metres.
-    """
-
-    key: Key
+    key: Key  #: The hypothesis
+    #: (q,): the numbers that fit best, and their standard deviations
     theta: Array
     sigma: Array
-    moved_m: float
+    moved_m: float  #: Largest distance by which a corner is moved, less two standard deviations; metres
+    #: The same in the median view, pixels; of a gap its change, since a tag's edges beside it are what tells it
     moved_px: float
+    #: Root mean squares of the reprojection errors, pixels, each with the poses that fit best
     stated_px: float
     fitted_px: float
-    probability: float
+    probability: float  #: That a board of the stated shape leads to so large a change
     views: int
-    extent_m: float
+    extent_m: float  #: Largest side of the box around the board, metres
 
     @property
     def contradicts(self) -> bool:

@@ -30,26 +30,13 @@ FLAT = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class PlanePoses:
-    """Poses of N targets. Each target has up to two candidates, and the better candidate is first.
+    """Poses of N targets. Each target has up to two candidates, and the better candidate is first."""
 
-    Attributes
-    ----------
-    T : (N, 2, 4, 4) array
-        T_camera_target, metres; nan where no pose was found.
-    squared_px : (N, 2) array
-        Sums of squared reprojection errors, px^2.
-    reprojection_px : (N, 2) array
-        Root mean square over corners of the error's length, px.
-    covariance : (N, 2, 6, 6) array
-        Covariance of the right perturbation [omega (rad), v (m)], from corner noise.
-    errors_px : (N, n, 2) array
-        Seen minus predicted corners of the better candidate; nan where a target has fewer corners.
-    """
-
-    T: Array
-    squared_px: Array
-    reprojection_px: Array
-    covariance: Array
+    T: Array  #: (N, 2, 4, 4): T_camera_target, metres; nan where no pose was found
+    squared_px: Array  #: (N, 2): sums of squared reprojection errors, px^2
+    reprojection_px: Array  #: (N, 2): root mean square over corners of the error's length, px
+    covariance: Array  #: (N, 2, 6, 6): covariance of the right perturbation [omega (rad), v (m)], from corner noise
+    #: (N, n, 2): seen minus predicted corners of the better candidate; nan where a target has fewer corners
     errors_px: Array
 
 

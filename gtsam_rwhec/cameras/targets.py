@@ -71,27 +71,18 @@ class TagGrid:
 
     Ids count from first_id at the top left, to the right, then down, unless they are listed in this order. Corners are
     the tags' corners in that order.
-
-    Attributes
-    ----------
-    family : str
-        A key of `FAMILIES`.
-    columns, rows : int
-        Numbers of tags.
-    tag_m, gap_m : float
-        Side of a tag's black square, and the white gap between two tags, metres.
-    ids : tuple of int
-        Of all tags, left to right, from the top; if it is empty, they count from `first_id`.
     """
 
     name: str
-    family: str
+    family: str  #: A key of `FAMILIES`
+    #: Numbers of tags
     columns: int
     rows: int
+    #: Side of a tag's black square, and the white gap between two tags, metres
     tag_m: float
     gap_m: float
     first_id: int = 0
-    ids: tuple[int, ...] = ()
+    ids: tuple[int, ...] = ()  #: Of all tags, left to right, from the top; if it is empty, they count from `first_id`
 
     def __post_init__(self) -> None:
         check_grid(self.name, self.columns, self.rows, 1)
@@ -120,21 +111,12 @@ class TagGrid:
 
 @dataclass(frozen=True)
 class BundleTag:
-    """A tag of a bundle: its id, its side, and where it is in the bundle's frame.
-
-    Attributes
-    ----------
-    size_m : float
-        Side of the black square, metres.
-    t_m : tuple of 3 floats
-        The tag's middle in the bundle's frame, metres.
-    wxyz : tuple of 4 floats
-        The unit quaternion w, x, y, z that turns the tag's axes (x right, y up, z out of the paper) into the bundle's.
-    """
+    """A tag of a bundle: its id, its side, and where it is in the bundle's frame."""
 
     id: int
-    size_m: float
-    t_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    size_m: float  #: Side of the black square, metres
+    t_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: The tag's middle in the bundle's frame, metres
+    #: The unit quaternion w, x, y, z that turns the tag's axes (x right, y up, z out of the paper) into the bundle's
     wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def corners(self) -> Array:
@@ -154,15 +136,10 @@ class Bundle:
 
     Its frame is the one in which the tags' places are given: the origin need not be in the middle. Corners are the
     tags' corners in the order of the tags.
-
-    Attributes
-    ----------
-    family : str
-        A key of `FAMILIES`.
     """
 
     name: str
-    family: str
+    family: str  #: A key of `FAMILIES`
     tags: tuple[BundleTag, ...]
 
     def __post_init__(self) -> None:
@@ -199,20 +176,12 @@ CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 
 @dataclass(frozen=True)
 class Tag:
-    """A single tag.
-
-    Attributes
-    ----------
-    family : str
-        A key of `FAMILIES`.
-    size_m : float
-        Side of the black square, metres.
-    """
+    """A single tag."""
 
     name: str
-    family: str
+    family: str  #: A key of `FAMILIES`
     id: int
-    size_m: float
+    size_m: float  #: Side of the black square, metres
 
     def __post_init__(self) -> None:
         check(self.name, self.family, (self.id,), {"size_m": self.size_m})
@@ -237,26 +206,17 @@ class Charuco:
     """A ChArUco board of columns x rows squares, with markers in the white squares, numbered from first_id.
 
     Its corners are the inner corners of the chessboard in OpenCV's order: left to right, from the top.
-
-    Attributes
-    ----------
-    family : str
-        A key of `FAMILIES`.
-    columns, rows : int
-        Numbers of squares.
-    square_m, marker_m : float
-        Sides of a square and of a marker, metres.
-    first_id : int
-        The markers' ids are first_id, first_id + 1 and so on.
     """
 
     name: str
-    family: str
+    family: str  #: A key of `FAMILIES`
+    #: Numbers of squares
     columns: int
     rows: int
+    #: Sides of a square and of a marker, metres
     square_m: float
     marker_m: float
-    first_id: int = 0
+    first_id: int = 0  #: The markers' ids are first_id, first_id + 1 and so on
 
     def __post_init__(self) -> None:
         check_grid(self.name, self.columns, self.rows, 2)
@@ -284,25 +244,15 @@ class AprilGrid:
     """Kalibr's AprilGrid: columns x rows tags with a double black border, spacing = gap / tag_m.
 
     Ids count from first_id at the bottom left, to the right, then up. Corners are the tags' corners in that order.
-
-    Attributes
-    ----------
-    family : str
-        A key of `FAMILIES`.
-    columns, rows : int
-        Numbers of tags.
-    tag_m : float
-        Side of a tag's black square, metres.
-    spacing : float
-        Gap between tags over tag_m.
     """
 
     name: str
-    family: str
+    family: str  #: A key of `FAMILIES`
+    #: Numbers of tags
     columns: int
     rows: int
-    tag_m: float
-    spacing: float
+    tag_m: float  #: Side of a tag's black square, metres
+    spacing: float  #: Gap between tags over tag_m
     first_id: int = 0
 
     def __post_init__(self) -> None:
@@ -338,19 +288,13 @@ class Checkerboard:
 
     If columns and rows are both even or both odd, the board looks the same turned by half a turn (or by quarters, see
     `ways`): which way up it is in each image only the motion tells.
-
-    Attributes
-    ----------
-    columns, rows : int
-        Numbers of inner corners.
-    square_m : float
-        Side of a square, metres.
     """
 
     name: str
+    #: Numbers of inner corners
     columns: int
     rows: int
-    square_m: float
+    square_m: float  #: Side of a square, metres
     family: ClassVar[str] = "checkerboard"
     ids: ClassVar[tuple[int, ...]] = ()
 
@@ -387,26 +331,18 @@ class CircleGrid:
     is the upper left one as printed. Neighbours in a row are two spacings apart, diagonal ones sqrt(2).
 
     A grid may look the same turned (see `ways`): which way up it is only the motion tells.
-
-    Attributes
-    ----------
-    columns, rows : int
-        Numbers of circles: in a row, and rows. OpenCV's patternSize (4, 11) is 4 columns and 11 rows.
-    spacing_m : float
-        Between the centres of neighbours, metres. In an asymmetric grid it is the distance between two rows, which is
-        half the distance between neighbours in a row (OpenCV's square size, Kalibr's spacingMeters).
-    larger_dot : bool or str
-        Whether one circle, at a corner, is larger; or which corner, one of `CORNERS`. True is "lower_left".
-    asymmetric : bool
-        Whether every other row is shifted. Such a grid has no larger dot.
     """
 
     name: str
+    #: Numbers of circles: in a row, and rows. OpenCV's patternSize (4, 11) is 4 columns and 11 rows.
     columns: int
     rows: int
+    #: Between the centres of neighbours, metres. In an asymmetric grid it is the distance between two rows, which is
+    #: half the distance between neighbours in a row (OpenCV's square size, Kalibr's spacingMeters).
     spacing_m: float
+    #: Whether one circle, at a corner, is larger; or which corner, one of `CORNERS`. True is "lower_left".
     larger_dot: bool | str = False
-    asymmetric: bool = False
+    asymmetric: bool = False  #: Whether every other row is shifted. Such a grid has no larger dot.
     family: ClassVar[str] = "circle_grid"
     ids: ClassVar[tuple[int, ...]] = ()
 

@@ -28,23 +28,12 @@ FOCAL_OF_SIZE = (1.0 / np.pi, 0.4, 0.6, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class PlanesFitted:
-    """Intrinsics that fit views of planes.
+    """Intrinsics that fit views of planes."""
 
-    Attributes
-    ----------
-    rms_px : float
-        Root mean square length of the reprojection errors, pixels.
-    K : (3, 3) array
-    D : (4,) array
-        k1, k2, p1, p2; of a fisheye k1, k2, k3, k4.
-    T : (n, 4, 4) array
-        T_camera_target of each view, metres.
-    """
-
-    rms_px: float
-    K: Array
-    D: Array
-    T: Array
+    rms_px: float  #: Root mean square length of the reprojection errors, pixels
+    K: Array  #: (3, 3)
+    D: Array  #: (4,): k1, k2, p1, p2; of a fisheye k1, k2, k3, k4
+    T: Array  #: (n, 4, 4): T_camera_target of each view, metres
 
 
 def fitted_to_planes(
@@ -161,21 +150,12 @@ LARGEST_SIGMA = 0.1
 
 @dataclass(frozen=True, eq=False)
 class EstimatedIntrinsics:
-    """Intrinsics that fit views of planes.
-
-    Attributes
-    ----------
-    sigma : (4,) array
-        Standard deviations of fx, fy, cx and cy, pixels, by the corners' residuals.
-    rms_px : float
-        Root mean square length of the residuals, pixels.
-    views, corners : int
-        How many of them were used.
-    """
+    """Intrinsics that fit views of planes."""
 
     camera: Camera
-    sigma: Array
-    rms_px: float
+    sigma: Array  #: (4,): standard deviations of fx, fy, cx and cy, pixels, by the corners' residuals
+    rms_px: float  #: Root mean square length of the residuals, pixels
+    #: How many of them were used
     views: int
     corners: int
 

@@ -31,19 +31,11 @@ LEAST_SHARE = 0.08
 
 @dataclass(frozen=True, eq=False)
 class Strips:
-    """Where the edges of n corners are, up to a pixel.
+    """Where the edges of n corners are, up to a pixel."""
 
-    Attributes
-    ----------
-    corners_px : (n, 2) array
-    directions : (n, 2, 2) array
-        Unit vectors along the two edges in the image.
-    along_px, across_px : (n, 2) arrays
-        How far along and across each edge there is nothing else, pixels.
-    """
-
-    corners_px: Array
-    directions: Array
+    corners_px: Array  #: (n, 2)
+    directions: Array  #: (n, 2, 2): unit vectors along the two edges in the image
+    #: (n, 2): how far along and across each edge there is nothing else, pixels
     along_px: Array
     across_px: Array
 

@@ -46,21 +46,12 @@ class FoundBoard:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the image says about a grid of corners.
+    """What the image says about a grid of corners."""
 
-    Attributes
-    ----------
-    rejection : Rejection or None
-        Why the corners are not the board's; None if they are.
-    kept : (rows, columns) array of bool
-        Which corners are at their places in the plane; a shadow's edge or dirt moves a few.
-    first_is_dark : bool
-        Whether the first corner's outer square is dark.
-    """
-
-    rejection: Rejection | None
+    rejection: Rejection | None  #: Why the corners are not the board's; None if they are
+    #: (rows, columns): which corners are at their places in the plane; a shadow's edge or dirt moves a few
     kept: np.ndarray
-    first_is_dark: bool = True
+    first_is_dark: bool = True  #: Whether the first corner's outer square is dark
 
 
 @dataclass(frozen=True, eq=False)

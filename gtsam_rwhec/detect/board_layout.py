@@ -285,26 +285,13 @@ MOST_ELSEWHERE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class BoardTags:
-    """Tags of a board in an image.
+    """Tags of a board in an image."""
 
-    Attributes
-    ----------
-    ids : (m,) integers
-    corners_px : (m, 4, 2) array
-        In the order of the board's own corners, right to about a pixel.
-    contradicted : bool
-        The tags are not where the board says: none may be used.
-    note : str
-        What the rig file would have to say instead, as far as it is known.
-    is_legacy : bool
-        Whether a ChArUco board has the pattern of OpenCV before 4.6.
-    """
-
-    ids: np.ndarray
-    corners_px: Array
-    contradicted: bool = False
-    note: str = ""
-    is_legacy: bool = False
+    ids: np.ndarray  #: (m,)
+    corners_px: Array  #: (m, 4, 2): in the order of the board's own corners, right to about a pixel
+    contradicted: bool = False  #: The tags are not where the board says: none may be used
+    note: str = ""  #: What the rig file would have to say instead, as far as it is known
+    is_legacy: bool = False  #: Whether a ChArUco board has the pattern of OpenCV before 4.6.
 
 
 @cache

@@ -65,31 +65,16 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Circles:
-    """Circles (...) as they are in an image.
+    """Circles (...) as they are in an image."""
 
-    Attributes
-    ----------
-    seen_px : (..., 2) array
-        Centroids of the gray values, pixels.
-    centres_px : (..., 2) array
-        Images of the circles' centres, pixels.
-    radii : (...) array
-        In steps of the grid, from the areas.
-    contrasts : (...) array
-        (background - circle) / the lighter of the two; negative if that is the circle.
-    uneven : (...) array
-        By how much the light on the background around a circle is off a plane: root mean square, as a share of it.
-        Where a shadow's edge crosses a circle, its centroid is off.
-    seen : (...) array of bool
-        Whether a circle is whole in the image and its numbers are finite.
-    """
-
-    seen_px: Array
-    centres_px: Array
-    radii: Array
-    contrasts: Array
+    seen_px: Array  #: (..., 2): centroids of the gray values, pixels
+    centres_px: Array  #: (..., 2): images of the circles' centres, pixels
+    radii: Array  #: (...): in steps of the grid, from the areas
+    contrasts: Array  #: (...): (background - circle) / the lighter of the two; negative if that is the circle
+    #: (...): by how much the light on the background around a circle is off a plane: root mean square, as a share of
+    #: it. Where a shadow's edge crosses a circle, its centroid is off.
     uneven: Array
-    seen: np.ndarray
+    seen: np.ndarray  #: (...): whether a circle is whole in the image and its numbers are finite
 
 
 def measured_circles(gray: Gray, plane: Plane, steps: Array, about_px: Array, radii: Array) -> Circles:

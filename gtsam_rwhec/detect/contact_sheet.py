@@ -59,15 +59,9 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A detection in a small picture.
+    """A detection in a small picture."""
 
-    Attributes
-    ----------
-    corners : (n, 2) array
-        Its corners, as shares of the image's width.
-    """
-
-    corners: Array
+    corners: Array  #: (n, 2): its corners, as shares of the image's width
     is_used: bool
 
 
@@ -81,26 +75,14 @@ class Detail:
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """An image of the sheet.
-
-    Attributes
-    ----------
-    name : str
-        The image's file name, or its stamp.
-    words : str
-        What is to be said: targets and reasons.
-    gray : (height, WIDTH) array or None
-        The small picture; None where the image cannot be decoded.
-    detail : Detail or None
-        The first target, larger, where it is small in the image.
-    """
+    """An image of the sheet."""
 
     outcome: Outcome
-    name: str
-    words: str
-    gray: Gray | None
+    name: str  #: The image's file name, or its stamp
+    words: str  #: What is to be said: targets and reasons
+    gray: Gray | None  #: (height, WIDTH): the small picture; None where the image cannot be decoded
     outlines: tuple[Outline, ...] = ()
-    detail: Detail | None = None
+    detail: Detail | None = None  #: The first target, larger, where it is small in the image
 
 
 @dataclass(frozen=True, eq=False)

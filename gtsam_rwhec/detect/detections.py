@@ -87,46 +87,21 @@ class DetectionOptions:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A target in an image.
+    """A target in an image."""
 
-    Attributes
-    ----------
-    target : str
-        Name of the target.
-    corners_px : (n, 2) array
-        The corners that were seen, pixels.
-    indices : (n,) integers
-        Rows of these corners in ``Target.corners``.
-    T : (2, 4, 4) array
-        T_camera_target, metres: a plane's two candidates, the candidate of smaller reprojection error first; nan where
-        a candidate is missing.
-    squared_px : (2,) array
-        Sum of squared reprojection errors, px^2.
-    reprojection_px : (2,) array
-        Root mean square of the reprojection errors, pixels.
-    covariance : (2, 6, 6) array
-        Covariance of the right perturbation [omega (rad), v (m)], from corner noise.
-    side_px : float
-        The shortest side of a tag, or of a board's bounding box, pixels.
-    blur_px : float
-        Standard deviation of the blur across a tag's edges, pixels; nan for boards.
-    rejection : Rejection or None
-        Why the detection is not used; None if it is used.
-    note : str
-        More about the rejection (what the rig file would have to say), or about the board.
-    """
-
-    target: str
-    corners_px: Array
-    indices: np.ndarray
+    target: str  #: Name of the target
+    corners_px: Array  #: (n, 2): the corners that were seen, pixels
+    indices: np.ndarray  #: (n,): rows of these corners in ``Target.corners``.
+    #: (2, 4, 4): T_camera_target, metres: a plane's two candidates, the candidate of smaller reprojection error first;
+    #: nan where a candidate is missing
     T: Array
-    squared_px: Array
-    reprojection_px: Array
-    covariance: Array
-    side_px: float
-    blur_px: float
-    rejection: Rejection | None = None
-    note: str = ""
+    squared_px: Array  #: (2,): sum of squared reprojection errors, px^2
+    reprojection_px: Array  #: (2,): root mean square of the reprojection errors, pixels
+    covariance: Array  #: (2, 6, 6): covariance of the right perturbation [omega (rad), v (m)], from corner noise
+    side_px: float  #: The shortest side of a tag, or of a board's bounding box, pixels
+    blur_px: float  #: Standard deviation of the blur across a tag's edges, pixels; nan for boards
+    rejection: Rejection | None = None  #: Why the detection is not used; None if it is used
+    note: str = ""  #: More about the rejection (what the rig file would have to say), or about the board
 
     def reason(self, rejection: Rejection | None) -> str:
         """The words for a reason why this detection is not used, with the note; empty if it is used."""

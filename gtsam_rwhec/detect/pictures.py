@@ -29,26 +29,14 @@ MOST_READ = 400
 
 @dataclass(frozen=True)
 class Words:
-    """A line of text in a picture.
+    """A line of text in a picture."""
 
-    Attributes
-    ----------
-    place : (float, float)
-        Left end and top of its letters, pixels.
-    size : int
-        Height of its letters with their gaps, pixels.
-    colour : (int, int, int)
-        Blue, green, red.
-    outline : Colour or None
-        A line of this colour around each letter, for text over an image.
-    """
-
-    place: tuple[float, float]
+    place: tuple[float, float]  #: Left end and top of its letters, pixels
     text: str
-    size: int
-    colour: Colour = (0, 0, 0)
+    size: int  #: Height of its letters with their gaps, pixels
+    colour: Colour = (0, 0, 0)  #: Blue, green, red
     is_bold: bool = False
-    outline: Colour | None = None
+    outline: Colour | None = None  #: A line of this colour around each letter, for text over an image
 
 
 @cache

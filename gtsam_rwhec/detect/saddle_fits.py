@@ -42,24 +42,13 @@ LEFT, LEFT_MEDIANS = 0.1, 2.0
 
 @dataclass(frozen=True, eq=False)
 class FittedCorners:
-    """Corners of a board.
+    """Corners of a board."""
 
-    Attributes
-    ----------
-    corners_px : (rows, columns, 2) array
-        Pixels.
-    good : (rows, columns) array of bool
-        Whether there is a corner, near where it was expected.
-    sharp : (rows, columns) array of bool
-        Whether the model explains all about it: the other good ones may be some tenths of a pixel off.
-    blur_px : (rows, columns) array
-        Standard deviation of the blur, pixels.
-    """
-
-    corners_px: Array
-    good: np.ndarray
+    corners_px: Array  #: (rows, columns, 2): pixels
+    good: np.ndarray  #: (rows, columns): whether there is a corner, near where it was expected
+    #: (rows, columns): whether the model explains all about it: the other good ones may be some tenths of a pixel off
     sharp: np.ndarray
-    blur_px: Array
+    blur_px: Array  #: (rows, columns): standard deviation of the blur, pixels
 
 
 def fitted_corners(gray: Gray, on_image: Callable[[Array], Array], rows: int, columns: int) -> FittedCorners:

@@ -34,21 +34,11 @@ BEYOND, BEYOND_PX = 0.45, 12.0
 
 @dataclass(frozen=True, eq=False)
 class Saddles:
-    """n saddles of an image, the strongest first.
+    """n saddles of an image, the strongest first."""
 
-    Attributes
-    ----------
-    places : (n, 2) array
-        Pixels, right to some tenths.
-    edges : (n, 2, 2) array
-        Unit vectors along the two edges that cross.
-    light : (n, 2) array
-        A unit vector towards a light side.
-    """
-
-    places: Array
-    edges: Array
-    light: Array
+    places: Array  #: (n, 2): pixels, right to some tenths
+    edges: Array  #: (n, 2, 2): unit vectors along the two edges that cross
+    light: Array  #: (n, 2): A unit vector towards a light side
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,17 +195,11 @@ LEAST_GRAY = 8.0
 
 @dataclass(frozen=True)
 class RefinedCorners:
-    """Corners of N tags.
+    """Corners of N tags."""
 
-    Attributes
-    ----------
-    corners_px : (N, 4, 2) array
-        Pixels; nan where the edges were not found.
-    blur_px : (N,) array
-        Standard deviation of the blur across the edges, on the side with the largest blur. It contains a pixel's blur.
-    """
-
-    corners_px: Array
+    corners_px: Array  #: (N, 4, 2): pixels; nan where the edges were not found
+    #: (N,): standard deviation of the blur across the edges, on the side with the largest blur. It contains a pixel's
+    #: blur.
     blur_px: Array
 
 

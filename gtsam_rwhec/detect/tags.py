@@ -174,26 +174,14 @@ SIDE = 50
 
 @dataclass(frozen=True, eq=False)
 class SeenTag:
-    """A tag in an image.
-
-    Attributes
-    ----------
-    is_double : bool
-        Whether the tag has an AprilGrid's double border.
-    middle_px : (2,) array
-        Mean of the corners, pixels.
-    side_px : float
-        Longest side, pixels.
-    corners_px : (4, 2) array
-        From the top left, clockwise, as printed; pixels.
-    """
+    """A tag in an image."""
 
     family: str
     id: int
-    is_double: bool
-    middle_px: Array
-    side_px: float
-    corners_px: Array
+    is_double: bool  #: Whether the tag has an AprilGrid's double border
+    middle_px: Array  #: (2,): mean of the corners, pixels
+    side_px: float  #: Longest side, pixels
+    corners_px: Array  #: (4, 2): from the top left, clockwise, as printed; pixels
 
 
 def tags_in_image(gray: Gray, families: Iterable[str] = BY_TRUST) -> list[SeenTag]:

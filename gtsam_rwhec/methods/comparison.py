@@ -47,33 +47,17 @@ Poses = dict[str, gtsam.Pose3]
 
 @dataclass(frozen=True)
 class Chained:
-    """A method for one pair, on every pair of a tree.
+    """A method for one pair, on every pair of a tree."""
 
-    Attributes
-    ----------
-    method : str
-        The method's name.
-    tree : tuple of Pair
-        The pairs whose answers count, in the order in which the tree took them.
-    X, Y : dict of str to gtsam.Pose3
-        The frames that the tree reaches.
-    failed : dict of Pair to str
-        Pairs that the tree avoids because the method has no answer for them, with the reason.
-    unreached : tuple of str
-        Frames that are in no pair that the tree can take.
-    estimate : Estimate or None
-        The answer under the joint objective; None where frames are unreached.
-    off_mm, off_deg : float
-        The largest difference of a reached frame from the joint answer; nan without a frame.
-    """
-
-    method: str
-    tree: tuple[Pair, ...]
+    method: str  #: The method's name
+    tree: tuple[Pair, ...]  #: The pairs whose answers count, in the order in which the tree took them
+    #: The frames that the tree reaches
     X: Poses
     Y: Poses
-    failed: dict[Pair, str]
-    unreached: tuple[str, ...]
-    estimate: Estimate[Poses] | None
+    failed: dict[Pair, str]  #: Pairs that the tree avoids because the method has no answer for them, with the reason
+    unreached: tuple[str, ...]  #: Frames that are in no pair that the tree can take
+    estimate: Estimate[Poses] | None  #: The answer under the joint objective; None where frames are unreached
+    #: The largest difference of a reached frame from the joint answer; nan without a frame
     off_mm: float
     off_deg: float
 
@@ -210,27 +194,15 @@ class Compared:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods' answers.
+    """All methods' answers."""
 
-    Attributes
-    ----------
-    rows : tuple of Compared
-        Methods with an answer first, by increasing cost.
-    solution : Solution or None
-        The certified solution; its certificate's bound holds for every answer.
-    error : RwhecError or None
-        Why there is no certified solution.
-    chained : tuple of Chained
-        Methods for one pair on each pair of the best tree, cheapest first; none where the problem has one pair, an
-        unknown scale, priors or fixed frames.
-    undetermined : tuple of Pair
-        Pairs that no tree takes, since their own measurements do not determine their frames.
-    """
-
-    rows: tuple[Compared, ...]
-    solution: Solution | None
-    error: RwhecError | None = None
+    rows: tuple[Compared, ...]  #: Methods with an answer first, by increasing cost
+    solution: Solution | None  #: The certified solution; its certificate's bound holds for every answer
+    error: RwhecError | None = None  #: Why there is no certified solution
+    #: Methods for one pair on each pair of the best tree, cheapest first; none where the problem has one pair, an
+    #: unknown scale, priors or fixed frames
     chained: tuple[Chained, ...] = ()
+    #: Pairs that no tree takes, since their own measurements do not determine their frames
     undetermined: tuple[Pair, ...] = ()
 
     @property

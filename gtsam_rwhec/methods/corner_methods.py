@@ -88,14 +88,10 @@ class Graph:
 
 @dataclass(frozen=True, eq=False)
 class Bordered(Linearised):
-    """A quadratic model whose images' poses are eliminated: H (m, m) and g (m,) are of the frames alone.
+    """A quadratic model whose images' poses are eliminated: H (m, m) and g (m,) are of the frames alone."""
 
-    Attributes
-    ----------
-    by_B : (V, 6, 6) array
-        Blocks of the images' poses, C (V, 6, m) those between them and the frames, and g_B (V, 6) the gradient.
-    """
-
+    #: (V, 6, 6): blocks of the images' poses, C (V, 6, m) those between them and the frames, and g_B (V, 6) the
+    #: gradient
     by_B: Array
     C: Array
     g_B: Array

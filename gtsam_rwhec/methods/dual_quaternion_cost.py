@@ -86,20 +86,13 @@ class MotionMoments:
 
 @dataclass(frozen=True)
 class DualQuaternionCost:
-    """The cost (8) as eq. 9 writes it: q'S q + 2 q'W q_dual + q_dual'M q_dual.
+    """The cost (8) as eq. 9 writes it: q'S q + 2 q'W q_dual + q_dual'M q_dual."""
 
-    Attributes
-    ----------
-    S, M, W : (4, 4) arrays
-        As below eq. 9: S = A'A + alpha^2 B'B, M = alpha^2 A'A, W = alpha^2 B'A.
-    count : int
-        Number of motions.
-    """
-
+    #: (4, 4): as below eq. 9: S = A'A + alpha^2 B'B, M = alpha^2 A'A, W = alpha^2 B'A.
     S: Array
     M: Array
     W: Array
-    count: int
+    count: int  #: Number of motions
 
     @cached_property
     def spectrum(self) -> tuple[Array, Array]:

@@ -102,36 +102,17 @@ ScaleMode = Literal["known", "unknown"]
 
 @dataclass(frozen=True)
 class Request:
-    """A problem C_i X = X H_i and how to solve it.
+    """A problem C_i X = X H_i and how to solve it."""
 
-    Attributes
-    ----------
-    motions : Motions
-        C and H, checked.
-    cost : DualQuaternionCost
-        Eq. 8 with alpha, with weights or covariances, and with the prior (eqs. 26-29) if there is one.
-    alpha : float
-        Weight of translations relative to rotations, 1/m.
-    weights : (N,) array or None
-        Factor of each motion's terms.
-    covariances : (N, 8, 8) or (1, 8, 8) array or None
-        Of the residuals (A q, B q + A q').
-    prior : DualQuaternionPrior or None
-        A pose known beforehand.
-    scale : "known" or "unknown"
-        Whether t_C is in metres.
-    rng : numpy.random.Generator, int or None
-        For methods with a random start: ``numpy.random.default_rng(rng)``.
-    """
-
-    motions: Motions
+    motions: Motions  #: C and H, checked
+    #: Eq. 8 with alpha, with weights or covariances, and with the prior (eqs. 26-29) if there is one.
     cost: DualQuaternionCost
-    alpha: float
-    weights: Array | None
-    covariances: Array | None
-    prior: DualQuaternionPrior | None
-    scale: ScaleMode
-    rng: np.random.Generator | int | None
+    alpha: float  #: Weight of translations relative to rotations, 1/m
+    weights: Array | None  #: (N,): factor of each motion's terms
+    covariances: Array | None  #: (N, 8, 8) or (1, 8, 8): of the residuals (A q, B q + A q')
+    prior: DualQuaternionPrior | None  #: A pose known beforehand
+    scale: ScaleMode  #: Whether t_C is in metres
+    rng: np.random.Generator | int | None  #: For methods with a random start: ``numpy.random.default_rng(rng)``.
 
 
 #: Information below this part of the largest is rounding error.

@@ -50,20 +50,13 @@ LomWeights = Literal["paper", "matched"]
 
 @dataclass(frozen=True)
 class LomOptions:
-    """Weights and the step limit.
+    """Weights and the step limit."""
 
-    Attributes
-    ----------
-    weights : "paper", "matched" or (float, float)
-        "paper": sigma_R = 1/sqrt(kappa), as in Appendix C. "matched": 1/sqrt(2 kappa), the standard deviation about
-        each axis that belongs to kappa. Both use each measurement's own sigma. Two numbers: (sigma_R rad, sigma_t m)
-        of all measurements.
-    max_iterations : int
-        1000, as in Section 8; from a start near the answer ten suffice.
-    """
-
+    #: "paper": sigma_R = 1/sqrt(kappa), as in Appendix C. "matched": 1/sqrt(2 kappa), the standard deviation about each
+    #: axis that belongs to kappa. Both use each measurement's own sigma. Two numbers: (sigma_R rad, sigma_t m) of all
+    #: measurements.
     weights: LomWeights | tuple[float, float] = "paper"
-    max_iterations: int = 1000
+    max_iterations: int = 1000  #: 1000, as in Section 8; from a start near the answer ten suffice
 
     def __post_init__(self) -> None:
         if isinstance(self.weights, tuple):
@@ -79,27 +72,17 @@ class LomOptions:
 
 @dataclass(frozen=True)
 class LomSolution:
-    """Where the local solver stopped; it proves nothing.
+    """Where the local solver stopped; it proves nothing."""
 
-    Attributes
-    ----------
-    X, Y : dict of str to gtsam.Pose3
-        T_targetcarrier_target by target, T_sensorcarrier_sensor by sensor; metres, divided by the scale.
-    scale : float
-        alpha, t_B = alpha * (true length). A negative scale is a local minimum far from the answer: the poses are
-        wrong.
-    initial_cost, cost : float
-        Half of eq. 78, before and after.
-    iterations : int
-        Levenberg-Marquardt steps.
-    """
-
+    #: T_targetcarrier_target by target, T_sensorcarrier_sensor by sensor; metres, divided by the scale
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
+    #: alpha, t_B = alpha * (true length). A negative scale is a local minimum far from the answer: the poses are wrong.
     scale: float
+    #: Half of eq. 78, before and after.
     initial_cost: float
     cost: float
-    iterations: int
+    iterations: int  #: Levenberg-Marquardt steps
 
 
 def local_on_manifold(

@@ -52,24 +52,12 @@ class Outcome(Generic[X]):
 
 @dataclass(frozen=True)
 class Proof:
-    """What a method proves of its own cost.
+    """What a method proves of its own cost."""
 
-    Attributes
-    ----------
-    cost : float
-        The answer's cost.
-    cost_name : str
-        The name of this cost, which may differ from ``Estimate.cost_name``.
-    lower_bound : float
-        No answer costs less.
-    is_optimal : bool
-        Whether the gap is closed, up to rounding.
-    """
-
-    cost: float
-    cost_name: str
-    lower_bound: float
-    is_optimal: bool
+    cost: float  #: The answer's cost
+    cost_name: str  #: The name of this cost, which may differ from ``Estimate.cost_name``.
+    lower_bound: float  #: No answer costs less
+    is_optimal: bool  #: Whether the gap is closed, up to rounding
 
     @property
     def gap(self) -> float:
@@ -79,50 +67,23 @@ class Proof:
 
 @dataclass(frozen=True)
 class Estimate(Generic[X]):
-    """A method's answer; all methods' answers are evaluated alike.
+    """A method's answer; all methods' answers are evaluated alike."""
 
-    Attributes
-    ----------
-    method : str
-        The method's name.
-    X : dict of str to gtsam.Pose3, or gtsam.Pose3
-        T_targetcarrier_target of each target, metres. For A X = X B it is one pose: T_c_h with C_i X = X H_i.
-    Y : dict of str to gtsam.Pose3
-        T_sensorcarrier_sensor of each sensor, metres; empty for A X = X B.
-    scale : float or dict of str to float
-        t_B (t_C of C X = X H) = scale * (true length); 1 when known.
-    cost : float
-        From ``methods.run``: J of the certified objective (eq. 18), whatever cost the method itself minimised. From
-        ``solve_hand_eye``: the cost that ``cost_name`` names.
-    proof : Proof or None
-        None where the method proves nothing.
-    free_directions : tuple of FreeDirection
-        What the measurements leave undetermined, by this answer's residuals.
-    seconds : float
-        The method's own time; from ``solve_hand_eye`` with checks and evaluation.
-    residuals : dict of (target, sensor) to Residual
-        Empty for A X = X B.
-    alpha : float or None
-        1/m, the weight of translations in A X = X B, given or estimated; None for A X = Y B.
-    starts_from : str or None
-        What an iteration started from; None for closed forms and global methods.
-    notes : tuple of str
-        The method's remarks on this answer.
-    """
-
-    method: str
-    X: X
-    Y: dict[str, gtsam.Pose3]
-    scale: float | dict[str, float]
+    method: str  #: The method's name
+    X: X  #: T_targetcarrier_target of each target, metres. For A X = X B it is one pose: T_c_h with C_i X = X H_i.
+    Y: dict[str, gtsam.Pose3]  #: T_sensorcarrier_sensor of each sensor, metres; empty for A X = X B
+    scale: float | dict[str, float]  #: t_B (t_C of C X = X H) = scale * (true length); 1 when known
+    #: From ``methods.run``: J of the certified objective (eq. 18), whatever cost the method itself minimised. From
+    #: ``solve_hand_eye``: the cost that ``cost_name`` names.
     cost: float
     cost_name: str
-    proof: Proof | None
-    free_directions: tuple[FreeDirection, ...]
-    seconds: float
-    residuals: dict[Pair, Residual] = field(default_factory=dict)
-    alpha: float | None = None
-    starts_from: str | None = None
-    notes: tuple[str, ...] = ()
+    proof: Proof | None  #: None where the method proves nothing
+    free_directions: tuple[FreeDirection, ...]  #: What the measurements leave undetermined, by this answer's residuals
+    seconds: float  #: The method's own time; from ``solve_hand_eye`` with checks and evaluation
+    residuals: dict[Pair, Residual] = field(default_factory=dict)  #: Empty for A X = X B
+    alpha: float | None = None  #: 1/m, the weight of translations in A X = X B, given or estimated; None for A X = Y B
+    starts_from: str | None = None  #: What an iteration started from; None for closed forms and global methods
+    notes: tuple[str, ...] = ()  #: The method's remarks on this answer
 
     @property
     def lower_bound(self) -> float | None:
@@ -164,77 +125,41 @@ class Takes(Enum):
 
 @dataclass(frozen=True)
 class Properties:
-    """A method's line in the RWHEC paper's Table 1.
+    """A method's line in the RWHEC paper's Table 1."""
 
-    Attributes
-    ----------
-    representation : str
-        How the method writes a pose.
-    joint : bool
-        Rotations and translations are estimated together: measured translations affect the rotations found.
-    probabilistic : bool
-        The method has a noise model.
-    certifiable : bool
-        The answer comes with a proof of optimality for the method's own cost.
-    multiple : "", "Xs or Ys", "Xs" or "Xs and Ys"
-        The frames that the method solves for at once.
-    monocular : bool
-        The method estimates an unknown scale that all targets share.
-    """
-
-    representation: str
+    representation: str  #: How the method writes a pose
+    #: Rotations and translations are estimated together: measured translations affect the rotations found
     joint: bool = True
-    probabilistic: bool = False
-    certifiable: bool = False
-    multiple: Multiple = ""
-    monocular: bool = False
+    probabilistic: bool = False  #: The method has a noise model
+    certifiable: bool = False  #: The answer comes with a proof of optimality for the method's own cost
+    multiple: Multiple = ""  #: The frames that the method solves for at once
+    monocular: bool = False  #: The method estimates an unknown scale that all targets share
 
 
 @dataclass(frozen=True)
 class Method(Generic[Arguments]):
-    """One published method.
+    """One published method."""
 
-    Attributes
-    ----------
-    name : str
-        Its key in ``METHODS``.
-    function : callable
-        Makes an ``Outcome`` from (problem, options) for A X = Y B, from a ``Request`` for A X = X B.
-    source : str
-        The publication.
-    assumes : str
-        What must hold for a correct answer, and where the method fails.
-    check : callable, optional
-        Raises a ``RwhecError`` for a problem that the method cannot solve for another reason.
-    """
-
-    name: str
+    name: str  #: Its key in ``METHODS``
+    #: Makes an ``Outcome`` from (problem, options) for A X = Y B, from a ``Request`` for A X = X B
     function: Callable[Arguments, Outcome[Any]]
     properties: Properties
-    source: str
-    assumes: str
+    source: str  #: The publication
+    assumes: str  #: What must hold for a correct answer, and where the method fails
     takes: frozenset[Takes] = frozenset()
+    #: Raises a ``RwhecError`` for a problem that the method cannot solve for another reason
     check: Callable[[Problem], None] | None = None
 
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """Options of all methods; a method ignores the options that it does not need.
+    """Options of all methods; a method ignores the options that it does not need."""
 
-    Attributes
-    ----------
-    start : (X, Y, scale), optional
-        Poses by name, metres, and alpha, for methods that descend from a start. Left out, they start from a closed
-        form's answer; ``Estimate.starts_from`` names the closed form.
-    seed : int
-        Seed of random numbers.
-    max_iterations : int
-        Most iterations of methods that iterate.
-    """
-
+    #: Poses by name, metres, and alpha, for methods that descend from a start. Left out, they start from a closed
+    #: form's answer; ``Estimate.starts_from`` names the closed form.
     start: tuple[Poses, Poses, float] | None = None
-    seed: int = 0
-    max_iterations: int = 1000
+    seed: int = 0  #: Seed of random numbers
+    max_iterations: int = 1000  #: Most iterations of methods that iterate
 
     def __post_init__(self) -> None:
         start = self.start

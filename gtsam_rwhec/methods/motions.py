@@ -172,19 +172,13 @@ STILL = 1e-14
 
 @dataclass(frozen=True)
 class Motions:
-    """Motions of two rigidly joined frames, C_i X = X H_i (eq. 3).
+    """Motions of two rigidly joined frames, C_i X = X H_i (eq. 3)."""
 
-    Attributes
-    ----------
-    C, H : (N, 4, 4) arrays
-        C_i = T_cbefore_cafter and H_i = T_hbefore_hafter of the same move, metres; X = T_c_h.
-    rows : (14, N) array
-        With v the vector part and w the scalar part: v_C + v_H (3), v_C - v_H (3), w_C - w_H, then the same of the
-        dual parts. A_i and B_i (below eq. 6) depend on nothing else. The signs of q_C and q_H agree (``signs``).
-    """
-
+    #: (N, 4, 4): C_i = T_cbefore_cafter and H_i = T_hbefore_hafter of the same move, metres; X = T_c_h
     C: Array
     H: Array
+    #: (14, N): with v the vector part and w the scalar part: v_C + v_H (3), v_C - v_H (3), w_C - w_H, then the same of
+    #: the dual parts. A_i and B_i (below eq. 6) depend on nothing else. The signs of q_C and q_H agree (``signs``).
     rows: Array = field(repr=False)
 
     def __len__(self) -> int:

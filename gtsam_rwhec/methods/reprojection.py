@@ -54,32 +54,21 @@ Descend = Callable[[Corners, Array, int], Minimum]
 
 @dataclass(frozen=True)
 class ReprojectionAnswer:
-    """A method's answer.
-
-    Attributes
-    ----------
-    X, Y : dict of str to gtsam.Pose3
-        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
-    cost : float
-        The method's own, over corner_px^2, halved; of ``refine_corners`` with a noise of A, that of the graph.
-    reprojection_cost : float
-        Half the sum of squared reprojection errors by the measured A, over corner_px^2: the same for all methods.
-        Infinite where a corner that was seen is behind its camera.
-    rms_px : float
-        Root mean square length of these errors, pixels.
-    seconds : float
-        Of the descent, without the start.
-    """
+    """A method's answer."""
 
     method: str
+    #: T_targetcarrier_target and T_sensorcarrier_sensor, metres
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
+    #: The method's own, over corner_px^2, halved; of ``refine_corners`` with a noise of A, that of the graph
     cost: float
+    #: Half the sum of squared reprojection errors by the measured A, over corner_px^2: the same for all methods.
+    #: Infinite where a corner that was seen is behind its camera.
     reprojection_cost: float
-    rms_px: float
+    rms_px: float  #: Root mean square length of these errors, pixels
     iterations: int
     converged: bool
-    seconds: float
+    seconds: float  #: Of the descent, without the start
     starts_from: str
 
 
