@@ -6,15 +6,17 @@ twice, imagesize 2.0.1 takes the last width and OpenCV the first. Of 771 damaged
 """
 
 from __future__ import annotations
+
 import struct
 from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
 from gtsam_rwhec.cameras.camera import MOST_PIXELS
 from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.files.budgets import SCANS
-from gtsam_rwhec.files.budgets import pixel_budget
+from gtsam_rwhec.files.budgets import SCANS, pixel_budget
 from gtsam_rwhec.logs.records import ImageRecord
 
 #: Files begin with these bytes.
