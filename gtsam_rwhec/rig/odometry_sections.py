@@ -11,7 +11,18 @@ from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandle
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError
 
 from gtsam_rwhec.files.yaml_lines import KeyPath, shown
-from gtsam_rwhec.rig.section_types import FramePair, Name, Positive, Section, Text, TimeOffset, list_of, one_of
+from gtsam_rwhec.rig.section_types import (
+    FramePair,
+    Name,
+    Positive,
+    Section,
+    Text,
+    TimeOffset,
+    list_of,
+    needed,
+    one_of,
+    optional,
+)
 from gtsam_rwhec.rig.sections import Carriers
 
 
@@ -29,15 +40,13 @@ def _none_for_estimate(given: Any) -> Any:
 class OdometryNoiseSection(Section):
     """How the errors of an odometry grow: as a random walk, whose steps are independent of one another."""
 
-    rotation_deg_per_sqrt_s: Positive = Field(
-        description="standard deviation about each axis after one second; after t seconds it is sqrt(t) times this",
-        examples=[0.05],
-        json_schema_extra={"unit": "degrees/sqrt(s)"},
+    rotation_deg_per_sqrt_s: Positive = needed(
+        "standard deviation about each axis after one second; after t seconds it is sqrt(t) times this",
+        0.05,
+        unit="degrees/sqrt(s)",
     )
-    translation_mm_per_sqrt_s: Positive = Field(
-        description="standard deviation along each axis after one second",
-        examples=[4.0],
-        json_schema_extra={"unit": "mm/sqrt(s)"},
+    translation_mm_per_sqrt_s: Positive = needed(
+        "standard deviation along each axis after one second", 4.0, unit="mm/sqrt(s)"
     )
 
 
@@ -46,45 +55,37 @@ class OdometrySource(Section):
 
     model_config = one_of("topic", "tf", "file")
 
-    topic: Text | None = Field(
-        default=None, description="a topic of Odometry, PoseStamped or PoseInFrame", examples=["/lidar_front/odom"]
+    topic: Text | None = optional("a topic of Odometry, PoseStamped or PoseInFrame", "/lidar_front/odom")
+    tf: FramePair | None = optional("two frames of tf, [start, sensor]", ["lidar_odom", "lidar_link"])
+    file: Text | None = optional(
+        "a file of poses (TUM: t x y z qx qy qz qw; CSV), in the folder that is given as the log, or beside the "
+        "rig file",
+        "lidar_front.tum",
     )
-    tf: FramePair | None = Field(
-        default=None, description="two frames of tf, [start, sensor]", examples=[["lidar_odom", "lidar_link"]]
-    )
-    file: Text | None = Field(
-        default=None,
-        description="a file of poses (TUM: t x y z qx qy qz qw; CSV), in the folder that is given as the log, or "
-        "beside the rig file",
-        examples=["lidar_front.tum"],
-    )
-    scale: Literal["known", "estimate"] = Field(
-        default="known",
-        description="known: lengths are metres. estimate: they are metres times one unknown factor, as those of visual "
+    scale: Literal["known", "estimate"] = optional(
+        "known: lengths are metres. estimate: they are metres times one unknown factor, as those of visual "
         "odometry with one camera",
-        examples=["estimate"],
+        "estimate",
+        default="known",
     )
-    noise: Annotated[OdometryNoiseSection | None, BeforeValidator(_none_for_estimate), OrEstimate()] = Field(
-        default=None,
-        description="how its errors grow; without it, or with the word estimate, from the data",
-        examples=[{"rotation_deg_per_sqrt_s": 0.05, "translation_mm_per_sqrt_s": 4.0}],
+    noise: Annotated[OdometryNoiseSection | None, BeforeValidator(_none_for_estimate), OrEstimate()] = optional(
+        "how its errors grow; without it, or with the word estimate, from the data",
+        {"rotation_deg_per_sqrt_s": 0.05, "translation_mm_per_sqrt_s": 4.0},
     )
-    max_gap_s: Positive = Field(
-        default=0.5,
-        description="poses further apart in time than this are of two pieces: no motion is taken over the gap",
-        examples=[0.2],
+    max_gap_s: Positive = optional(
+        "poses further apart in time than this are of two pieces: no motion is taken over the gap", 0.2, default=0.5
     )
-    max_turn_deg_s: Positive = Field(
+    max_turn_deg_s: Positive = optional(
+        "a step between two poses that turns faster is lost tracking (the DQ paper's 11.5 degrees a frame, at 30 "
+        "frames a second)",
+        120.0,
         default=345.0,
-        description="a step between two poses that turns faster is lost tracking (the DQ paper's 11.5 degrees a frame, "
-        "at 30 frames a second)",
-        examples=[120.0],
     )
-    max_speed_m_s: Positive = Field(
+    max_speed_m_s: Positive = optional(
+        "a step between two poses that is faster is lost tracking, in the odometry's own lengths; the DQ paper "
+        "has 0.1 m a frame, for sensors that are carried",
+        3.0,
         default=70.0,
-        description="a step between two poses that is faster is lost tracking, in the odometry's own lengths; the DQ "
-        "paper has 0.1 m a frame, for sensors that are carried",
-        examples=[3.0],
     )
 
     @model_validator(mode="after")
@@ -108,21 +109,17 @@ class OdometrySource(Section):
 class OdometrySensor(Section):
     """A sensor that knows only its own motion, as a LiDAR, a camera with visual odometry, wheels, an INS."""
 
-    odometry: OdometrySource = Field(
-        description="{topic: ...}, {tf: [start, sensor]} or {file: ...}, and what is known of these poses",
-        examples=[{"topic": "/lidar_front/odom"}],
+    odometry: OdometrySource = needed(
+        "{topic: ...}, {tf: [start, sensor]} or {file: ...}, and what is known of these poses",
+        {"topic": "/lidar_front/odom"},
     )
-    time_offset: TimeOffset = Field(
+    time_offset: TimeOffset = optional(
+        "the sensor's stamp t is t + offset of the carriers, or of the reference; or the word estimate",
+        "estimate",
         default=0.0,
-        description="the sensor's stamp t is t + offset of the carriers, or of the reference; or the word estimate",
-        examples=["estimate"],
-        json_schema_extra={"unit": "s"},
+        unit="s",
     )
-    frame: Name | None = Field(
-        default=None,
-        description="its frame in the results; without it the sensor's name",
-        examples=["lidar_front_link"],
-    )
+    frame: Name | None = optional("its frame in the results; without it the sensor's name", "lidar_front_link")
 
 
 def _unit(given: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -143,58 +140,55 @@ SensorPair: TypeAlias = Annotated[tuple[Name, Name], list_of(2, "two sensors, [o
 class GivenGround(Section):
     """The plane that the vehicle drives on, in the axes of the reference."""
 
-    up: Direction = Field(description="the direction away from the ground, of any length", examples=[[0.0, 0.0, 1.0]])
-    below_m: float = Field(description="how far the plane is below the reference's origin", examples=[0.52])
-    sigma_deg: Positive = Field(default=0.5, description="standard deviation of the direction", examples=[0.2])
-    sigma_mm: Positive = Field(default=5.0, description="standard deviation of below_m", examples=[2.0])
+    up: Direction = needed("the direction away from the ground, of any length", [0.0, 0.0, 1.0])
+    below_m: float = needed("how far the plane is below the reference's origin", 0.52)
+    sigma_deg: Positive = optional("standard deviation of the direction", 0.2, default=0.5)
+    sigma_mm: Positive = optional("standard deviation of below_m", 2.0, default=5.0)
 
 
 class GivenDirection(Section):
     """A direction that is known in the axes of the reference: of an axis of a sensor, or of the line to its origin."""
 
-    sensor: Name = Field(description="the sensor", examples=["camera_left"])
-    of: Literal["x", "y", "z", "lever_arm"] = Field(
-        description="what has the direction: an axis of the sensor, or (lever_arm) the line from the reference's "
-        "origin to the sensor's",
-        examples=["z"],
+    sensor: Name = needed("the sensor", "camera_left")
+    of: Literal["x", "y", "z", "lever_arm"] = needed(
+        "what has the direction: an axis of the sensor, or (lever_arm) the line from the reference's origin to "
+        "the sensor's",
+        "z",
     )
-    in_reference: Direction = Field(
-        description="its direction in the axes of the reference, of any length", examples=[[1.0, 0.0, 0.0]]
-    )
-    sigma_deg: Positive = Field(default=0.5, description="standard deviation of the direction", examples=[0.2])
+    in_reference: Direction = needed("its direction in the axes of the reference, of any length", [1.0, 0.0, 0.0])
+    sigma_deg: Positive = optional("standard deviation of the direction", 0.2, default=0.5)
 
 
 class GivenDistance(Section):
     """A distance between the origins of two sensors, as a tape measure says it."""
 
-    between: SensorPair = Field(description="the two sensors", examples=[["lidar_front", "lidar_rear"]])
-    distance_m: Annotated[float, Field(gt=0.0, lt=1000.0)] = Field(description="the distance", examples=[2.41])
-    sigma_mm: Positive = Field(default=5.0, description="standard deviation of the distance", examples=[3.0])
+    between: SensorPair = needed("the two sensors", ["lidar_front", "lidar_rear"])
+    distance_m: Annotated[float, Field(gt=0.0, lt=1000.0)] = needed("the distance", 2.41)
+    sigma_mm: Positive = optional("standard deviation of the distance", 3.0, default=5.0)
 
 
 class GivenSection(Section):
     """What a person measured, where the motion does not tell: a vehicle in a plane does not tell heights."""
 
-    heights_m: dict[Name, float] = Field(
+    heights_m: dict[Name, float] = optional(
+        "heights of sensors' origins above the ground; the reference needs one too, or ground",
+        {"lidar_front": 0.52, "lidar_rear": 0.71},
         default={},
-        description="heights of sensors' origins above the ground; the reference needs one too, or ground",
-        examples=[{"lidar_front": 0.52, "lidar_rear": 0.71}],
     )
-    height_sigma_mm: Positive = Field(default=5.0, description="standard deviation of each height", examples=[2.0])
-    ground: GivenGround | None = Field(
-        default=None,
-        description="the ground's plane; without it heights are along the axis that the vehicle turned about",
-        examples=[{"up": [0, 0, 1], "below_m": 0.52}],
+    height_sigma_mm: Positive = optional("standard deviation of each height", 2.0, default=5.0)
+    ground: GivenGround | None = optional(
+        "the ground's plane; without it heights are along the axis that the vehicle turned about",
+        {"up": [0, 0, 1], "below_m": 0.52},
     )
-    directions: Annotated[tuple[GivenDirection, ...], Field(max_length=1000)] = Field(
+    directions: Annotated[tuple[GivenDirection, ...], Field(max_length=1000)] = optional(
+        "directions that are known in the axes of the reference",
+        [{"sensor": "camera_left", "of": "z", "in_reference": [1, 0, 0]}],
         default=(),
-        description="directions that are known in the axes of the reference",
-        examples=[[{"sensor": "camera_left", "of": "z", "in_reference": [1, 0, 0]}]],
     )
-    distances: Annotated[tuple[GivenDistance, ...], Field(max_length=1000)] = Field(
+    distances: Annotated[tuple[GivenDistance, ...], Field(max_length=1000)] = optional(
+        "measured distances between sensors, used in the refinement",
+        [{"between": ["lidar_front", "lidar_rear"], "distance_m": 2.41}],
         default=(),
-        description="measured distances between sensors, used in the refinement",
-        examples=[[{"between": ["lidar_front", "lidar_rear"], "distance_m": 2.41}]],
     )
 
 

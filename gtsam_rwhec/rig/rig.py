@@ -17,7 +17,7 @@ from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.errors import OptionError, TargetError
 from gtsam_rwhec.files.yaml_lines import KeyPath, dotted, suggestion
 from gtsam_rwhec.rig.odometry_sections import GivenSection, OdometrySensor, odometry_contradictions, with_what_follows
-from gtsam_rwhec.rig.section_types import Name, Section
+from gtsam_rwhec.rig.section_types import Name, Section, needed, optional
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 
@@ -43,45 +43,37 @@ class RigFile(Section):
 
     model_config = ConfigDict(json_schema_extra=_may_leave_out)
 
-    carriers: Carriers = Field(description="the frames that carry the sensors and the targets, and their poses")
+    carriers: Carriers = needed("the frames that carry the sensors and the targets, and their poses")
     all_sensors: dict[Name, AnySensor] = Field(
         alias="sensors",
         description="by name, each with images or detections of targets, or with the odometry of its own motion",
     )
-    targets: dict[Name, TargetSection] = Field(
-        description="by name, each with type and sizes; sensors that all have odometry need none"
+    targets: dict[Name, TargetSection] = needed(
+        "by name, each with type and sizes; sensors that all have odometry need none"
     )
-    sizes: Literal["known", "check", "estimate"] = Field(
-        default="check",
-        description="known: the targets' sizes are right. check: they are taken as stated if the motion agrees, else "
+    sizes: Literal["known", "check", "estimate"] = optional(
+        "known: the targets' sizes are right. check: they are taken as stated if the motion agrees, else "
         "estimated and named. estimate: from the motion",
-        examples=["known"],
+        "known",
+        default="check",
     )
     noise: Annotated[
         Annotated[DetectionNoise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
         Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
-    ] = Field(
-        default="estimate",
-        description="of the detections: the word estimate, from the residuals, or a section",
-        examples=[{"corner_px": 0.1}],
+    ] = optional(
+        "of the detections: the word estimate, from the residuals, or a section", {"corner_px": 0.1}, default="estimate"
     )
-    detection: dict[str, Any] = Field(
-        default={}, description="limits beyond which a detection is not used", examples=[{"min_side_px": 20}]
+    detection: dict[str, Any] = optional("limits beyond which a detection is not used", {"min_side_px": 20}, default={})
+    cleaning: Cleaning = optional(
+        "which measurements are left out before solving", {"max_rotation_deg_s": 60.0}, default=Cleaning()
     )
-    cleaning: Cleaning = Field(
-        default=Cleaning(),
-        description="which measurements are left out before solving",
-        examples=[{"max_rotation_deg_s": 60.0}],
+    reference: Name | None = optional(
+        "in place of carriers: the sensor with odometry in whose frame all others are calibrated", "lidar_front"
     )
-    reference: Name | None = Field(
-        default=None,
-        description="in place of carriers: the sensor with odometry in whose frame all others are calibrated",
-        examples=["lidar_front"],
-    )
-    given: GivenSection = Field(
+    given: GivenSection = optional(
+        "what a person measured where the motion does not tell: heights, directions, distances",
+        {"heights_m": {"lidar_front": 0.52, "lidar_rear": 0.71}},
         default=GivenSection(),
-        description="what a person measured where the motion does not tell: heights, directions, distances",
-        examples=[{"heights_m": {"lidar_front": 0.52, "lidar_rear": 0.71}}],
     )
 
     @cached_property

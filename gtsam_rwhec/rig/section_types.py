@@ -6,7 +6,7 @@ import json
 import re
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema
 
@@ -166,3 +166,14 @@ def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...
 def keys_of(section: type[BaseModel]) -> dict[str, FieldInfo]:
     """The fields of a section by the keys that rig files have for them."""
     return {field.alias or name: field for name, field in section.model_fields.items()}
+
+
+def needed(words: str, *examples: Any, unit: str = "", **limits: Any) -> Any:
+    """A key that must be given: what it is, examples, and its unit where the end of its name does not say it."""
+    return optional(words, *examples, default=..., unit=unit, **limits)
+
+
+def optional(words: str, *examples: Any, default: Any = None, unit: str = "", **limits: Any) -> Any:
+    """A key that may be left out: as `needed`, with its default."""
+    said: Any = {"unit": unit} if unit else None
+    return Field(default, description=words, examples=[*examples] or None, json_schema_extra=said, **limits)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, model_validator
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import Lens
@@ -27,7 +27,9 @@ from gtsam_rwhec.rig.section_types import (
     Text,
     TimeOffset,
     list_of,
+    needed,
     one_of,
+    optional,
 )
 
 #: REP 103: a link's x is forward, y left, z up; an optical frame's z is forward, x right, y down. T_link_optical's R.
@@ -70,61 +72,39 @@ class Intrinsics(Section):
         together=(("width", "K"), ("height", "K"), ("model", "K"), ("D", "K")),
     )  # fmt: skip
 
-    topic: Text | None = Field(
-        default=None, description="a topic of CameraInfo or CameraCalibration", examples=["/cam_left/camera_info"]
+    topic: Text | None = optional("a topic of CameraInfo or CameraCalibration", "/cam_left/camera_info")
+    kalibr: Text | None = optional("Kalibr's camchain: the same as file", "camchain.yaml")
+    camera: Text | None = optional(
+        "with a file of several cameras: the one; without it the one of the sensor's name", "cam0"
     )
-    kalibr: Text | None = Field(
-        default=None, description="Kalibr's camchain: the same as file", examples=["camchain.yaml"]
+    file: Text | None = optional(
+        "a file of Kalibr, COLMAP, ROS, OpenCV or plain numbers; intrinsics: FILE is the same in short", "left.yaml"
     )
-    camera: Text | None = Field(
-        default=None,
-        description="with a file of several cameras: the one; without it the one of the sensor's name",
-        examples=["cam0"],
+    model: str | None = optional(
+        "with K: what D is: pinhole (no D), radtan (OpenCV, plumb_bob), equidistant (fisheye) or unified (omni, D"
+        " is [xi, k1, k2, p1, p2])",
+        "radtan",
     )
-    file: Text | None = Field(
-        default=None,
-        description="a file of Kalibr, COLMAP, ROS, OpenCV or plain numbers; intrinsics: FILE is the same in short",
-        examples=["left.yaml"],
+    width: int | None = optional("with K, in place of size", 640, unit="pixels")
+    height: int | None = optional("with K, in place of size", 480, unit="pixels")
+    size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = optional(
+        "[width, height], with K or with a file that lacks it", [640, 480], unit="pixels"
     )
-    model: str | None = Field(
-        default=None,
-        description="with K: what D is: pinhole (no D), radtan (OpenCV, plumb_bob), equidistant (fisheye) or "
-        "unified (omni, D is [xi, k1, k2, p1, p2])",
-        examples=["radtan"],
+    K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = optional(
+        "[fx, fy, cx, cy]; the middle of the first pixel is at 0, 0", [550.0, 550.0, 320.0, 240.0], unit="pixels"
     )
-    width: int | None = Field(
-        default=None, description="with K, in place of size", examples=[640], json_schema_extra={"unit": "pixels"}
+    D: tuple[float, ...] | None = optional("with model: coefficients in OpenCV's order", [-0.1, 0.02, 0.0, 0.0])
+    estimate: Lens | None = optional(
+        "no calibration is there: from the images, with this lens model (any: the one that fits); intrinsics: "
+        "estimate is {estimate: any} in short. It takes images of a board at different tilts",
+        "equidistant",
     )
-    height: int | None = Field(
-        default=None, description="with K, in place of size", examples=[480], json_schema_extra={"unit": "pixels"}
-    )
-    size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = Field(
-        default=None,
-        description="[width, height], with K or with a file that lacks it",
-        examples=[[640, 480]],
-        json_schema_extra={"unit": "pixels"},
-    )
-    K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = Field(
-        default=None,
-        description="[fx, fy, cx, cy]; the middle of the first pixel is at 0, 0",
-        examples=[[550.0, 550.0, 320.0, 240.0]],
-        json_schema_extra={"unit": "pixels"},
-    )
-    D: tuple[float, ...] | None = Field(
-        default=None, description="with model: coefficients in OpenCV's order", examples=[[-0.1, 0.02, 0.0, 0.0]]
-    )
-    estimate: Lens | None = Field(
-        default=None,
-        description="no calibration is there: from the images, with this lens model (any: the one that fits); "
-        "intrinsics: estimate is {estimate: any} in short. It takes images of a board at different tilts",
-        examples=["equidistant"],
-    )
-    stated: Literal["calibration", "nominal"] | None = Field(
-        default=None,
-        description="where they come from, however they are given: calibration (of this camera, with this lens and "
-        "focus: right to 0.3 % of the focal length and 3 pixels of the centre) or nominal (a data sheet, a driver's "
-        "default, another camera of the kind: right to 3 %, and to 30 pixels or 2 % of the width); nominal without it",
-        examples=["calibration"],
+    stated: Literal["calibration", "nominal"] | None = optional(
+        "where they come from, however they are given: calibration (of this camera, with this lens and focus: "
+        "right to 0.3 % of the focal length and 3 pixels of the centre) or nominal (a data sheet, a driver's "
+        "default, another camera of the kind: right to 3 %, and to 30 pixels or 2 % of the width); nominal "
+        "without it",
+        "calibration",
     )
 
     @property
@@ -182,8 +162,8 @@ IntrinsicsOrText: TypeAlias = Annotated[
 class PoseNoise(Section):
     """Noise of poses: standard deviations about and along each axis."""
 
-    rotation_deg: Positive = Field(description="standard deviation about each axis", examples=[0.02])
-    translation_mm: Positive = Field(description="standard deviation along each axis", examples=[0.2])
+    rotation_deg: Positive = needed("standard deviation about each axis", 0.02)
+    translation_mm: Positive = needed("standard deviation along each axis", 0.2)
 
 
 class PoseSource(Section):
@@ -200,52 +180,29 @@ class PoseSource(Section):
         ),
     )  # fmt: skip
 
-    tf: FramePair | None = Field(
-        default=None,
-        description="two frames of tf, [parent, child], also over several links",
-        examples=[["base", "hand"]],
+    tf: FramePair | None = optional("two frames of tf, [parent, child], also over several links", ["base", "hand"])
+    topic: Text | None = optional(
+        "a topic of PoseStamped, Odometry or PoseInFrame; with parent and child", "/vicon/hand/pose"
     )
-    topic: Text | None = Field(
-        default=None,
-        description="a topic of PoseStamped, Odometry or PoseInFrame; with parent and child",
-        examples=["/vicon/hand/pose"],
+    parent: Name | None = optional("with topic: the frame that the poses are in", "world")
+    child: Name | None = optional("with topic: the frame that the poses are of", "hand")
+    frames: FramePair | None = optional(
+        "of poses in files beside images, [parent, child]: the files have T_parent_child", ["base", "hand"]
     )
-    parent: Name | None = Field(
-        default=None, description="with topic: the frame that the poses are in", examples=["world"]
+    quaternion: Literal["xyzw", "wxyz"] | None = optional(
+        "with frames: the order of quaternions; without it the files' names of columns or keys tell, else xyzw", "wxyz"
     )
-    child: Name | None = Field(
-        default=None, description="with topic: the frame that the poses are of", examples=["hand"]
+    euler: EulerAxes | None = optional(
+        "with frames: axes in the order of the turns, capitals about turning axes, small letters about fixed "
+        "ones; or rotation_vector. Angles in files are refused without it",
+        "ZYX",
     )
-    frames: FramePair | None = Field(
-        default=None,
-        description="of poses in files beside images, [parent, child]: the files have T_parent_child",
-        examples=[["base", "hand"]],
+    angles: Literal["degrees", "radians"] | None = optional("with euler: the unit of the files' angles", "degrees")
+    length: Literal["m", "mm"] | None = optional(
+        "with frames: the unit of the files' positions; without it names of columns tell, else m", "mm"
     )
-    quaternion: Literal["xyzw", "wxyz"] | None = Field(
-        default=None,
-        description="with frames: the order of quaternions; without it the files' names of columns or keys "
-        "tell, else xyzw",
-        examples=["wxyz"],
-    )
-    euler: EulerAxes | None = Field(
-        default=None,
-        description="with frames: axes in the order of the turns, capitals about turning axes, small letters "
-        "about fixed ones; or rotation_vector. Angles in files are refused without it",
-        examples=["ZYX"],
-    )
-    angles: Literal["degrees", "radians"] | None = Field(
-        default=None, description="with euler: the unit of the files' angles", examples=["degrees"]
-    )
-    length: Literal["m", "mm"] | None = Field(
-        default=None,
-        description="with frames: the unit of the files' positions; without it names of columns tell, else m",
-        examples=["mm"],
-    )
-    one_instant: bool | None = Field(
-        default=None,
-        description="with frames, images taken at rest: whether images of one name, of different cameras, are "
-        "of one instant",
-        examples=[True],
+    one_instant: bool | None = optional(
+        "with frames, images taken at rest: whether images of one name, of different cameras, are of one instant", True
     )
 
     @property
@@ -273,43 +230,39 @@ class PoseSource(Section):
 class Carriers(Section):
     """The frame that carries the sensors, the frame that carries the targets, and where their poses are."""
 
-    sensors: Name = Field(
-        description="the frame that carries the sensors: the moving one for a camera on a hand, the fixed one for a "
-        "camera beside the robot",
-        examples=["hand"],
+    sensors: Name = needed(
+        "the frame that carries the sensors: the moving one for a camera on a hand, the fixed one for a camera "
+        "beside the robot",
+        "hand",
     )
-    targets: Name = Field(description="the frame that carries the targets", examples=["base"])
-    poses: PoseSource = Field(
-        description="where their poses are: {tf: [parent, child]}, {topic, parent, child} or {frames: [parent, child]}",
-        examples=[{"tf": ["base", "hand"]}],
+    targets: Name = needed("the frame that carries the targets", "base")
+    poses: PoseSource = needed(
+        "where their poses are: {tf: [parent, child]}, {topic, parent, child} or {frames: [parent, child]}",
+        {"tf": ["base", "hand"]},
     )
-    max_gap_s: Positive = Field(
-        default=0.2, description="between poses further apart in time nothing is interpolated", examples=[0.1]
-    )
-    noise: PoseNoise | None = Field(
-        default=None,
-        description="standard deviations of these poses; leave it out if you do not know them",
-        examples=[{"rotation_deg": 0.02, "translation_mm": 0.2}],
+    max_gap_s: Positive = optional("between poses further apart in time nothing is interpolated", 0.1, default=0.2)
+    noise: PoseNoise | None = optional(
+        "standard deviations of these poses; leave it out if you do not know them",
+        {"rotation_deg": 0.02, "translation_mm": 0.2},
     )
 
 
 class Link(Section):
     """The frame of a camera's body, of which its driver publishes the optical frame: exported in its place."""
 
-    frame: Name = Field(description="the name of that frame", examples=["camera_link"])
+    frame: Name = needed("the name of that frame", "camera_link")
     T_link_optical: (
         Annotated[
             tuple[float, float, float, float, float, float, float],
             list_of(7, "[x, y, z, qx, qy, qz, qw], metres and a unit quaternion"),
         ]
         | None
-    ) = Field(
-        default=None,
-        description="pose of the optical frame in it, [x, y, z, qx, qy, qz, qw], as `ros2 run tf2_ros tf2_echo "
-        "camera_link camera_optical_frame` prints it; without it that of REP 103: one origin, the link's x "
-        "forward, y left, z up",
-        examples=[[0.0, 0.015, 0.0, -0.5, 0.5, -0.5, 0.5]],
-        json_schema_extra={"unit": "m"},
+    ) = optional(
+        "pose of the optical frame in it, [x, y, z, qx, qy, qz, qw], as `ros2 run tf2_ros tf2_echo camera_link "
+        "camera_optical_frame` prints it; without it that of REP 103: one origin, the link's x forward, y left, z"
+        " up",
+        [0.0, 0.015, 0.0, -0.5, 0.5, -0.5, 0.5],
+        unit="m",
     )
 
     @model_validator(mode="after")
@@ -328,42 +281,32 @@ class Sensor(Section):
 
     model_config = one_of("images", "detections", together=(("images", "intrinsics"), ("poses", "images")))
 
-    images: Text | None = Field(
-        default=None,
-        description="topic of the camera's images; of a folder of images, their path in it",
-        examples=["/cam_left/image"],
+    images: Text | None = optional(
+        "topic of the camera's images; of a folder of images, their path in it", "/cam_left/image"
     )
-    poses: Text | None = Field(
-        default=None,
-        description="with images in a folder: path of the carriers' poses, one file for all images, a folder "
-        "with a file an image, or an index",
-        examples=["poses.csv"],
+    poses: Text | None = optional(
+        "with images in a folder: path of the carriers' poses, one file for all images, a folder with a file an "
+        "image, or an index",
+        "poses.csv",
     )
-    detections: Text | None = Field(
-        default=None, description="topic of a driver's detections, in place of images", examples=["/tag_detections"]
+    detections: Text | None = optional("topic of a driver's detections, in place of images", "/tag_detections")
+    intrinsics: IntrinsicsOrText | None = optional(
+        "with images: a file, a section, or the word estimate, which needs no calibration but images of a board; "
+        "detections with poses need none",
+        "left.yaml",
+        {"topic": "/cam_left/camera_info"},
+        "estimate",
     )
-    intrinsics: IntrinsicsOrText | None = Field(
-        default=None,
-        description="with images: a file, a section, or the word estimate, which needs no calibration but images of a "
-        "board; detections with poses need none",
-        examples=["left.yaml", {"topic": "/cam_left/camera_info"}, "estimate"],
-    )
-    time_offset: TimeOffset = Field(
+    time_offset: TimeOffset = optional(
+        "the sensor's stamp t is the carriers' t + offset; or the word estimate, which needs a rotation that "
+        "speeds up and slows down. Images taken at rest: leave it out",
+        "estimate",
         default=0.0,
-        description="the sensor's stamp t is the carriers' t + offset; or the word estimate, which needs a "
-        "rotation that speeds up and slows down. Images taken at rest: leave it out",
-        examples=["estimate"],
-        json_schema_extra={"unit": "s"},
+        unit="s",
     )
-    frame: Name | None = Field(
-        default=None,
-        description="its frame in the results; without it the sensor's name",
-        examples=["cam_left_optical"],
-    )
-    link: Annotated[Link, BeforeValidator(_frame_or_section), OrText("the name of the frame")] | None = Field(
-        default=None,
-        description="the frame of a camera's body; it takes the optical frame's place in the files for ROS",
-        examples=["camera_link"],
+    frame: Name | None = optional("its frame in the results; without it the sensor's name", "cam_left_optical")
+    link: Annotated[Link, BeforeValidator(_frame_or_section), OrText("the name of the frame")] | None = optional(
+        "the frame of a camera's body; it takes the optical frame's place in the files for ROS", "camera_link"
     )
 
     @property
@@ -398,15 +341,9 @@ class DetectionNoise(Section):
 
     model_config = one_of(("rotation_deg", "translation_mm"), ("corner_px",))
 
-    rotation_deg: Positive | None = Field(
-        default=None, description="standard deviation about each axis; with translation_mm", examples=[0.3]
-    )
-    translation_mm: Positive | None = Field(
-        default=None, description="standard deviation along each axis; with rotation_deg", examples=[3.0]
-    )
-    corner_px: Positive | None = Field(
-        default=None, description="standard deviation of a corner along each axis", examples=[0.1]
-    )
+    rotation_deg: Positive | None = optional("standard deviation about each axis; with translation_mm", 0.3)
+    translation_mm: Positive | None = optional("standard deviation along each axis; with rotation_deg", 3.0)
+    corner_px: Positive | None = optional("standard deviation of a corner along each axis", 0.1)
 
     @model_validator(mode="after")
     def _is_one(self) -> DetectionNoise:
@@ -422,31 +359,23 @@ class DetectionNoise(Section):
 class Cleaning(Section):
     """Which measurements cleaning removes before solving; a limit of null removes nothing."""
 
-    min_rotation_deg: Positive = Field(
+    min_rotation_deg: Positive = optional(
+        "a measurement at which the carriers have turned less and moved less than this since the one before is "
+        "left out",
+        1.0,
         default=0.5,
-        description="a measurement at which the carriers have turned less and moved less than this since the "
-        "one before is left out",
-        examples=[1.0],
     )
-    min_translation_mm: Positive = Field(default=3.0, description="see min_rotation_deg", examples=[5.0])
-    max_rotation_deg_s: Positive | None = Field(
-        default=None,
-        description="measurements while the carriers turn faster are left out; null: none is",
-        examples=[60.0],
+    min_translation_mm: Positive = optional("see min_rotation_deg", 5.0, default=3.0)
+    max_rotation_deg_s: Positive | None = optional(
+        "measurements while the carriers turn faster are left out; null: none is", 60.0
     )
-    max_translation_m_s: Positive | None = Field(
-        default=None,
-        description="measurements while the carriers move faster are left out; null: none is",
-        examples=[0.5],
+    max_translation_m_s: Positive | None = optional(
+        "measurements while the carriers move faster are left out; null: none is", 0.5
     )
-    consensus: bool = Field(
-        default=True,
-        description="whether measurements that disagree with most others are left out before solving",
-        examples=[False],
+    consensus: bool = optional(
+        "whether measurements that disagree with most others are left out before solving", False, default=True
     )
-    thin: bool = Field(
-        default=True, description="whether standstill is thinned, see min_rotation_deg", examples=[False]
-    )
-    robust: Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"] = Field(
-        default="gnc", description="how solving treats outliers; gnc leaves them out", examples=["none"]
+    thin: bool = optional("whether standstill is thinned, see min_rotation_deg", False, default=True)
+    robust: Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"] = optional(
+        "how solving treats outliers; gnc leaves them out", "none", default="gnc"
     )

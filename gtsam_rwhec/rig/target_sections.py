@@ -22,7 +22,7 @@ from gtsam_rwhec.cameras.targets import (
 )
 from gtsam_rwhec.errors import FileFormatError, RigError
 from gtsam_rwhec.files.yaml_lines import YamlFile, read_yaml, shown
-from gtsam_rwhec.rig.section_types import InSchema, Length, Positive, Section, list_of
+from gtsam_rwhec.rig.section_types import InSchema, Length, Positive, Section, list_of, needed, optional
 
 #: How many there are across and down, as the board is printed upright.
 Counts: TypeAlias = Annotated[tuple[int, int], list_of(2, "two whole numbers, [across, down]")]
@@ -49,9 +49,9 @@ class TagTarget(_TargetSection):
 
     made: ClassVar = Tag
     type: Literal["tag"]
-    family: Family = Field(description="dictionary of the tags", examples=["tag36h11"])
-    id: int = Field(description="the number of the tag", examples=[0])
-    size_m: Length = Field(description="side of the black square", examples=[0.12])
+    family: Family = needed("dictionary of the tags", "tag36h11")
+    id: int = needed("the number of the tag", 0)
+    size_m: Length = needed("side of the black square", 0.12)
 
 
 class CharucoTarget(_TargetSection):
@@ -60,11 +60,11 @@ class CharucoTarget(_TargetSection):
     made: ClassVar = Charuco
     counted: ClassVar = "squares"
     type: Literal["charuco"]
-    family: Family = Field(description="dictionary of the markers", examples=["aruco_5x5_100"])
-    squares: Counts = Field(description="[across, down], whole squares, black and white", examples=[[7, 5]])
-    square_m: Length = Field(description="side of a square", examples=[0.04])
-    marker_m: Length = Field(description="side of a marker's black square", examples=[0.03])
-    first_id: int = Field(default=0, description="the smallest number; the others follow it", examples=[0])
+    family: Family = needed("dictionary of the markers", "aruco_5x5_100")
+    squares: Counts = needed("[across, down], whole squares, black and white", [7, 5])
+    square_m: Length = needed("side of a square", 0.04)
+    marker_m: Length = needed("side of a marker's black square", 0.03)
+    first_id: int = optional("the smallest number; the others follow it", 0, default=0)
 
 
 class AprilGridTarget(_TargetSection):
@@ -73,11 +73,11 @@ class AprilGridTarget(_TargetSection):
     made: ClassVar = AprilGrid
     counted: ClassVar = "tags"
     type: Literal["aprilgrid"]
-    family: Family = Field(description="dictionary of the tags, most often tag36h11", examples=["tag36h11"])
-    tags: Counts = Field(description="[across, down], tags", examples=[[6, 6]])
-    tag_m: Length = Field(description="side of a tag's black square (Kalibr's tagSize)", examples=[0.088])
-    spacing: Positive = Field(description="gap between tags / side of a tag (Kalibr's tagSpacing)", examples=[0.3])
-    first_id: int = Field(default=0, description="the smallest number; the others follow it", examples=[0])
+    family: Family = needed("dictionary of the tags, most often tag36h11", "tag36h11")
+    tags: Counts = needed("[across, down], tags", [6, 6])
+    tag_m: Length = needed("side of a tag's black square (Kalibr's tagSize)", 0.088)
+    spacing: Positive = needed("gap between tags / side of a tag (Kalibr's tagSpacing)", 0.3)
+    first_id: int = optional("the smallest number; the others follow it", 0, default=0)
 
 
 class TagGridTarget(_TargetSection):
@@ -86,15 +86,13 @@ class TagGridTarget(_TargetSection):
     made: ClassVar = TagGrid
     counted: ClassVar = "tags"
     type: Literal["tag_grid"]
-    family: Family = Field(description="dictionary of the tags", examples=["aruco_5x5_100"])
-    tags: Counts = Field(description="[across, down], tags", examples=[[5, 7]])
-    tag_m: Length = Field(description="side of a tag's black square", examples=[0.04])
-    gap_m: Length = Field(description="white gap between two tags", examples=[0.01])
-    first_id: int = Field(default=0, description="at the top left; then to the right, then down", examples=[0])
-    ids: Annotated[tuple[int, ...], Field(max_length=10_000)] | None = Field(
-        default=None,
-        description="of all tags, left to right, from the top, in place of first_id",
-        examples=[[7, 3, 9, 4]],
+    family: Family = needed("dictionary of the tags", "aruco_5x5_100")
+    tags: Counts = needed("[across, down], tags", [5, 7])
+    tag_m: Length = needed("side of a tag's black square", 0.04)
+    gap_m: Length = needed("white gap between two tags", 0.01)
+    first_id: int = optional("at the top left; then to the right, then down", 0, default=0)
+    ids: Annotated[tuple[int, ...], Field(max_length=10_000)] | None = optional(
+        "of all tags, left to right, from the top, in place of first_id", [7, 3, 9, 4]
     )
 
     def target(self, name: str) -> Target:
@@ -107,15 +105,15 @@ class TagGridTarget(_TargetSection):
 class BundleTagPlace(Section):
     """A tag of a bundle, as apriltag_ros writes it."""
 
-    id: int = Field(description="the number of the tag", examples=[0])
-    size: Length = Field(description="side of the black square", examples=[0.05], json_schema_extra={"unit": "m"})
-    x: float = Field(default=0.0, description="the tag's middle in the bundle's frame, metres", examples=[0.035])
-    y: float = Field(default=0.0, description="as x", examples=[0.0])
-    z: float = Field(default=0.0, description="as x", examples=[0.0])
-    qw: float = Field(default=1.0, description="quaternion of the tag's axes in the bundle's frame", examples=[0.7071])
-    qx: float = Field(default=0.0, description="as qw", examples=[0.0])
-    qy: float = Field(default=0.0, description="as qw", examples=[0.7071])
-    qz: float = Field(default=0.0, description="as qw", examples=[0.0])
+    id: int = needed("the number of the tag", 0)
+    size: Length = needed("side of the black square", 0.05, unit="m")
+    x: float = optional("the tag's middle in the bundle's frame, metres", 0.035, default=0.0)
+    y: float = optional("as x", 0.0, default=0.0)
+    z: float = optional("as x", 0.0, default=0.0)
+    qw: float = optional("quaternion of the tag's axes in the bundle's frame", 0.7071, default=1.0)
+    qx: float = optional("as qw", 0.0, default=0.0)
+    qy: float = optional("as qw", 0.7071, default=0.0)
+    qz: float = optional("as qw", 0.0, default=0.0)
 
 
 class BundleTarget(_TargetSection):
@@ -123,10 +121,9 @@ class BundleTarget(_TargetSection):
 
     made: ClassVar = Bundle
     type: Literal["bundle"]
-    family: Family = Field(description="dictionary of the tags", examples=["tag36h11"])
-    layout: Annotated[tuple[BundleTagPlace, ...], Field(max_length=10_000)] = Field(
-        description="the tags, each with size and pose, as in apriltag_ros's tags.yaml",
-        examples=[[{"id": 0, "size": 0.05, "z": 0.035}]],
+    family: Family = needed("dictionary of the tags", "tag36h11")
+    layout: Annotated[tuple[BundleTagPlace, ...], Field(max_length=10_000)] = needed(
+        "the tags, each with size and pose, as in apriltag_ros's tags.yaml", [{"id": 0, "size": 0.05, "z": 0.035}]
     )
 
     def target(self, name: str) -> Target:
@@ -141,10 +138,8 @@ class CheckerboardTarget(_TargetSection):
     made: ClassVar = Checkerboard
     counted: ClassVar = "inner_corners"
     type: Literal["checkerboard"]
-    inner_corners: Counts = Field(
-        description="[across, down], corners where four squares meet: one less than squares", examples=[[9, 6]]
-    )
-    square_m: Length = Field(description="side of a square", examples=[0.04])
+    inner_corners: Counts = needed("[across, down], corners where four squares meet: one less than squares", [9, 6])
+    square_m: Length = needed("side of a square", 0.04)
 
 
 class CircleGridTarget(_TargetSection):
@@ -153,24 +148,21 @@ class CircleGridTarget(_TargetSection):
     made: ClassVar = CircleGrid
     counted: ClassVar = "circles"
     type: Literal["circle_grid"]
-    circles: Counts = Field(
-        description="[across, down], circles in a row and rows (OpenCV's patternSize; Kalibr's targetCols, targetRows)",
-        examples=[[10, 10]],
+    circles: Counts = needed(
+        "[across, down], circles in a row and rows (OpenCV's patternSize; Kalibr's targetCols, targetRows)", [10, 10]
     )
-    spacing_m: Length = Field(
-        description="between the centres of neighbours; in an asymmetric grid between two rows, which is half the "
-        "distance between neighbours in a row (OpenCV's square size, Kalibr's spacingMeters)",
-        examples=[0.0254],
+    spacing_m: Length = needed(
+        "between the centres of neighbours; in an asymmetric grid between two rows, which is half the distance "
+        "between neighbours in a row (OpenCV's square size, Kalibr's spacingMeters)",
+        0.0254,
     )
-    larger_dot: bool | Literal["lower_left", "lower_right", "upper_left", "upper_right"] = Field(
+    larger_dot: bool | Literal["lower_left", "lower_right", "upper_left", "upper_right"] = optional(
+        "whether one circle at a corner is larger, and at which as printed; true: lower_left", True, default=False
+    )
+    asymmetric: bool = optional(
+        "every other row is shifted to the right by spacing_m, the first is not (Kalibr's asymmetricGrid)",
+        True,
         default=False,
-        description="whether one circle at a corner is larger, and at which as printed; true: lower_left",
-        examples=[True],
-    )
-    asymmetric: bool = Field(
-        default=False,
-        description="every other row is shifted to the right by spacing_m, the first is not (Kalibr's asymmetricGrid)",
-        examples=[True],
     )
 
 
