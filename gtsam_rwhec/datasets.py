@@ -184,33 +184,15 @@ def demo_folder() -> Path:
 
 @dataclass(frozen=True)
 class DemoTruth:
-    """The facts that the log was made with.
+    """The facts that the log was made with."""
 
-    Attributes
-    ----------
-    X : dict of str to gtsam.Pose3
-        T_base_target by target, metres.
-    Y : dict of str to gtsam.Pose3
-        T_hand_camera by camera, metres.
-    time_offsets_s : dict of str to float
-        By camera, seconds: the camera's stamp t is the robot's t + offset.
-    scale : dict of str to float
-        Stated length over true length, by target.
-    twice_seen : str
-        The target whose tag a poster shows a second time.
-    twice_seen_by : str
-        The camera that sees the poster.
-    twice_seen_in : int
-        Number of that camera's images with the poster.
-    """
-
-    X: dict[str, gtsam.Pose3]
-    Y: dict[str, gtsam.Pose3]
-    time_offsets_s: dict[str, float]
-    scale: dict[str, float]
-    twice_seen: str
-    twice_seen_by: str
-    twice_seen_in: int
+    X: dict[str, gtsam.Pose3]  #: T_base_target by target, metres
+    Y: dict[str, gtsam.Pose3]  #: T_hand_camera by camera, metres
+    time_offsets_s: dict[str, float]  #: By camera, seconds: the camera's stamp t is the robot's t + offset
+    scale: dict[str, float]  #: Stated length over true length, by target
+    twice_seen: str  #: The target whose tag a poster shows a second time
+    twice_seen_by: str  #: The camera that sees the poster
+    twice_seen_in: int  #: Number of that camera's images with the poster
 
 
 def demo_truth() -> DemoTruth:

@@ -16,18 +16,11 @@ Progress = Callable[[str], None]
 
 
 class Counted(str):
-    """A stage that counts: "detecting: image 240 of 1004".
-
-    Attributes
-    ----------
-    what : str
-        The stage without its count, "detecting: image": the same for all counts of one stage.
-    done, total : int
-        How many are done, and how many there are.
-    """
+    """A stage that counts: "detecting: image 240 of 1004"."""
 
     __slots__ = ("done", "total", "what")
-    what: str
+    what: str  #: The stage without its count, "detecting: image": the same for all counts of one stage
+    #: done, total: how many are done, and how many there are
     done: int
     total: int
 
@@ -49,14 +42,9 @@ class Remark(str):
 
 @dataclass
 class Pace:
-    """How fast a counted stage goes, from when it was first told.
+    """How fast a counted stage goes, from when it was first told."""
 
-    Attributes
-    ----------
-    begun_s, begun_done
-        Time, and count, when the stage was first told: what an earlier run had done takes no time.
-    """
-
+    #: begun_s, begun_done: time, and count, when the stage was first told: what an earlier run had done takes no time
     begun_s: float
     begun_done: int
 

@@ -46,20 +46,11 @@ _PLAIN_KEY = re.compile(r"[A-Za-z0-9_/.-]+")
 
 @dataclass(frozen=True)
 class YamlFile:
-    """The contents of a YAML file, with their lines.
+    """The contents of a YAML file, with their lines."""
 
-    Attributes
-    ----------
-    where : str
-        The file's name, for messages.
-    data : Any
-        Mappings are dicts with keys of text, lists are tuples, scalars are str, int, float, bool or None.
-    lines : mapping of key path to int
-        For each value the line of its key, or of the value itself in a list, from 1 on.
-    """
-
-    where: str
-    data: Any
+    where: str  #: The file's name, for messages
+    data: Any  #: Mappings are dicts with keys of text, lists are tuples, scalars are str, int, float, bool or None
+    #: For each value the line of its key, or of the value itself in a list, from 1 on
     lines: Mapping[KeyPath, int]
 
     def line(self, path: KeyPath) -> int:
@@ -106,23 +97,12 @@ def read_text(path: str | Path) -> str:
 
 
 def parse_yaml(text: str, where: str, *, tags: Collection[str] = (), most_values: int = MOST_VALUES) -> YamlFile:
-    """Parse one document.
-
-    Parameters
-    ----------
-    text : str
-        The document.
-    where : str
-        The file's name, for messages.
-    tags : collection of str
-        Tags that are ignored; any other tag is refused.
-    most_values : int
-        At most so many keys, values and items.
+    """Parse one document; `tags` are ignored, and more than `most_values` keys and values are refused.
 
     Raises
     ------
     FileFormatError
-        When the text is not YAML, is empty, or has what this module refuses. The message has the line.
+        The text is not YAML of the kind that the module describes. The message has the line.
     """
     reader = _Reader(where, frozenset(tags), _events(text, where), most_values)
     return YamlFile(where, reader.document(), reader.lines)

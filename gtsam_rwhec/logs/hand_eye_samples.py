@@ -56,28 +56,14 @@ _ON_HAND = {"eye_in_hand": True, "eye_on_hand": True, "eye_on_base": False, "eye
 
 @dataclass(frozen=True, eq=False)
 class HandEyeSamples:
-    """The samples of one file.
-
-    Attributes
-    ----------
-    path : Path
-    tool : str
-        Who wrote the file.
-    robot : (N, 4, 4) array
-        T_base_hand in metres, or, if `is_of_carriers`, T_targetcarrier_sensorcarrier.
-    B : (N, 4, 4) array
-        T_camera_target, metres.
-    is_of_carriers : bool
-    is_on_hand : bool or None
-        Whether the camera is on the hand; None if the file does not say it.
-    """
+    """The samples of one file."""
 
     path: Path
-    tool: str
-    robot: Array
-    B: Array
+    tool: str  #: Who wrote the file
+    robot: Array  #: (N, 4, 4): T_base_hand in metres, or, if `is_of_carriers`, T_targetcarrier_sensorcarrier
+    B: Array  #: (N, 4, 4): T_camera_target, metres
     is_of_carriers: bool
-    is_on_hand: bool | None
+    is_on_hand: bool | None  #: Whether the camera is on the hand; None if the file does not say it
 
     def T_base_hand(self, is_on_hand: bool) -> Array:
         """The robot's poses (N, 4, 4), for a camera on the hand or a fixed one."""
@@ -106,18 +92,13 @@ def is_samples_file(path: object) -> bool:
 def read_hand_eye_samples(path: str | Path, stated: PoseStatement | None = None) -> HandEyeSamples:
     """Read samples of MoveIt, easy_handeye, easy_handeye2, or arrays for OpenCV's ``calibrateHandEye``.
 
-    Parameters
-    ----------
-    path
-        YAML, JSON, or OpenCV's YAML, XML or JSON.
-    stated : PoseStatement, optional
-        What the file does not say.
+    The file is YAML, JSON, or OpenCV's YAML, XML or JSON; `stated` says what it does not.
 
     Raises
     ------
     LogError
-        The file cannot be read, has no samples, a sample lacks one of its two poses, or a pose is none; the message
-        has the file and the line.
+        The file cannot be read, has no samples, a sample lacks one of its two poses, or a pose is none; the message has
+        the file and the line.
     """
     path, stated = checked_path(path), stated or PoseStatement()
     tree = PoseTree(pose_tree(str(path), pose_text(path)))

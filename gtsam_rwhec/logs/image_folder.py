@@ -54,28 +54,11 @@ def write_image_folder(
     child: str = "hand",
     camera: str = "camera",
 ) -> tuple[int, int]:
-    """Write images and poses as one log.
+    """Write a folder of images, and a file or folder of their poses T_parent_child (metres), as one log.
 
     Topics are ``/<camera>/image`` (``foxglove.CompressedImage``, the files' bytes as they are) and ``/tf``
-    (``foxglove.FrameTransforms`` of T_parent_child).
-
-    Parameters
-    ----------
-    images
-        The folder; files with other endings than `FORMATS` are passed over.
-    poses
-        The file or folder of T_parent_child, in metres.
-    path
-        The MCAP file to write.
-    columns
-        The order of the seven numbers, where the file does not name them.
-    parent, child, camera
-        Names of the frames.
-
-    Returns
-    -------
-    int, int
-        How many images and how many poses were written.
+    (``foxglove.FrameTransforms``). Files with other endings than `FORMATS` are passed over; `columns` is the order of
+    the seven numbers where the file of poses does not name them. Returns how many images and poses were written.
 
     Raises
     ------
@@ -147,18 +130,10 @@ SAME_POSE = 1e-9
 
 @dataclass(frozen=True)
 class Matched:
-    """Images with their poses.
+    """Images with their poses."""
 
-    Attributes
-    ----------
-    images : tuple of int
-        Places of the images that have a pose.
-    poses : tuple of int
-        The pose of each.
-    """
-
-    images: tuple[int, ...]
-    poses: tuple[int, ...]
+    images: tuple[int, ...]  #: Places of the images that have a pose
+    poses: tuple[int, ...]  #: The pose of each
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -207,16 +182,13 @@ def pose_stamps(poses: NamedPoses) -> list[int] | None:
 def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
     """Match images and poses by name, else by the number in the name; poses without names by their order.
 
+    Warns of images without a pose, and the reverse.
+
     Raises
     ------
     LogError
         Fewer than two images have a pose, an image has two different ones, or poses without names are more or fewer
         than the images.
-
-    Warns
-    -----
-    LogWarning
-        Some images have no pose, or the reverse.
     """
     for key in (stem_of, _number):
         of_images, of_poses = [key(file.name) for file in files], [key(name) for name in poses.names]
@@ -281,14 +253,9 @@ TREES, TABLES = (".json", ".yaml", ".yml", ".xml", ".samples"), (".csv", ".txt",
 
 
 def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPoses:
-    """Read poses.
+    """Read the poses of a file, or of a folder with one pose a file, whose names poses without a name then have.
 
-    Parameters
-    ----------
-    path
-        A file, or a folder with one pose a file; a pose without a name of its own then has its file's.
-    stated : PoseStatement, optional
-        What the files do not say.
+    `stated` is what the files do not say.
 
     Raises
     ------

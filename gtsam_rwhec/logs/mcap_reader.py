@@ -118,17 +118,11 @@ class Log:
         return found[-1] if found else None
 
     def records(self, topics: Iterable[str] | None = None, on_bad: OnBad = "warn") -> Iterator[Record]:
-        """Go through the log in the order of log time.
+        """Go through the log in the order of log time; without `topics`, all that can be read.
 
-        Memory is bounded: only blocks of messages that overlap in time are open together.
-
-        Parameters
-        ----------
-        topics
-            None for all that can be read.
-        on_bad
-            ``"warn"`` leaves out messages that cannot be read and blocks that are damaged. One `LogWarning` at the end
-            says how many each topic lost, and the first fault. ``"raise"`` stops at the first fault.
+        Memory is bounded: only blocks of messages that overlap in time are open together. With ``on_bad="warn"``
+        messages that cannot be read and damaged blocks are left out, and one `LogWarning` at the end says how many each
+        topic lost, and the first fault; ``"raise"`` stops at the first fault.
 
         Raises
         ------

@@ -4,7 +4,7 @@
         out.copy(log, images="leave_out")
         out.transforms("/calibration", stamp_ns, [("rig", "cam_0", T_rig_cam)])
 
-The file gets its name once it is whole (``files.atomic_write``): an error leaves the earlier file as it was.
+The file gets its name once it is whole (`atomic_stream`): an error leaves the earlier file as it was.
 """
 
 from __future__ import annotations
@@ -46,17 +46,10 @@ _BLACK = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 0.6}
 
 
 class LogWriter:
-    """A context manager that writes one MCAP file.
+    """A context manager that writes one MCAP file. A file of this name is replaced when the block ends without an
+    error.
 
-    Parameters
-    ----------
-    path
-        A file of this name is replaced when the block ends without an error.
-
-    Raises
-    ------
-    LogError
-        The file cannot be written: no such folder, no permission, disk full. Every method raises it too.
+    Every method raises a LogError where the file cannot be written: no such folder, no permission, disk full.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -85,19 +78,8 @@ class LogWriter:
     def copy(self, log: Log, topics: Iterable[str] | None = None, images: Images = "copy") -> int:
         """Copy messages byte for byte, with their schemas, channels and times, but no metadata and no attachments.
 
-        Parameters
-        ----------
-        log
-            Damaged blocks are left out (``log.losses`` and `Log.records` name them).
-        topics
-            None for all.
-        images
-            ``"leave_out"`` leaves out the topics of images, which are large.
-
-        Returns
-        -------
-        int
-            How many messages were copied.
+        Without `topics`, of all; ``images="leave_out"`` leaves out topics of images and videos. Damaged blocks are left
+        out (``log.losses`` and `Log.records` name them). Returns how many messages were copied.
         """
         wanted = None if topics is None else set(topics)
         copied = 0

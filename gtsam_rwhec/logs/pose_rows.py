@@ -26,53 +26,28 @@ WORKSPACE_M = 50.0
 
 @dataclass(frozen=True)
 class PoseRow:
-    """One pose as its file has it.
+    """One pose as its file has it."""
 
-    Attributes
-    ----------
-    name : str
-        An image's name or a stamp; empty where the file has neither.
-    place : str
-        The file, and its line where it has several poses.
-    kind : str
-    numbers : tuple of float
-        16 of a matrix; 3 of a position, then 4 or 3 of the rotation. Angles are about x, y and z if `is_named`.
-    is_named : bool
-        Whether the file names the angles' axes.
-    unit_m : float or None
-        The position's unit in metres; None if the file does not say it.
-    """
-
-    name: str
-    place: str
+    name: str  #: An image's name or a stamp; empty where the file has neither
+    place: str  #: The file, and its line where it has several poses
     kind: Kind
+    #: 16 of a matrix; 3 of a position, then 4 or 3 of the rotation. Angles are about x, y and z if `is_named`.
     numbers: tuple[float, ...]
-    is_named: bool = False
-    unit_m: float | None = None
+    is_named: bool = False  #: Whether the file names the angles' axes
+    unit_m: float | None = None  #: The position's unit in metres; None if the file does not say it
 
 
 @dataclass(frozen=True)
 class PoseStatement:
-    """How the numbers of a file of poses are meant, where the file does not say it; None is not stated.
+    """How the numbers of a file of poses are meant, where the file does not say it; None is not stated."""
 
-    Attributes
-    ----------
-    quaternion : str or None
-        ``"xyzw"`` or ``"wxyz"``; a file that names no columns has x, y, z, w unless stated.
-    euler : str or None
-        Axes as SciPy has them (``"ZYX"`` about turning axes, ``"xyz"`` about fixed ones), or ``"rotation_vector"``.
-    angles : str or None
-        ``"degrees"`` or ``"radians"``.
-    length : str or None
-        ``"m"`` or ``"mm"``.
-    columns : str or None
-        The order of a line's seven numbers, as ``"qw qx qy qz tx ty tz"``, in tables without names of columns.
-    """
-
+    #: ``"xyzw"`` or ``"wxyz"``; a file that names no columns has x, y, z, w unless stated
     quaternion: Literal["xyzw", "wxyz"] | None = None
+    #: Axes as SciPy has them (``"ZYX"`` about turning axes, ``"xyz"`` about fixed ones), or ``"rotation_vector"``
     euler: str | None = None
     angles: Literal["degrees", "radians"] | None = None
     length: Literal["m", "mm"] | None = None
+    #: The order of a line's seven numbers, as ``"qw qx qy qz tx ty tz"``, in tables without names of columns
     columns: str | None = None
 
 

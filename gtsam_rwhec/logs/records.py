@@ -21,24 +21,15 @@ Array: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRecord:
-    """A pose or transform.
-
-    Attributes
-    ----------
-    T : (4, 4) array
-        T_parent_child, in metres.
-    child : str
-        Empty where the message names one frame only (``PoseStamped``, ``PoseInFrame``).
-    covariance : (6, 6) array or None
-        GTSAM's order: rotation first, right perturbation ``T * Expmap(xi)``. It is None if the message has none.
-    """
+    """A pose or transform."""
 
     logged_ns: int
     stamp_ns: int
     topic: str
     parent: str
-    child: str
-    T: Array
+    child: str  #: Empty where the message names one frame only (``PoseStamped``, ``PoseInFrame``)
+    T: Array  #: (4, 4): T_parent_child, in metres
+    #: (6, 6): GTSAM's order: rotation first, right perturbation ``T * Expmap(xi)``. It is None if the message has none.
     covariance: Array | None = None
 
     @property
@@ -59,27 +50,19 @@ class PoseSeries:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
-    """An image, not decoded.
-
-    Attributes
-    ----------
-    encoding : str
-        Pixel format (``mono8``, ``rgb8``, ...) of a raw image; format (``jpeg``, ``png``) of a compressed image.
-    width, height : int or None
-        Pixels of a raw image. They are None for a compressed image.
-    step : int or None
-        Bytes from one row of a raw image to the next; None for a compressed image.
-    """
+    """An image, not decoded."""
 
     logged_ns: int
     stamp_ns: int
     topic: str
     frame: str
+    #: Pixel format (``mono8``, ``rgb8``, ...) of a raw image; format (``jpeg``, ``png``) of a compressed image.
     encoding: str
     data: bytes
+    #: width, height: pixels of a raw image. They are None for a compressed image.
     width: int | None = None
     height: int | None = None
-    step: int | None = None
+    step: int | None = None  #: Bytes from one row of a raw image to the next; None for a compressed image
     is_bigendian: bool = False
 
     @property
@@ -90,19 +73,7 @@ class ImageRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntrinsicsRecord:
-    """A camera's intrinsics as the log states them; the camera model checks the numbers later.
-
-    Attributes
-    ----------
-    model : str
-        The model's name in the log: ``plumb_bob``, ``equidistant``, ``kannala_brandt``, ...
-    K, P : (3, 3) and (3, 4) arrays
-        Camera matrix and projection matrix of the rectified image, in pixels.
-    R : (3, 3) array
-        Rotation from the camera to the rectified camera.
-    D : (n,) array
-        Distortion coefficients, in the order of the model.
-    """
+    """A camera's intrinsics as the log states them; the camera model checks the numbers later."""
 
     logged_ns: int
     stamp_ns: int
@@ -110,47 +81,35 @@ class IntrinsicsRecord:
     frame: str
     width: int
     height: int
-    model: str
+    model: str  #: The model's name in the log: ``plumb_bob``, ``equidistant``, ``kannala_brandt``, ...
+    #: K, P: (3, 3) and (3, 4): Camera matrix and projection matrix of the rectified image, in pixels
     K: Array
-    D: Array
-    R: Array
+    D: Array  #: (n,): Distortion coefficients, in the order of the model
+    R: Array  #: (3, 3): Rotation from the camera to the rectified camera
     P: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionRecord:
-    """A tag or board that was detected; a message with several tags gives one record for each.
-
-    Attributes
-    ----------
-    family : str
-        Empty where the message does not name it.
-    id : str
-        The tag's number, or the board's name.
-    corners_px : (4, 2) array or None
-        Pixels, in the driver's order. A board has (n, 2), with the corners that were seen.
-    T_camera_tag, covariance : (4, 4) and (6, 6) arrays or None
-        The pose in metres and its covariance as in `PoseRecord`.
-    size_m, reprojection_px : float or None
-        The tag's side in metres; the root mean square of the reprojection error over the corners, in pixels.
-    reason : str
-        Why the detection is not used; empty where it is used.
-    corner_indices : tuple of int or None
-        The number of each row of `corners_px` among the corners of the target, as the target's class numbers them.
-    """
+    """A tag or board that was detected; a message with several tags gives one record for each."""
 
     logged_ns: int
     stamp_ns: int
     topic: str
     frame: str
-    family: str
-    id: str
+    family: str  #: Empty where the message does not name it
+    id: str  #: The tag's number, or the board's name
+    #: (4, 2): Pixels, in the driver's order. A board has (n, 2), with the corners that were seen.
     corners_px: Array | None = None
+    #: T_camera_tag, covariance: (4, 4) and (6, 6): The pose in metres and its covariance as in `PoseRecord`
     T_camera_tag: Array | None = None
     covariance: Array | None = None
+    #: size_m, reprojection_px: the tag's side in metres; the root mean square of the reprojection error over the
+    #: corners, in pixels
     size_m: float | None = None
     reprojection_px: float | None = None
-    reason: str = ""
+    reason: str = ""  #: Why the detection is not used; empty where it is used
+    #: The number of each row of `corners_px` among the corners of the target, as the target's class numbers them
     corner_indices: tuple[int, ...] | None = None
 
     @property
@@ -161,28 +120,19 @@ class DetectionRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairRecord:
-    """A synchronised measurement as this library writes it.
-
-    Attributes
-    ----------
-    A, B : (4, 4) arrays
-        T_sensorcarrier_targetcarrier and T_sensor_target, in metres.
-    reason : str
-        Why the measurement is an outlier; empty for an inlier.
-    covariance : (6, 6) array or None
-        The covariance of B, as in `PoseRecord`.
-    """
+    """A synchronised measurement as this library writes it."""
 
     logged_ns: int
     stamp_ns: int
     topic: str
     target: str
     sensor: str
+    #: A, B: (4, 4): T_sensorcarrier_targetcarrier and T_sensor_target, in metres
     A: Array
     B: Array
     is_inlier: bool = True
-    reason: str = ""
-    covariance: Array | None = None
+    reason: str = ""  #: Why the measurement is an outlier; empty for an inlier
+    covariance: Array | None = None  #: (6, 6): The covariance of B, as in `PoseRecord`
 
 
 Record: TypeAlias = PoseRecord | ImageRecord | IntrinsicsRecord | DetectionRecord | PairRecord
@@ -207,23 +157,17 @@ def schema_word(schema: str) -> str:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a log.
-
-    Attributes
-    ----------
-    first_ns, last_ns : int or None
-        First and last log time. If the file has an index, they are the times of the chunks that have the topic.
-    unreadable : str
-        Why the messages cannot become records; the text is empty if they can.
-    """
+    """A topic of a log."""
 
     name: str
     schema: str
     encoding: str
     count: int
+    #: first_ns, last_ns: first and last log time. If the file has an index, they are the times of the chunks that have
+    #: the topic.
     first_ns: int | None
     last_ns: int | None
-    unreadable: str
+    unreadable: str  #: Why the messages cannot become records; the text is empty if they can
 
     @property
     def is_tf(self) -> bool:

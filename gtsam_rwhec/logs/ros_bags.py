@@ -64,25 +64,17 @@ _ENDED_BY = {
 
 
 def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
-    """Write a bag's messages as an MCAP file, in the order of time.
+    """Write the messages of a ROS 1 ``.bag`` file, or of a ROS 2 bag's folder, as an MCAP file in the order of time.
 
-    Parameters
-    ----------
-    bag
-        A ROS 1 ``.bag`` file, or the folder of a ROS 2 bag.
-    path
-        The MCAP file. A file of this name is replaced once all is written.
-
-    Returns
-    -------
-    int
-        How many messages were written.
+    A file of this name is replaced once all is written. Returns how many messages there are.
 
     Raises
     ------
+    MissingPackageError
+        `rosbags` is not installed.
     LogError
-        `rosbags` is not installed; the bag cannot be read, has no definitions of its messages, or takes more memory or
-        time than a bag of its size may; the file cannot be written; or a ROS 2 bag is in MCAP already.
+        The bag cannot be read, has no definitions of its messages, or takes more memory or time than a bag of its size
+        may; the file cannot be written; or a ROS 2 bag is in MCAP already.
     BudgetError
         The bag states more, or yields more, than one of its size may (``files/budgets.py``).
     """
@@ -193,14 +185,10 @@ class _Seen:
 
 
 def check_ros1_bag(path: Path) -> None:
-    """Refuse a bag that asks for more memory or work than one of its size may.
+    """Refuse a bag that asks for more memory or work than one of its size may: a BudgetError.
 
-    Raises
-    ------
-    BudgetError
-        It does: its chunks yield too much, its index lists a chunk twice, its definitions are too long.
-    LogError
-        It cannot be read, or is damaged.
+    So do chunks that yield too much, an index that lists a chunk twice, and definitions that are too long. A LogError
+    says that it cannot be read, or is damaged.
     """
     try:
         with open(path, "rb") as stream:
@@ -348,21 +336,9 @@ _PIECE = 1 << 20
 
 
 def check_ros2_bag(bag: Path, spending: Spending) -> None:
-    """Refuse a bag that asks for more memory or work than one of its size may.
+    """Refuse a bag's folder or db3 file that asks for more than one of its size may, or has more than plain tables.
 
-    Parameters
-    ----------
-    bag
-        The folder of a ROS 2 bag, or a db3 file.
-    spending : Spending
-        Of all the files of the bag.
-
-    Raises
-    ------
-    BudgetError
-        It does; or its database has more than plain tables.
-    LogError
-        It is in MCAP already, or it cannot be read.
+    That is a BudgetError; a LogError says that it is in MCAP already, or cannot be read.
     """
     if bag.suffix == ".mcap" or (bag.is_dir() and not any(bag.glob("*.db3*")) and any(bag.glob("*.mcap"))):
         raise LogError(f"{bag} is in MCAP already: no conversion is needed. Give it to gtsam-rwhec init as it is.")

@@ -125,26 +125,16 @@ class TfBuffer:
         return {link.child: np.array(link.stamps_ns, dtype=np.int64) for link in links}
 
     def at(self, parent: str, child: str, stamps_ns: Stamps) -> tuple[Array, Array]:
-        """T_parent_child at stamps.
-
-        Parameters
-        ----------
-        parent, child
-            Any two frames that a chain joins, in either direction.
-        stamps_ns : (M,) integers
+        """T_parent_child at stamps (M,), for any two frames that a chain joins, in either direction; errors as in
+        `chain`.
 
         Returns
         -------
         T : (M, 4, 4)
             Each moving link is interpolated on SE(3) between its neighbours in time, T_i Expmap(tau Log(T_i^-1 T_i+1)).
         gap_s : (M,)
-            The longest time between two such neighbours. It is 0 where each link is static or has a transform at
-            the stamp, and infinite where a link has no transform before or after (T then has the nearest).
-
-        Raises
-        ------
-        TransformError
-            As `chain`.
+            The longest time between two such neighbours. It is 0 where each link is static or has a transform at the
+            stamp, and infinite where a link has no transform before or after (T then has the nearest).
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         T = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))

@@ -65,19 +65,13 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class RoleEvidence:
-    """What solving for both roles says.
+    """What solving for both roles says."""
 
-    Attributes
-    ----------
-    child, parent : TrialFit or None
-        The robust fit if the sensors are on the child of the poses, or on their parent; None without an answer.
-    images : int
-        The number of measurements.
-    """
-
+    #: child, parent: the robust fit if the sensors are on the child of the poses, or on their parent; None without an
+    #: answer
     child: TrialFit | None
     parent: TrialFit | None
-    images: int
+    images: int  #: The number of measurements
 
     @property
     def role(self) -> Role | None:
@@ -179,21 +173,11 @@ OF_DRIVER = 1e-4 * np.eye(6)
 
 @dataclass(frozen=True, eq=False)
 class LogEvidence:
-    """What a log says about its carriers.
+    """What a log says about its carriers."""
 
-    Attributes
-    ----------
-    roles : RoleEvidence
-        What solving with the cameras on either frame says.
-    rest : dict of str to Rest
-        By topic of images, whether they were taken at rest; empty where the poses do not tell.
-    origin : Origin
-        Where the poses come from.
-    """
-
-    roles: RoleEvidence
-    rest: dict[str, Rest]
-    origin: Origin
+    roles: RoleEvidence  #: What solving with the cameras on either frame says
+    rest: dict[str, Rest]  #: By topic of images, whether they were taken at rest; empty where the poses do not tell
+    origin: Origin  #: Where the poses come from
 
 
 def evidence_of_log(
@@ -306,32 +290,14 @@ LEAST_POSES, LEAST_HZ = 50, 15.0
 
 @dataclass(frozen=True)
 class Origin:
-    """Where poses come from, as a guess.
+    """Where poses come from, as a guess."""
 
-    Attributes
-    ----------
-    noise : PoseNoise or None
-        A guess of their noise; None where nothing says what they come from.
-    words : str
-        The guess with its reasons.
-    """
-
-    noise: PoseNoise | None
-    words: str
+    noise: PoseNoise | None  #: A guess of their noise; None where nothing says what they come from
+    words: str  #: The guess with its reasons
 
 
 def origin_of(names: Iterable[str], schema: str = "", path: Trajectory | None = None) -> Origin:
-    """Guess where poses come from.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Frames and topics; files and folders.
-    schema : str
-        The messages' schema, if they are of a log.
-    path : Trajectory, optional
-        The poses.
-    """
+    """Guess where poses come from, by the names of frames, topics and files, the messages' schema, and the path."""
     names = [name for name in names if name]
     seen = f"; {of_path}" if (of_path := _path_words(path)) else ""
     if "odometry" in schema.lower():

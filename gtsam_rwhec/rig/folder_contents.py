@@ -54,57 +54,26 @@ STATEMENTS = (
 
 @dataclass(frozen=True, eq=False)
 class FolderPoses:
-    """The poses for a folder of images.
+    """The poses for a folder of images."""
 
-    Attributes
-    ----------
-    path : str
-        From the folder that was looked at.
-    stated : PoseStatement
-        What the file does not say, and reading needs: a guess.
-    T : (n, 4, 4) array
-        The pose of each image; nan where there is none.
-    stamps_ns : (n,) integers or None
-        The images' stamps, if their names are stamps.
-    all : NamedPoses
-        All poses of the file.
-    """
-
-    path: str
-    stated: PoseStatement
-    T: Array
-    stamps_ns: np.ndarray | None
-    all: NamedPoses
+    path: str  #: From the folder that was looked at
+    stated: PoseStatement  #: What the file does not say, and reading needs: a guess
+    T: Array  #: (n, 4, 4): The pose of each image; nan where there is none
+    stamps_ns: np.ndarray | None  #: (n,): The images' stamps, if their names are stamps
+    all: NamedPoses  #: All poses of the file
 
 
 @dataclass(frozen=True, eq=False)
 class ImageFolder:
-    """A folder of images: one camera's.
+    """A folder of images: one camera's."""
 
-    Attributes
-    ----------
-    path : str
-        From the folder that was looked at; ``.`` for itself.
-    files : tuple of Path
-        In natural order.
-    size : (int, int)
-        Width and height, pixels, of the first image that can be read.
-    poses : FolderPoses or None
-    intrinsics : str
-        The file of intrinsics, from the folder that was looked at; empty if there is none.
-    camera_name : str
-        The camera's name in that file; empty where it has one alone.
-    camera : Camera or None
-        Its intrinsics.
-    """
-
-    path: str
-    files: tuple[Path, ...]
-    size: tuple[int, int]
+    path: str  #: From the folder that was looked at; ``.`` for itself.
+    files: tuple[Path, ...]  #: In natural order
+    size: tuple[int, int]  #: (int, int): Width and height, pixels, of the first image that can be read
     poses: FolderPoses | None
-    intrinsics: str
-    camera_name: str
-    camera: Camera | None
+    intrinsics: str  #: The file of intrinsics, from the folder that was looked at; empty if there is none
+    camera_name: str  #: The camera's name in that file; empty where it has one alone
+    camera: Camera | None  #: Its intrinsics
 
 
 def is_folder_without_logs(path: Path) -> bool:

@@ -40,20 +40,8 @@ def propose_folder_rig(
 ) -> tuple[str, tuple[str, ...]]:
     """Propose a rig file for folders of images with poses beside them; a person completes it.
 
-    Parameters
-    ----------
-    folder
-        Where the paths of the rig file start.
-    path
-        The rig file that will be written, for messages.
-    progress : callable, optional
-
-    Returns
-    -------
-    text : str
-        A rig file that `parse_rig` reads.
-    notes : tuple of str
-        What was seen, what was chosen, and what was left out.
+    Paths in the rig file start from `folder`; `path` is the file that will be written, for messages. Returns the text
+    of a rig file that `parse_rig` reads, and notes: what was seen, what was chosen, and what was left out.
 
     Raises
     ------
@@ -253,20 +241,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class PoseReading:
-    """How the poses are read.
+    """How the poses are read."""
 
-    Attributes
-    ----------
-    stated : PoseStatement
-        What the rig file must say.
-    evidence : RoleEvidence
-        Of the poses that are read so.
-    otherwise : RoleEvidence or None
-        Of the poses as they are read without a statement, where another reading explains the images far better.
-    """
-
-    stated: PoseStatement
-    evidence: RoleEvidence
+    stated: PoseStatement  #: What the rig file must say
+    evidence: RoleEvidence  #: Of the poses that are read so
+    #: Of the poses as they are read without a statement, where another reading explains the images far better
     otherwise: RoleEvidence | None
 
 

@@ -47,24 +47,12 @@ MOST_REGIONS = 2
 
 @dataclass(frozen=True, eq=False)
 class BoardSeen:
-    """A board that was found out.
+    """A board that was found out."""
 
-    Attributes
-    ----------
-    board : Checkerboard or CircleGrid
-        With 1 m for the length that is not known.
-    images : tuple of int
-        The images in which it was found.
-    corners_px : tuple of (n, 2) arrays
-        Its corners or centres in each of them.
-    indices : tuple of (n,) arrays
-        Their rows in ``board.corners()``.
-    """
-
-    board: Checkerboard | CircleGrid
-    images: tuple[int, ...]
-    corners_px: tuple[Array, ...]
-    indices: tuple[np.ndarray, ...]
+    board: Checkerboard | CircleGrid  #: With 1 m for the length that is not known
+    images: tuple[int, ...]  #: The images in which it was found
+    corners_px: tuple[Array, ...]  #: tuple of (n, 2): Its corners or centres in each of them
+    indices: tuple[np.ndarray, ...]  #: tuple of (n,): Their rows in ``board.corners()``.
 
     @property
     def counts(self) -> tuple[int, int]:

@@ -244,40 +244,23 @@ MOST, LONGEST = 40, 5.0
 
 @dataclass(frozen=True)
 class Layout:
-    """A board's layout.
-
-    Attributes
-    ----------
-    kind : str
-    columns, rows : int
-        As the rig file counts them: squares of a ChArUco board, else tags.
-    share : float
-        A tag's side over the step from one to the next; of a ChArUco board over a square's side.
-    off : float
-        Root mean square distance of the tags' middles from their places, over a tag's side, median over images.
-    images : int
-        The images that were compared.
-    """
+    """A board's layout."""
 
     kind: Kind
+    #: columns, rows: as the rig file counts them: squares of a ChArUco board, else tags
     columns: int
     rows: int
-    share: float
+    share: float  #: A tag's side over the step from one to the next; of a ChArUco board over a square's side
+    #: Root mean square distance of the tags' middles from their places, over a tag's side, median over images
     off: float
-    images: int
+    images: int  #: The images that were compared
 
 
 def layout_of(kinds: Iterable[Kind], ids: Sequence[int], views: Iterable[Sequence[SeenTag]]) -> Layout | None:
-    """The layout of the tags with ids from ``ids[0]`` to ``ids[-1]``; None where the images do not tell.
+    """The layout of the tags with ids from ``ids[0]`` to ``ids[-1]``, in increasing order; None where images do not
+    tell.
 
-    Parameters
-    ----------
-    kinds
-        What the board may be.
-    ids : sequence of int
-        In increasing order.
-    views : iterable of sequences of SeenTag
-        The tags of the board's family in each image.
+    `kinds` are what the board may be, and `views` the tags of its family in each image.
     """
     first, count = ids[0], ids[-1] - ids[0] + 1
     wanted = set(ids)

@@ -51,18 +51,8 @@ class _Camera:
 def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     """Propose a rig file for a log; a person completes it.
 
-    Parameters
-    ----------
-    log : Log
-    path
-        The rig file that will be written, for messages.
-
-    Returns
-    -------
-    text : str
-        A rig file that `parse_rig` reads; its lengths are guesses, and TODO marks them.
-    notes : tuple of str
-        What was seen, what was chosen, and what was left out.
+    `path` is the rig file that will be written, for messages. Returns the text of a rig file that `parse_rig` reads,
+    whose lengths are guesses marked TODO, and notes: what was seen, what was chosen, and what was left out.
 
     Raises
     ------

@@ -137,18 +137,10 @@ class RigFile(Section):
 
 @dataclass(frozen=True)
 class Lines:
-    """Where the values of a rig file stand, for messages; rig files of equal content are equal wherever they stand.
+    """Where the values of a rig file stand, for messages; rig files of equal content are equal wherever they stand."""
 
-    Attributes
-    ----------
-    where : str
-        The file; empty for a rig that was made in Python.
-    lines : mapping of key path to int
-        The line of each value.
-    """
-
-    where: str = field(default="", compare=False)
-    lines: Mapping[KeyPath, int] = field(default_factory=dict, compare=False)
+    where: str = field(default="", compare=False)  #: The file; empty for a rig that was made in Python
+    lines: Mapping[KeyPath, int] = field(default_factory=dict, compare=False)  #: The line of each value
 
     def place(self, *paths: KeyPath) -> str:
         """``FILE, lines N and M: a.b and a.c``, as far as known; of a value that is not written, its section's line."""

@@ -234,21 +234,11 @@ _KEY = re.compile(r"\s*(?P<key>[^\s#:][^:]*):(?:\s|$)")
 
 @dataclass(frozen=True)
 class TodoLine:
-    """A line that a person must complete; ``str()`` says which, and what is to be done.
+    """A line that a person must complete; ``str()`` says which, and what is to be done."""
 
-    Attributes
-    ----------
-    number : int
-        From 1 on. A comment on lines of its own belongs to the line after it.
-    key : str
-        The line's key; empty where it has none.
-    words : str
-        The comment from the mark on.
-    """
-
-    number: int
-    key: str
-    words: str
+    number: int  #: From 1 on. A comment on lines of its own belongs to the line after it.
+    key: str  #: The line's key; empty where it has none
+    words: str  #: The comment from the mark on
 
     def __str__(self) -> str:
         return f"line {self.number}{f', {self.key}' if self.key else ''}: {self.words}"

@@ -40,30 +40,6 @@ class RigFrames:
     Names are written into Python, YAML and XML. They have only characters that mean nothing special there: first a
     letter, then letters, digits and _, in parts joined by /.
 
-    Attributes
-    ----------
-    sensor_carrier, target_carrier : str
-        Names of the frames that carry the sensors and the targets.
-    sensors : dict of str to (4, 4) array
-        T_sensorcarrier_sensor, metres.
-    targets : dict of str to (4, 4) array
-        T_targetcarrier_target, metres.
-    cameras : dict of str to Camera
-        Intrinsics by sensor; may lack a sensor.
-    camera_origins : dict of str to str
-        Where the intrinsics of a sensor are from, in words that are written beside them; may lack a sensor, whose
-        intrinsics are as stated.
-    time_offsets_s : dict of str to float
-        Time offsets by sensor, seconds: the sensor's stamp t is the carriers' t + offset. A missing offset is 0.
-    topics : dict of str to str
-        Topics of images by sensor; may lack a sensor.
-    links : dict of str to CameraLink
-        Frames of cameras' bodies by sensor, which are written in the place of the optical frames; may lack a sensor.
-    warnings : tuple of str
-        Why frames should not be used; written into every file.
-    left_out : dict of str to str
-        Why frames of the rig file are not here; written into every file.
-
     Raises
     ------
     FrameError
@@ -74,16 +50,22 @@ class RigFrames:
         A time offset is not finite.
     """
 
+    #: sensor_carrier, target_carrier: names of the frames that carry the sensors and the targets
     sensor_carrier: str
     target_carrier: str
-    sensors: Mapping[str, Array]
-    targets: Mapping[str, Array]
-    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    sensors: Mapping[str, Array]  #: dict of str to (4, 4): T_sensorcarrier_sensor, metres
+    targets: Mapping[str, Array]  #: dict of str to (4, 4): T_targetcarrier_target, metres
+    cameras: Mapping[str, Camera] = field(default_factory=dict)  #: Intrinsics by sensor; may lack a sensor
+    #: Where the intrinsics of a sensor are from, in words that are written beside them; may lack a sensor, whose
+    #: intrinsics are as stated
     camera_origins: Mapping[str, str] = field(default_factory=dict)
+    #: Time offsets by sensor, seconds: the sensor's stamp t is the carriers' t + offset. A missing offset is 0.
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
-    topics: Mapping[str, str] = field(default_factory=dict)
+    topics: Mapping[str, str] = field(default_factory=dict)  #: Topics of images by sensor; may lack a sensor
+    #: Frames of cameras' bodies by sensor, which are written in the place of the optical frames; may lack a sensor
     links: Mapping[str, CameraLink] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  #: Why frames should not be used; written into every file
+    #: Why frames of the rig file are not here; written into every file
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -183,19 +183,9 @@ _KEYS = {
 
 
 def with_kalibr_targets(file: YamlFile, folder: Path) -> YamlFile:
-    """The rig file with the sections that Kalibr's files stand for.
+    """The rig file with the sections that Kalibr's files stand for; their paths start from the rig file's folder.
 
-    Parameters
-    ----------
-    file : YamlFile
-        A rig file as it was read.
-    folder : Path
-        The folder of the rig file, from which the paths start.
-
-    Raises
-    ------
-    RigError
-        A file cannot be read, or is no target that is detected; the message has the rig file's line and the file's.
+    A RigError says that a file cannot be read, or is no target that is detected, with the lines of both files.
     """
     data = file.data
     targets = data.get("targets") if isinstance(data, dict) else None

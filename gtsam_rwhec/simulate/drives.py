@@ -31,50 +31,27 @@ OUTLIER_RAD, OUTLIER_M = 0.2, 1.0
 
 @dataclass(frozen=True)
 class SimulatedOdometry:
-    """One sensor of a drive.
+    """One sensor of a drive."""
 
-    Attributes
-    ----------
-    T_vehicle_sensor : (4, 4) array
-    rotation_rad_per_sqrt_s, translation_m_per_sqrt_s : float
-        Standard deviations of what a second adds to its error, about and along each axis. The translation's is of true
-        lengths, before the scale.
-    scale : float
-        Measured over true length.
-    clock_offset_s : float
-        Its stamp t is the vehicle's t + offset.
-    outlier_share : float
-        This share of its steps is an outlier.
-    every : int
-        It gives each so-many-th pose of the drive.
-    """
-
-    T_vehicle_sensor: Array
+    T_vehicle_sensor: Array  #: (4, 4)
+    #: rotation_rad_per_sqrt_s, translation_m_per_sqrt_s: standard deviations of what a second adds to its error, about
+    #: and along each axis. The translation's is of true lengths, before the scale.
     rotation_rad_per_sqrt_s: float = 0.002
     translation_m_per_sqrt_s: float = 0.02
-    scale: float = 1.0
-    clock_offset_s: float = 0.0
-    outlier_share: float = 0.0
-    every: int = 1
+    scale: float = 1.0  #: Measured over true length
+    clock_offset_s: float = 0.0  #: Its stamp t is the vehicle's t + offset
+    outlier_share: float = 0.0  #: This share of its steps is an outlier
+    every: int = 1  #: It gives each so-many-th pose of the drive
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A simulated drive.
+    """A simulated drive."""
 
-    Attributes
-    ----------
-    stamps_ns : (N,) integers
-        Of the truth, nanoseconds, on the vehicle's clock.
-    T_world_vehicle : (N, 4, 4) array
-        The truth.
-    tracks : dict of sensor to (stamps_ns (M,), T_start_sensor (M, 4, 4))
-        What each sensor says, on its own clock; it begins at the identity.
-    sensors : dict of sensor to SimulatedOdometry
-    """
-
-    stamps_ns: np.ndarray
-    T_world_vehicle: Array
+    stamps_ns: np.ndarray  #: (N,): Of the truth, nanoseconds, on the vehicle's clock
+    T_world_vehicle: Array  #: (N, 4, 4): The truth
+    #: dict of sensor to (stamps_ns (M,), T_start_sensor (M, 4, 4)): What each sensor says, on its own clock; it begins
+    #: at the identity
     tracks: dict[str, tuple[np.ndarray, Array]] = field(hash=False)
     sensors: dict[str, SimulatedOdometry] = field(hash=False)
 

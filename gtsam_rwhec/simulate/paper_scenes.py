@@ -58,7 +58,6 @@ def sphere(
         Noise on B = T_marker_camera, whose sigma and kappa are also the weights. ``released`` noise reproduces Tables 2
         and 3. ``None``: exact measurements, unit weights.
     seed : int or numpy.random.Generator
-        Seed, or a generator to draw path and noise from.
     monocular : bool
         The problem has one unknown scale. As in the paper, all translations of B are multiplied by alpha = 0.5 *after*
         the noise, and the weights stay 1/sigma^2: the noise of the scaled B is half of sigma.
@@ -67,13 +66,6 @@ def sphere(
         paper: 1 with known scale, 2 when monocular. A monocular camera on one sphere has no unique calibration.
     number_of_measurements : int
         Camera poses, half a second apart; 100 in the paper.
-    keep_measurements : bool
-        Passed to :class:`gtsam_rwhec.Problem`.
-
-    Returns
-    -------
-    Simulation
-        With one target, "camera", and one sensor, "marker" (the module says why).
 
     Raises
     ------
@@ -146,22 +138,9 @@ T_HAND_MARKER = pose(np.eye(3), [0.0, 0.0, 0.1])
 def cameras(noise: Noise | None, seed: Seed, *, monocular: bool = False, keep_measurements: bool = True) -> Simulation:
     """Simulate Section 8.2: four fixed cameras see the hand-mounted target in each of its 108 poses.
 
-    Parameters
-    ----------
-    noise : Noise or None
-        Noise on B = T_marker_camera, as in :func:`gtsam_rwhec.simulate.sphere`. ``released`` noise reproduces Tables 4
-        and 5.
-    seed : int or numpy.random.Generator
-        Seed, or a generator to draw the noise from.
-    monocular : bool
-        The problem has one unknown scale, as in :func:`gtsam_rwhec.simulate.sphere`.
-    keep_measurements : bool
-        Passed to :class:`gtsam_rwhec.Problem`.
-
-    Returns
-    -------
-    Simulation
-        With four targets, "camera0" ... "camera3", and one sensor, "marker" (the module says why).
+    `noise` is on B = T_marker_camera; ``released`` noise reproduces Tables 4 and 5. With `monocular` the problem has
+    one unknown scale. Both as in :func:`sphere`. The simulation has four targets, "camera0" ... "camera3", and one
+    sensor, "marker" (the module says why).
     """
     generator = np.random.default_rng(seed)
     T_base_camera = fixed_camera_poses()

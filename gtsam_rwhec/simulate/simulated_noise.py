@@ -42,17 +42,6 @@ Seed = int | Generator
 class Noise:
     """Size and model of the noise on a pose.
 
-    Attributes
-    ----------
-    sigma_m : float
-        Standard deviation of the translation along each axis, metres. With ``released`` noise it is only a scale: those
-        lengths are not Gaussian in three dimensions.
-    kappa : float
-        Concentration of the rotation, no unit. A large kappa of ``stated`` noise means a standard deviation of
-        1/sqrt(2 kappa) rad about each axis.
-    model : "stated" or "released"
-        See the module. The default is the model that the cost assumes.
-
     Raises
     ------
     NoiseError
@@ -61,9 +50,13 @@ class Noise:
         If the model is unknown.
     """
 
+    #: Standard deviation of the translation along each axis, metres. With ``released`` noise it is only a scale: those
+    #: lengths are not Gaussian in three dimensions.
     sigma_m: float
+    #: Concentration of the rotation, no unit. A large kappa of ``stated`` noise means a standard deviation of 1/sqrt(2
+    #: kappa) rad about each axis.
     kappa: float
-    model: NoiseModel = "stated"
+    model: NoiseModel = "stated"  #: See the module. The default is the model that the cost assumes.
 
     def __post_init__(self) -> None:
         for name, value in (("sigma_m", self.sigma_m), ("kappa", self.kappa)):
@@ -77,27 +70,13 @@ class Noise:
 
 
 def langevin_rotations(count: int, kappa: float, seed: Seed) -> Array:
-    """Draw from the isotropic Langevin distribution Langevin(I, kappa) on SO(3), exactly.
+    """Draw rotations (count, 3, 3) from the isotropic Langevin distribution Langevin(I, kappa) on SO(3), exactly.
 
-    The density is proportional to exp(kappa tr R) in the Haar measure. So the axis is uniform, and the angle t has a
-    density proportional to exp(2 kappa cos t) (1 - cos t) on [0, pi]. As a unit quaternion (w, v), tr R = 3 - 4 |v|^2:
-    a Bingham distribution with density exp(-4 kappa |v|^2). It is sampled by rejection from an angular central Gaussian
-    envelope (Kent, Ganeiber, Mardia: A new unified approach for the simulation of a wide class of directional
-    distributions, 2018). At least 44 draws in 100 are accepted, at any kappa >= 0.
-
-    Parameters
-    ----------
-    count : int
-        Number of rotations N.
-    kappa : float
-        Concentration; 0 gives uniform rotations.
-    seed : int or numpy.random.Generator
-        Seed, or a generator to draw from.
-
-    Returns
-    -------
-    (N, 3, 3) array
-        Rotation matrices.
+    The density is proportional to exp(kappa tr R) in the Haar measure; kappa = 0 is uniform. So the axis is uniform,
+    and the angle t has a density proportional to exp(2 kappa cos t) (1 - cos t) on [0, pi]. As a unit quaternion (w,
+    v), tr R = 3 - 4 |v|^2: a Bingham distribution with density exp(-4 kappa |v|^2). It is sampled by rejection from an
+    angular central Gaussian envelope (Kent, Ganeiber, Mardia: A new unified approach for the simulation of a wide class
+    of directional distributions, 2018). At least 44 draws in 100 are accepted, at any kappa >= 0.
     """
     generator = np.random.default_rng(seed)
     bingham = np.array([0.0, 4.0 * kappa, 4.0 * kappa, 4.0 * kappa])
@@ -144,28 +123,10 @@ def released_translations(count: int, sigma_m: float, seed: Seed, section: Secti
 
 
 def perturb(poses: Array, noise: Noise | None, seed: Seed, section: Section | None = None) -> Array:
-    """Add noise to poses on the right: R_a_b R_eps, t_a_b + eps.
+    """Noisy copies of poses T_a_b (N, 4, 4), metres: R_a_b R_eps, t_a_b + eps. Without noise, a copy.
 
-    Parameters
-    ----------
-    poses : (N, 4, 4) array
-        T_a_b, metres; not changed.
-    noise : Noise or None
-        ``None`` returns a copy.
-    seed : int or numpy.random.Generator
-        Seed, or a generator to draw from.
-    section : "8.1" or "8.2", optional
-        The section of the paper whose rule ``released`` noise uses for translations. ``stated`` noise does not use it.
-
-    Returns
-    -------
-    (N, 4, 4) array
-        Noisy poses.
-
-    Raises
-    ------
-    OptionError
-        If the noise is ``released`` and no section is given.
+    `section` is the section of the paper whose rule ``released`` noise has for translations; without one ``released``
+    noise is an OptionError.
     """
     noisy: Array = np.array(poses, dtype=np.float64)
     if noise is None:

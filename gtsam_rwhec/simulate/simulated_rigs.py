@@ -58,23 +58,21 @@ def general(
 
     The carriers are the rig (of the sensors) and the world (of the targets): A = T_rig_world, X = T_world_target,
     Y = T_rig_sensor. The sensor measures B = T_sensor_target, and B has the noise. X is drawn within 2 m and Y within
-    0.5 m of their carriers; rotations are uniform.
+    0.5 m of their carriers; rotations are uniform. The truth has the frames that occur in the problem.
 
     Parameters
     ----------
     targets, sensors : int
         Number of each. With no targets there is only odometry.
     seed : int or numpy.random.Generator
-        Seed, or a generator to draw from. One seed gives the same frames, graph and motion at every noise level.
+        One seed gives the same frames, graph and motion at every noise level.
     graph : "complete", "star", "random", or pairs (target index, sensor index)
-        See :func:`gtsam_rwhec.simulate.simulated_rigs.bipartite_edges`.
-    edge_probability : float
-        Probability of the edges beyond the spanning tree of a ``"random"`` graph.
+        See :func:`gtsam_rwhec.simulate.simulated_rigs.bipartite_edges`, also for `edge_probability`.
     motion : Motion or kind of motion
         The rig's motion, T_world_rig; a kind stands for ``Motion(kind)``.
     number_of_measurements : int, or mapping of (target, sensor) to int
-        For every pair, or by pair of names. The rig has one trajectory, as long as the largest number. A pair with
-        fewer measurements uses poses that are drawn from it.
+        The rig has one trajectory, as long as the largest number. A pair with fewer measurements uses poses that are
+        drawn from it.
     noise : Noise, mapping of (target, sensor) to Noise, or None
         ``stated`` noise on B, added after the scale: sigma_m is the true standard deviation at every scale. It also
         gives the weights. ``None``: exact B, unit weights.
@@ -91,16 +89,7 @@ def general(
         With ``"per_target"``, the targets (and sensors' odometries) whose scale the problem is told.
     odometry : int
         Number of AX = XB measurements for each sensor: A = T_rig_before_after and B = T_sensor_before_after between
-        consecutive poses of a separate trajectory.
-    odometry_noise : Noise or None
-        ``stated`` noise on the odometry's B, and its weights. ``None``: exact, unit weights.
-    keep_measurements : bool
-        Passed to :class:`gtsam_rwhec.Problem`.
-
-    Returns
-    -------
-    Simulation
-        Its truth has the frames that occur in the problem.
+        consecutive poses of a separate trajectory. `odometry_noise` is on that B, and gives its weights.
 
     Raises
     ------
@@ -180,34 +169,25 @@ MotionKind = Literal["general", "planar", "single_axis", "none"]
 class Motion:
     """How a carrier moves. Each pose is drawn independently.
 
-    Attributes
-    ----------
-    kind : "general", "planar", "single_axis" or "none"
-        ``"general"``: rotations about all axes, translations in a cube. ``"planar"``: rotations about one axis,
-        translations perpendicular to it. ``"single_axis"``: rotations about one axis, translations in a cube.
-        ``"none"``: no rotation, translations in a cube.
-    axis : tuple of three floats
-        Rotation axis of planar and single-axis motion, in the frame that does not move, of any length. The default z
-        suits a wheeled robot's floor.
-    max_angle_rad : float
-        Rotation angles are uniform in [-max_angle_rad, max_angle_rad]. The default pi is the most there is; small
-        values give poorly excited problems.
-    extent_m : float
-        Half-width of the cube, metres. The default of one metre is a robot arm's reach.
-    wobble_rad, wobble_m : float
-        Standard deviations of an added Gaussian motion, about and along each axis, for example for "nearly planar"
-        motion. The default 0 keeps the kind exact.
-
     Raises
     ------
     OptionError
         For an unknown kind, a zero axis, or a size that is negative or not finite.
     """
 
+    #: ``"general"``: rotations about all axes, translations in a cube. ``"planar"``: rotations about one axis,
+    #: translations perpendicular to it. ``"single_axis"``: rotations about one axis, translations in a cube.
+    #: ``"none"``: no rotation, translations in a cube.
     kind: MotionKind = "general"
+    #: Rotation axis of planar and single-axis motion, in the frame that does not move, of any length. The default z
+    #: suits a wheeled robot's floor.
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    #: Rotation angles are uniform in [-max_angle_rad, max_angle_rad]. The default pi is the most there is; small values
+    #: give poorly excited problems.
     max_angle_rad: float = math.pi
-    extent_m: float = 1.0
+    extent_m: float = 1.0  #: Half-width of the cube, metres. The default of one metre is a robot arm's reach.
+    #: wobble_rad, wobble_m: standard deviations of an added Gaussian motion, about and along each axis, for example for
+    #: "nearly planar" motion. The default 0 keeps the kind exact.
     wobble_rad: float = 0.0
     wobble_m: float = 0.0
 
@@ -251,19 +231,9 @@ def bipartite_edges(
 ) -> list[Edge]:
     """List the edges of a graph between targets and sensors, as (target index, sensor index).
 
-    Parameters
-    ----------
-    graph : "complete", "star", "random", or edges
-        ``"complete"``: every sensor sees every target. ``"star"``: the fewest edges that connect all frames, all at
-        sensor 0 or at target 0 (two joined stars, or one star where there is one target or one sensor). ``"random"``: a
-        random spanning tree, and every other edge with probability ``edge_probability``. Given edges keep their order;
-        they may leave unconnected parts, and frames without an edge.
-    targets, sensors : int
-        Number of targets and of sensors.
-    seed : int or numpy.random.Generator
-        Seed, or a generator to draw from; only ``"random"`` uses it.
-    edge_probability : float
-        Probability of an edge outside the tree.
+    ``"complete"``: every sensor sees every target. ``"star"``: the fewest edges that connect all frames, all at sensor
+    0 or at target 0. ``"random"``: a random spanning tree, and every other edge with probability `edge_probability`.
+    Given edges keep their order; they may leave unconnected parts, and frames without an edge.
 
     Raises
     ------

@@ -34,18 +34,10 @@ class PosesAndScale(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FrameDistance:
-    """Distance of one estimated frame from its truth.
+    """Distance of one estimated frame from its truth."""
 
-    Attributes
-    ----------
-    translation_m : float
-        |t_estimated - t_true|, metres.
-    rotation_rad : float
-        Angle of R_true' R_estimated (the geodesic distance on SO(3)), radians, in [0, pi].
-    """
-
-    translation_m: float
-    rotation_rad: float
+    translation_m: float  #: |t_estimated - t_true|, metres
+    rotation_rad: float  #: Angle of R_true' R_estimated (the geodesic distance on SO(3)), radians, in [0, pi]
 
     @property
     def translation_mm(self) -> float:
@@ -60,40 +52,23 @@ class FrameDistance:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationErrors:
-    """Distance of an answer from the truth of its simulation.
+    """Distance of an answer from the truth of its simulation."""
 
-    Attributes
-    ----------
-    X, Y : dict of str to FrameDistance
-        Error of each target's frame (X) and of each sensor's frame (Y), by name.
-    relative_scale : float or dict of str to float
-        |alpha_estimated - alpha_true| / alpha_true, by target in scale mode ``"per_target"``.
-    """
-
+    #: X, Y: error of each target's frame (X) and of each sensor's frame (Y), by name
     X: dict[str, FrameDistance]
     Y: dict[str, FrameDistance]
+    #: |alpha_estimated - alpha_true| / alpha_true, by target in scale mode ``"per_target"``
     relative_scale: float | dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """A simulated calibration problem and its truth.
+    """A simulated calibration problem and its truth."""
 
-    Attributes
-    ----------
-    problem : Problem
-        The measurements, ready for ``gtsam_rwhec.solve``.
-    X : dict of str to (4, 4) array
-        True T_targetcarrier_target by target, metres; read-only.
-    Y : dict of str to (4, 4) array
-        True T_sensorcarrier_sensor by sensor, metres; read-only.
-    scale : float or dict of str to float
-        True alpha, t_B = alpha * (true length), by target in scale mode ``"per_target"``.
-    """
-
-    problem: Problem
-    X: dict[str, Array]
-    Y: dict[str, Array]
+    problem: Problem  #: The measurements, ready for ``gtsam_rwhec.solve``.
+    X: dict[str, Array]  #: dict of str to (4, 4): True T_targetcarrier_target by target, metres; read-only
+    Y: dict[str, Array]  #: dict of str to (4, 4): True T_sensorcarrier_sensor by sensor, metres; read-only
+    #: True alpha, t_B = alpha * (true length), by target in scale mode ``"per_target"``
     scale: float | dict[str, float]
 
     def __post_init__(self) -> None:
