@@ -4,7 +4,7 @@
 
 Takes some hours. ``--quick`` takes minutes: a small part of each, which tells that all run and roughly where they are
 (bars of small parts may be missed by chance). Exits with 1 if a bar is missed. `pip install '.[bench]'` brings what the
-neutral benchmark and OpenCV 4's hand-eye calls need.
+neutral benchmark and OpenCV 4's hand-eye calls need. The papers' tables are in examples/papers.
 """
 
 from __future__ import annotations
@@ -53,9 +53,6 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "fleet_kills": ("", None),
     "fleet_s3": ("", None),
     "fleet_drift": ("", None),
-    "tables_2_to_5": ("--runs 1000", None),
-    "method_tables": ("--runs 1000", None),
-    "lom_tables": ("--runs 300", None),
     "kinhec": ("--seeds 20260909", None),
 }
 

@@ -6,7 +6,7 @@ Noise: ``released``, with which the paper's experiments were run, or ``stated``,
 close to the truth (10 cm, 10 degrees), and from Wang's closed form where the scale is known. Some of the paper's rows
 are not what its text says (t_y of Y's inverse, rotation errors doubled or tenfold, other weights): with ``released``
 noise they follow here once more, as they seem to have been run. What those readings are and how they were found is in
-benchmarks/method_tables.py and lom_tables.py, which hold the paper's numbers too and judge them at 1,000 runs.
+examples/papers/method_tables.py and lom_tables.py, which hold the paper's numbers too and judge them at 1,000 runs.
 Differences are in combined standard errors, ours and the paper's. Rows without numbers of the paper are methods that
 its tables leave out. Two of them fail in Table 2 by their own mathematics: Y is a half turn about z there, whose
 quaternion has a scalar part of zero, which Zhuang divides by; and the cameras of Table 2 look at a fixed point, so that
@@ -16,32 +16,17 @@ Li's Kronecker equations hold exactly with matrices of zeros and translations to
 from __future__ import annotations
 
 import math
-import sys
 import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import lom_tables
+import method_tables
 import numpy as np
 from in_processes import in_processes
 from matplotlib.figure import Figure
-from reports import (
-    BLUE,
-    HERE,
-    ORANGE,
-    VERMILLION,
-    arguments_of,
-    markdown,
-    plain,
-    plain_numbers,
-    save_picture,
-    save_text,
-)
-
-sys.path.insert(1, str(HERE.parents[1] / "benchmarks"))
-
-import lom_tables
-import method_tables
 from paper_tables import COLUMNS, Experiment, Runs, cell_of, compare, simulated
+from reports import BLUE, ORANGE, VERMILLION, arguments_of, markdown, plain, plain_numbers, save_picture, save_text
 from tables_2_to_5 import EXPERIMENTS
 
 import gtsam_rwhec as rw

@@ -180,7 +180,7 @@ def test_released_noise_gives_the_errors_of_the_tables(
     translation_mm: tuple[float, float],
     rotation_deg: tuple[float, float],
 ) -> None:
-    # A glance at what benchmarks/tables_2_to_5.py does with 16 experiments and 1,000 runs. Means over the cameras
+    # A glance at what examples/papers/tables_2_to_5.py does with 16 experiments and 1,000 runs. Means over the cameras
     # of a run, so that their standard errors (of 40 runs, and of the paper's 100) are at most these.
     runs = 40
     errors = []

@@ -1,6 +1,6 @@
 """Tables 2-5 of the RWHEC paper, rows "Ours": our mean errors against the paper's.
 
-    python benchmarks/tables_2_to_5.py --runs 1000
+    python examples/papers/tables_2_to_5.py --runs 1000
 
 Simulates the paper's 16 experiments with the noise that it was really run with (``--model stated`` for the noise of its
 text), solves each run with ``gtsam_rwhec.solve`` and compares mean errors in combined standard errors. The bar: every

@@ -1,6 +1,6 @@
 """Tables 2-5 of the RWHEC paper, rows "LOM": its local on-manifold method from close and from random starts.
 
-    python benchmarks/lom_tables.py --runs 300
+    python examples/papers/lom_tables.py --runs 300
 
 Close starts stand 10 cm and 10 degrees, at the most, from the truth, with a scale of 1; random ones have rotations
 uniform on SO(3), translations uniform in [-1, 1]^3 and a scale of 1. In Tables 2 and 4 the paper starts LOM from Wang's

@@ -1,6 +1,6 @@
 """Tables 2 and 4 of the RWHEC paper, rows of the other methods: our implementations' mean errors against its.
 
-    python benchmarks/method_tables.py --runs 1000
+    python examples/papers/method_tables.py --runs 1000
 
 The runs are those of tables_2_to_5.py (``released`` noise), each solved by every method of ``gtsam_rwhec.methods`` that
 has a row. Some rows are not what the paper's text says. They are printed twice: as the text has them, without a bar,
