@@ -37,7 +37,7 @@ from simulated_arms import ARM
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fleet.rows import RobotRow, RowFrame
+from gtsam_rwhec.fleet.fleet_rows import RobotRow, RowFrame
 from gtsam_rwhec.fleet.watching import DAY_NS, Watched, watch
 from gtsam_rwhec.results.difference import as_result, without_constant_errors
 from gtsam_rwhec.simulate.simulated_noise import random_poses

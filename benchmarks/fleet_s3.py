@@ -18,7 +18,7 @@ from mixed_log import TOPICS, write_mixed_log
 from s3_server import BUCKET, s3_server
 
 from gtsam_rwhec.fleet import stores
-from gtsam_rwhec.fleet.log_parts import Needed, local_copy_of_topics, needed_of
+from gtsam_rwhec.fleet.topic_copy import Needed, local_copy_of_topics, needed_of
 from gtsam_rwhec.logs import open_log
 
 
@@ -34,9 +34,9 @@ def rows(arguments: argparse.Namespace) -> list[Row]:
             assert isinstance(needed, Needed)
             chunks += needed.chunk_bytes
             url = f"s3://{BUCKET}/{seed}.mcap"
-            stores.write_once(url, path.read_bytes(), server.options)
+            stores.write_once(url, path.read_bytes())
             before = server.sent, server.asked
-            copy = local_copy_of_topics(url, TOPICS, folder, server.options)
+            copy = local_copy_of_topics(url, TOPICS, folder)
             assert copy.bytes_read == server.sent - before[0]
             sent, asked = sent + copy.bytes_read, asked + server.asked - before[1]
             with open_log(copy.path) as log:

@@ -33,14 +33,6 @@ def run(
     each: Annotated[
         Each, typer.Option(help="What is solved together: all logs of a robot, those of a day (UTC), or each alone.")
     ] = "robot",
-    refine: Annotated[
-        bool,
-        typer.Option(
-            "--refine",
-            help="Calibrate from the measurements and corners, with all that calibrate does. Without it the moments "
-            "are solved, which is fast: no outliers beyond cleaning, no noise of the carriers' poses.",
-        ),
-    ] = False,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -71,11 +63,13 @@ def run(
     with StageDisplay() as stage, said_in_the_report():
         stage(f"reading {rw.fleet.shown(manifest)}")
         fleet = rw.fleet.manifest_of_pattern(manifest, rig) if rig is not None else rw.fleet.read_manifest(manifest)
-        options = rw.fleet.FleetOptions(each=each, refine=refine)
-        with rw.fleet.StartedLate(lambda: rw.fleet.engine_of(count, memory_bytes, scheduler), stage) as started:
-            done = rw.fleet.run(fleet, output, options, started, stage)
+        if count == 0 and scheduler is None:
+            done = rw.fleet.run(fleet, output, each, progress=stage)
+        else:
+            with rw.fleet.DaskEngine(count, memory_bytes, scheduler, progress=stage) as engine:
+                done = rw.fleet.run(fleet, output, each, engine, stage)
     rw.fleet.print_fleet(done)
-    say(f"The page of all robots: {rw.fleet.shown(rw.fleet.put_summary(done.rows, output))}", to_errors=True)
+    say(f"The page of all robots: {rw.fleet.shown(rw.fleet.put_page(done.rows, output))}", to_errors=True)
     return ExitStatus.DONE if done.is_fine else ExitStatus.CHANGED
 
 
@@ -110,7 +104,7 @@ def watch(
         bool, typer.Option("--every-night", help="The stream has a line for each night too.")
     ] = False,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="An HTML file with the charts of the robots that changed.")
+        Path | None, typer.Option("--output", "-o", help="A page (HTML): all calibrations, what moved, with charts.")
     ] = None,
 ) -> ExitStatus:
     """What moved on each robot over time, when, and which frame; exit status 1 if something did."""
@@ -120,7 +114,8 @@ def watch(
     local = [Path(each) for each in runs if "://" not in each]
     for written in (output, to_file):
         check_output(written, *local)
-    watched = rw.fleet.watch(rw.fleet.read_history(runs), rate)
+    rows = rw.fleet.read_history(runs)
+    watched = rw.fleet.watch(rows, rate)
     lines = rw.fleet.stream(watched, every_night=every_night)
     is_piped = stream == STANDARD_OUTPUT
     if is_piped:
@@ -129,10 +124,10 @@ def watch(
     elif to_file is not None:
         write_atomically(to_file, "".join(f"{line}\n" for line in lines).encode())
     alarms = rw.fleet.alarm_lines(watched, since_ns)
-    for words in (rw.fleet.verdict(watched, since_ns), *alarms, *rw.fleet.remarks(watched)):
+    for words in (rw.fleet.drift_verdict(watched, since_ns), *alarms, *rw.fleet.drift_remarks(watched)):
         say(words, to_errors=is_piped)
     if output is not None:
-        rw.fleet.write_watch_page(watched, output, since_ns)
+        rw.fleet.write_fleet_page(rows, watched, output, since_ns)
     for file in (to_file, output):
         if file is not None:
             say(f"Written to {shown_path(file)}.", to_errors=True)

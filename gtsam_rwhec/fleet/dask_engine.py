@@ -1,7 +1,8 @@
 """The engine on Dask: processes of this machine, or any scheduler by address.
 
-The scheduler has at most a few tasks for each thread at a time, so a run of 100,000 tasks costs it no more memory than
-one of 100. A task's outcome is a receipt or a Failed, never an error: what a worker raises does not travel.
+Dask tries again what breaks off (``retries``) and what kills its worker (``allowed-failures``), and bounds the workers'
+memory. The scheduler has at most a few tasks for each thread at a time, so a run of 100,000 tasks costs it no more
+memory than one of 100.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import queue
+import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator
@@ -18,11 +20,10 @@ from itertools import count, islice
 from typing import Any
 
 from gtsam_rwhec.errors import FleetError, OptionError
-from gtsam_rwhec.fleet.attempts import ATTEMPTS, PAUSE_S, attempted
+from gtsam_rwhec.files.optional_packages import extra_named
+from gtsam_rwhec.files.progress import Progress, Remark, silent
 from gtsam_rwhec.fleet.dask_cluster import START_S, DaskCluster
-from gtsam_rwhec.fleet.extras import imported
-from gtsam_rwhec.fleet.order import TaskOrder
-from gtsam_rwhec.fleet.tasks import Failed, Receipt, Task
+from gtsam_rwhec.fleet.tasks import ATTEMPTS, Failed, Receipt, Task, carried_out, failed
 from gtsam_rwhec.fleet.without_secrets import without_secrets
 
 _CLIENT_LOG = logging.getLogger("distributed.client")
@@ -30,48 +31,43 @@ _CLIENT_LOG = logging.getLogger("distributed.client")
 TASKS_OF_A_THREAD, FEWEST_TASKS = 4, 16
 #: Seconds between two looks at how many threads there are, and whether the processes live.
 LOOK_S = 2.0
-#: Seconds that a scheduler has to answer.
-CONNECT_S = 15.0
-#: The same on this machine.
-LOCAL_S = 3.0
+#: Seconds that a scheduler has to answer; the same on this machine.
+CONNECT_S, LOCAL_S = 15.0, 3.0
 #: Bytes of memory that a worker may have, if not said: a log of 1 GB in detection takes less than half of it.
 MEMORY_BYTES = 2 << 30
-#: A worker may have this share of its memory for data before Python says that there is no more; Dask ends it at 1.
-_DATA_SHARE = 0.9
+_SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) *([kMGT]?)(i?)B?", re.IGNORECASE)
+
+
+def bytes_of(size: str) -> int:
+    """The bytes of a size in words: "2GB", "500 MB", "1.5GiB"; an OptionError for anything else."""
+    found = _SIZE.fullmatch(size.strip())
+    if found is None or float(found[1]) == 0.0:
+        raise OptionError(f"{size!r} is no size of memory; give a number with MB or GB, such as 2GB")
+    return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2].lower() or " "))
 
 
 class DaskEngine:
-    """Carries out tasks on Dask's workers. It is a context manager that stops what it started.
+    """Carries out tasks on Dask's workers, which start with the first task. A context manager stops what it started.
 
     Parameters
     ----------
     workers
         How many processes of this machine, each with one thread and one thread of BLAS.
     memory_bytes
-        Memory of each worker. A task that needs more is a Failed of kind ``MemoryError`` or, where a library took it
-        before Python could say so, of kind ``KilledWorker``.
+        Memory of each worker. A task that needs more is a Failed.
     scheduler
         The address of a scheduler that runs already (``"tcp://10.0.0.1:8786"``). Its workers need this library of this
         version, have the memory that whoever started them said, and count how often a task kills them by the
         scheduler's own ``allowed-failures``; `workers` is not used.
-    attempts
-        How often a task is tried for errors of the system, and for workers that die.
     dashboard
         Whether a scheduler of this machine has Dask's page.
-    pause_s
-        Seconds before the second attempt.
-
-    Attributes
-    ----------
-    dashboard : str
-        The address of Dask's own page; empty where there is none.
+    progress
+        Is told that workers start, and where Dask's page is.
 
     Raises
     ------
     OptionError
-        Dask is not installed, or there are no workers.
-    FleetError
-        The processes do not start, or nobody answers at the address.
+        There are no workers.
     """
 
     def __init__(
@@ -80,31 +76,47 @@ class DaskEngine:
         memory_bytes: int = MEMORY_BYTES,
         scheduler: str | None = None,
         *,
-        attempts: int = ATTEMPTS,
         dashboard: bool = True,
-        pause_s: float = PAUSE_S,
+        progress: Progress = silent,
     ) -> None:
         if scheduler is None and workers < 1:
             raise OptionError(f"{workers} workers cannot work; give 1 or more")
-        self._distributed = imported("distributed", "fleet", "the engine Dask")
-        self._spec = imported("dask._task_spec", "fleet", "the engine Dask").Task
-        self.attempts, self.pause_s, self.memory_bytes = attempts, pause_s, memory_bytes
-        self.cluster = None if scheduler else DaskCluster(workers, memory_bytes, attempts - 1, dashboard)
-        self.address = scheduler or (self.cluster.address if self.cluster else "")
+        self.workers, self.memory_bytes, self.dashboard = workers, memory_bytes, dashboard
+        self.address, self.tell = scheduler or "", progress
+        self.cluster: DaskCluster | None = None
+        self._client: Any = None
+        self._is_gone, self._numbers, self._level = False, count(), _CLIENT_LOG.level
+
+    def start(self) -> None:
+        """Start the processes, or look for the scheduler, if that is still to be done.
+
+        Raises
+        ------
+        MissingPackageError
+            Dask is not installed.
+        FleetError
+            The processes do not start, or nobody answers at the address.
+        """
+        if self._client is not None:
+            return
+        with extra_named():
+            import distributed
+            from dask._task_spec import Task as Spec
+        self._distributed, self._spec = distributed, Spec
+        self.tell("starting workers")
+        if not self.address:
+            self.cluster = DaskCluster(self.workers, self.memory_bytes, ATTEMPTS - 1, self.dashboard)
+            self.address = self.cluster.address
         # What it says of a scheduler that is gone, with tracebacks, an error of this engine says in words.
-        self._is_gone, self._numbers = False, count()
-        self._level = _CLIENT_LOG.level
         _CLIENT_LOG.setLevel(logging.CRITICAL)
         try:
             self._client = self._connected()
         except BaseException:
-            _CLIENT_LOG.setLevel(self._level)
-            if self.cluster is not None:
-                self.cluster.close()
+            self.close()
             raise
-        self.dashboard = ""
-        if self.cluster is None or (dashboard and find_spec("bokeh") is not None):
-            self.dashboard = self.cluster.dashboard if self.cluster else str(self._client.dashboard_link)
+        page = self.cluster.dashboard if self.cluster else str(self._client.dashboard_link)
+        if self.dashboard and page and find_spec("bokeh") is not None:
+            self.tell(Remark(f"Dask's dashboard: {page}"))
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Receipt | Failed]:
         """Yield one receipt or failure for each task, as they end.
@@ -112,20 +124,22 @@ class DaskEngine:
         Raises
         ------
         FleetError
-            The tasks contradict one another; or the scheduler is gone, or all workers are. What is done is on disk: the
-            same run goes on from there.
+            The scheduler is gone, or all workers are; or it cannot start. What is done is on disk: the same run goes on
+            from there.
         """
-        order = TaskOrder(tasks)
-        total = len(order)
+        self.start()
+        tasks = list(tasks)
+        waiting, left = iter(tasks), len(tasks)
         running: dict[str, tuple[Task, Any]] = {}
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         most, looked_s = 0, -LOOK_S
         try:
-            while len(order):
+            while left:
+                of_all = f"after {len(tasks) - left} of {len(tasks)} tasks"
                 if time.monotonic() > looked_s + LOOK_S:
-                    most, looked_s = self._most_tasks(total - len(order), total), time.monotonic()
-                batch = list(islice(iter(order.take, None), most - len(running)))
-                for (task, _), future in zip(batch, self._submitted(batch), strict=True):
+                    most, looked_s = self._most_tasks(of_all), time.monotonic()
+                batch = list(islice(waiting, most - len(running)))
+                for task, future in zip(batch, self._submitted(batch), strict=True):
                     running[future.key] = task, future
                     future.add_done_callback(ended.put)
                 try:
@@ -134,10 +148,10 @@ class DaskEngine:
                     continue
                 while not ended.empty():
                     futures.append(ended.get())
-                for future, outcome in self._outcomes(futures, running, total - len(order), total):
-                    task, _ = running.pop(future.key)
+                for future, outcome in self._outcomes(futures, running, of_all):
+                    del running[future.key]
                     future.release()
-                    order.ended(outcome, task.key)
+                    left -= 1
                     yield outcome
         finally:
             if running and not self._is_gone:
@@ -146,8 +160,10 @@ class DaskEngine:
 
     def close(self) -> None:
         """Stop what was started; a scheduler by address goes on."""
-        with suppress(OSError, asyncio.CancelledError):
-            self._client.close(timeout=2)
+        if self._client is not None:
+            with suppress(OSError, asyncio.CancelledError):
+                self._client.close(timeout=2)
+            self._client = None
         _CLIENT_LOG.setLevel(self._level)
         if self.cluster is not None:
             self.cluster.close()
@@ -176,69 +192,69 @@ class DaskEngine:
             raise FleetError(f"no worker of Dask starts within {START_S:.0f} s. {self.cluster.last_words()}") from None
         return client
 
-    def _submitted(self, batch: list[tuple[Task, tuple[Receipt | Failed, ...]]]) -> list[Any]:
-        bound = int(_DATA_SHARE * self.memory_bytes) if self.cluster is not None else None
-        options = {"attempts": self.attempts, "memory_bytes": bound, "pause_s": self.pause_s}
+    def _submitted(self, batch: list[Task]) -> list[Any]:
         graph = {}
-        for task, done in batch:
+        for task in batch:
             # Dask groups tasks, and learns how long they take, by the words before the hyphen.
             # Of tasks that are sent together, those whose keys come first are done first.
             key = f"{task.function.__name__}-{next(self._numbers):08x}{uuid.uuid4().hex[8:]}"
             # Tasks that read data wait at the scheduler, not at a worker: so a task that kills its worker is alone
             # there, and no other is blamed.
-            graph[key] = self._spec(key, attempted, task, done, _data_producer=True, **options)
-        return list(self._client.get(graph, list(graph), sync=False)) if graph else []
+            graph[key] = self._spec(key, carried_out, task, _data_producer=True)
+        return list(self._client.get(graph, list(graph), sync=False, retries=ATTEMPTS - 1)) if graph else []
 
-    def _most_tasks(self, done: int, total: int) -> int:
+    def _most_tasks(self, of_all: str) -> int:
         """How many tasks the scheduler should have now. A FleetError if it is gone."""
-        self._check(done, total)
+        self._check(of_all)
         try:
             threads: int = sum(self._client.nthreads().values())
         except OSError as error:
-            self._check(done, total)
-            raise self._gone(done, total, f"{error}.") from None
+            raise self._gone(of_all, f"{error}.") from None
         return max(FEWEST_TASKS, TASKS_OF_A_THREAD * threads)
 
     def _outcomes(
-        self, futures: list[Any], running: dict[str, tuple[Task, Any]], done: int, total: int
+        self, futures: list[Any], running: dict[str, tuple[Task, Any]], of_all: str
     ) -> list[tuple[Any, Receipt | Failed]]:
         """Each future with its outcome. A FleetError if the scheduler is gone."""
-        self._check(done, total)
+        self._check(of_all)
         finished = [future for future in futures if future.status == "finished"]
         try:
             outcomes = list(zip(finished, self._client.gather(finished), strict=True))
         except (OSError, asyncio.CancelledError) as error:
-            self._check(done, total)
-            raise self._gone(done, total, f"{error or type(error).__name__}.") from None
+            raise self._gone(of_all, f"{error or type(error).__name__}.") from None
         for future in futures:
+            task = running[future.key][0]
             if future.status == "error":
-                outcomes.append((future, self._failed(running[future.key][0], future.exception())))
+                outcomes.append((future, self._failed(task, future.exception())))
             elif future.status != "finished":
-                raise self._gone(done, total, f"it lost the task {running[future.key][0].key}.")
+                raise self._gone(of_all, f"it lost the task {task.key}.")
         return outcomes
 
     def _failed(self, task: Task, error: BaseException) -> Failed:
         if isinstance(error, self._distributed.KilledWorker):
-            deaths = error.allowed_failures + 1
             memory = f", {self.memory_bytes} bytes here," if self.cluster is not None else ""
             words = (
-                f"the worker that did it died, {deaths} times, on the last of them at {error.last_worker.address}. It "
-                f"needs more memory than a worker may have{memory} or a library that it calls crashes: do this log "
-                "alone to see which."
+                f"the worker that did it died, {error.allowed_failures + 1} times, on the last of them at "
+                f"{error.last_worker.address}. It needs more memory than a worker may have{memory} or a library that "
+                "it calls crashes: do this log alone to see which."
             )
-            return Failed(task.key, words, "KilledWorker", deaths)
+            return Failed(task.key, words)
+        if isinstance(error, OSError):
+            return failed(task, error)
         words = f"a worker cannot do it: {type(error).__name__}: {error}. Has it this library, of this version?"
-        return Failed(task.key, without_secrets(words), type(error).__name__)
+        return Failed(task.key, without_secrets(words))
 
-    def _check(self, done: int, total: int) -> None:
+    def _check(self, of_all: str) -> None:
         """Raise a FleetError if the scheduler or all workers are gone."""
         gone = self.cluster.gone() if self.cluster is not None else ""
         if gone or self._client.status != "running":
-            raise self._gone(done, total, gone or f"nobody answers at {self.address}.")
+            raise self._gone(of_all, gone or f"nobody answers at {self.address}.")
 
-    def _gone(self, done: int, total: int, why: str) -> FleetError:
+    def _gone(self, of_all: str, why: str) -> FleetError:
         self._is_gone = True
+        if self.cluster is not None:
+            why = self.cluster.gone() or why
         return FleetError(
-            f"Dask's scheduler is gone after {done} of {total} tasks: {without_secrets(why, self.address)} Run it "
-            "again: it goes on from what is done."
+            f"Dask's scheduler is gone {of_all}: {without_secrets(why, self.address)} Run it again: it goes on from "
+            "what is done."
         )

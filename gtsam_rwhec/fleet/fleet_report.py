@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 
-import numpy as np
-
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.fleet.rows import RobotRow
-from gtsam_rwhec.fleet.running import ROWS_FILE, FleetRun
+from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
+from gtsam_rwhec.fleet.fleet_run import FleetRun
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, print_tables, report_console
-from gtsam_rwhec.solver.certificate import Basis
 
 #: So many robots and failures are named.
 MOST_NAMED = 10
 #: Characters of a reason in a list.
 LONGEST_REASON = 600
-HEADINGS = ("verdict", "logs", "n", "mm", "deg", "condition")
+HEADINGS = ("verdict", "logs", "n", "mm", "deg")
 LEGEND = (
     "n: measurements. mm, deg: the largest standard deviation of a sensor's position along, and of its rotation about, "
-    "one axis; - where the motion leaves it free. condition: poses are the same to 1e-12 times this, however the work "
-    "is divided."
-)
-OF_MOMENTS = (
-    "The answers are those of the moments: optimal for the cleaned measurements, with the noise of B estimated. "
-    "Outliers that cleaning left, noise of the carriers' poses and corners are not looked at: --refine does."
+    "one axis; - where the motion leaves it free."
 )
 _WORDS = {Verdict.USE: "may be used", Verdict.CARE: "to be used with care", Verdict.DO_NOT_USE: "not to be used"}
 
@@ -49,8 +42,6 @@ def print_fleet(run: FleetRun) -> None:
             more = len(said) - MOST_NAMED
             print_list(console, [*said[:MOST_NAMED], *([f"and {more} more, in {ROWS_FILE}"] if more > 0 else [])])
     console.print()
-    if any(row.basis is Basis.MOMENTS for row in run.rows):
-        print_sentence(console, OF_MOMENTS)
     print_sentence(console, f"Results: {run.output}/robots/; all rows: {run.output}/{ROWS_FILE}.")
     print_sentence(console, _done(run), "dim")
 
@@ -70,7 +61,7 @@ def worst_first(rows: Sequence[RobotRow]) -> list[RobotRow]:
     """The calibrations, those that are not to be used first, then by how well positions of sensors are known."""
     there = [row for row in rows if row.verdict is not None]
     order = list(Verdict)
-    return sorted(there, key=lambda row: (-order.index(row.verdict), -_deviations(row)[0], row.unit))  # type: ignore[arg-type]
+    return sorted(there, key=lambda row: (-order.index(row.verdict), -row.largest_deviations("sensor")[1], row.unit))  # type: ignore[arg-type]
 
 
 def failures_of(rows: Sequence[RobotRow]) -> list[str]:
@@ -102,22 +93,12 @@ def _name(row: RobotRow) -> str:
 def _cells(rows: Sequence[RobotRow]) -> dict[str, tuple[str, ...]]:
     cells = {}
     for row in rows:
-        deviations = ("-" if np.isinf(value) else f"{value:.3g}" for value in _deviations(row))
+        turned, moved = row.largest_deviations("sensor")
+        deviations = ("-" if math.isinf(value) else f"{value:.3g}" for value in (1e3 * moved, math.degrees(turned)))
         logs = str(row.logs) if not row.failed_logs else f"{row.logs} of {row.logs + len(row.failed_logs)}"
-        condition = "-" if row.condition is None else f"{row.condition:.0e}"
         words = "" if row.verdict is None else row.verdict.value.replace("_", " ")
-        cells[_name(row)] = (words, logs, str(row.measurements), *deviations, condition)
+        cells[_name(row)] = (words, logs, str(row.measurements), *deviations)
     return cells
-
-
-def _deviations(row: RobotRow) -> tuple[float, float]:
-    """The largest standard deviations of a sensor: along an axis, mm, and about an axis, degrees."""
-    number = sum(frame.kind == "sensor" for frame in row.frames)
-    if row.covariance is None or not number:
-        return np.inf, np.inf
-    variances = np.diagonal(row.covariance)[: 6 * number].reshape(-1, 2, 3)
-    turned, moved = np.sqrt(variances.max(axis=(0, 2)))
-    return float(1e3 * moved), float(np.degrees(turned))
 
 
 def _short(words: str | None) -> str:

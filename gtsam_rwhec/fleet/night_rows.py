@@ -10,7 +10,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
-from gtsam_rwhec.fleet.rows import RobotRow
+from gtsam_rwhec.fleet.fleet_rows import RobotRow
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.common_quantities import Movement
 

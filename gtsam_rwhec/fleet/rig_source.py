@@ -65,11 +65,6 @@ class RigSource:
                 write_atomically(place, content)
         return _in_words(self.text, shown(self.url), base)
 
-    def parsed(self) -> None:
-        """Check it before anything is done; `RigError` as `rig`."""
-        with TemporaryDirectory(prefix="gtsam-rwhec-") as folder:
-            self.rig(Path(folder))
-
 
 @lru_cache(maxsize=8)
 def _parsed(text: str, where: str) -> Rig:
@@ -84,13 +79,7 @@ def _in_words(text: str, where: str, folder: Path) -> Rig:
 
 
 def read_rig_source(url: str) -> RigSource:
-    """Read a rig file, and the files that it names, which start from its folder.
-
-    Raises
-    ------
-    RigError
-        It is not there, or cannot be read; or a file that it names.
-    """
+    """Read and check a rig file and the files that it names, which start from its folder; errors as ``read_rig``."""
     try:
         text = read_bytes(url, most_bytes=MOST_BYTES).decode("utf-8-sig")
         data = parse_yaml(text, shown(url)).data
@@ -100,7 +89,10 @@ def read_rig_source(url: str) -> RigSource:
         raise RigError(f"{shown(url)} is not a text file in UTF-8 (byte {error.start}); YAML was expected.") from error
     except (FileFormatError, StoreError) as error:
         raise RigError(str(error)) from error
-    return RigSource(url, text, files)
+    source = RigSource(url, text, files)
+    with TemporaryDirectory(prefix="gtsam-rwhec-") as folder:
+        source.rig(Path(folder))
+    return source
 
 
 def _named(data: dict[str, Any]) -> set[str]:

@@ -6,8 +6,8 @@ import asyncio
 import errno
 import random
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import TypeVar
 
 from gtsam_rwhec.errors import StoreError, StoreInterruptedError
 from gtsam_rwhec.fleet.without_secrets import without_secrets
@@ -46,7 +46,6 @@ def requested(
     ask: Callable[[], Answer],
     what: str,
     url: str,
-    options: Mapping[str, Any] | None = None,
     how_far: Callable[[], str] | None = None,
     attempts: int | None = None,
 ) -> Answer:
@@ -58,8 +57,8 @@ def requested(
         May be called several times; it goes on from where it broke off, if it can.
     what
         What is asked for, in words, without credentials.
-    url, options
-        Where, and the storage options: their secrets are taken out of what libraries say.
+    url
+        Where: its secrets are taken out of what libraries say.
     how_far
         How much has come, in words, for errors.
     attempts
@@ -79,11 +78,11 @@ def requested(
         except (StoreError, ImportError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001  (stores' libraries have errors of many roots; none is swallowed)
-            fault = _fault(error, what, url, options)
+            fault = _fault(error, what, url)
             if fault is not None:
                 raise fault from None  # the library's own error may repeat credentials
             if attempt == most:
-                said = without_secrets(_words(error), url, options)
+                said = without_secrets(_words(error), url)
                 times = f"{most} times" if most > 1 else "once"
                 came = f" {how_far()}." if how_far is not None else ""
                 raise StoreInterruptedError(
@@ -94,10 +93,10 @@ def requested(
     raise AssertionError("not reached")
 
 
-def _fault(error: Exception, what: str, url: str, options: Mapping[str, Any] | None) -> StoreError | None:
+def _fault(error: Exception, what: str, url: str) -> StoreError | None:
     """The error of what stays wrong; None if the same request may work later."""
     words = _words(error)
-    said = without_secrets(words, url, options)
+    said = without_secrets(words, url)
     # The names in the URL say nothing of the error.
     names = [name for name in url.lower().replace("?", "/").split("/") if name]
     text = f"{type(error).__name__} {_code(error)} {words}".lower()
@@ -108,8 +107,8 @@ def _fault(error: Exception, what: str, url: str, options: Mapping[str, Any] | N
         if "://" not in url:
             return StoreError(f"{what}: no right to it ({said}).")
         return StoreError(
-            f"{what}: refused ({said}). Check the rights and the credentials: they come from the environment, from the "
-            "store's own configuration files, or from the storage options."
+            f"{what}: refused ({said}). Check the rights and the credentials: they come from the environment, or "
+            "from the store's own configuration files."
         )
     if status is None and "://" in url and _is_of_connection(error):  # fsspec tells it as a file that is not there
         return None

@@ -1,32 +1,58 @@
 """Files in object stores and on disks by one way: a URL of fsspec (s3, gs, http, ...) or a path.
 
-Paths and ``file://`` need no library. Every error says in words what was asked of which store, without credentials:
-a `StoreError` for what stays wrong, a `StoreInterruptedError` (an OSError) for what was tried several times and may
-work later. Every byte that comes from a store is counted (``byte_count``); an object is written by one request.
-
-Storage options are those of fsspec's file system of the URL: ``{"key": ..., "secret": ..., "endpoint_url": ...}``.
-Without them the file systems find credentials where their users keep them: environment, configuration files, roles.
+Paths and ``file://`` need no library. Every error says what was asked of which store, without credentials: a
+`StoreError` for what stays wrong, a `StoreInterruptedError` (an OSError) for what was tried several times and may work
+later. Every byte that comes from a store is counted; an object is written by one request. File systems find credentials
+where their users keep them: environment, configuration files, roles.
 """
 
 from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from gtsam_rwhec.errors import FileFormatError, StoreError
+from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.whole_files import checked_path, write_atomically
-from gtsam_rwhec.fleet.byte_count import count_bytes
-from gtsam_rwhec.fleet.extras import imported
 from gtsam_rwhec.fleet.store_requests import requested
 from gtsam_rwhec.fleet.without_secrets import shown
 
-Options = Mapping[str, Any]
 #: A file that is asked for whole, a manifest or a rig file, has at most this many bytes unless the caller says more.
 MOST_BYTES = 1 << 32
+
+
+@dataclass
+class ByteCount:
+    """Bytes that came from stores."""
+
+    count: int = 0
+
+
+_counting: ContextVar[tuple[ByteCount, ...]] = ContextVar("counting", default=())
+
+
+@contextmanager
+def counted_bytes() -> Iterator[ByteCount]:
+    """Count in the block; blocks within blocks count each for themselves."""
+    count = ByteCount()
+    token = _counting.set((*_counting.get(), count))
+    try:
+        yield count
+    finally:
+        _counting.reset(token)
+
+
+def count_bytes(count: int) -> None:
+    """Tell all that count of bytes that came."""
+    for one in _counting.get():
+        one.count += count
 
 
 def local_path(url: str) -> Path | None:
@@ -36,12 +62,12 @@ def local_path(url: str) -> Path | None:
     return None if "://" in url else checked_path(url)
 
 
-def exists(url: str, options: Options | None = None) -> bool:
+def exists(url: str) -> bool:
     """Whether a file is there."""
     path = local_path(url)
     if path is not None:
         return path.is_file()
-    fs, place = _opened(url, options)
+    fs, place = _opened(url)
 
     def ask() -> bool:  # not fs.isfile, to which a store that refuses is one that has nothing
         try:
@@ -49,27 +75,27 @@ def exists(url: str, options: Options | None = None) -> bool:
         except FileNotFoundError:
             return False
 
-    return requested(ask, shown(url), url, options)
+    return requested(ask, shown(url), url)
 
 
-def size_of(url: str, options: Options | None = None) -> int:
+def size_of(url: str) -> int:
     """Bytes of a file."""
     path = local_path(url)
     if path is not None:
         return requested(lambda: os.stat(path), str(path), url).st_size
-    size = _info(url, options).get("size")
+    size = _info(url).get("size")
     if size is None:
         raise StoreError(f"{shown(url)}: its server does not say how many bytes it has; copy the file to a disk.")
     return int(size)
 
 
-def stamp_of(url: str, options: Options | None = None) -> str:
+def stamp_of(url: str) -> str:
     """What changes when the file does: its ETag or checksum in the store, or else its size and time of change."""
     path = local_path(url)
     if path is not None:
         status = requested(lambda: os.stat(path), str(path), url)
         return f"{status.st_size}-{status.st_mtime_ns}"
-    info = _info(url, options)
+    info = _info(url)
     names = ("ETag", "etag", "md5Hash", "generation", "Content-MD5", "LastModified", "updated", "mtime", "created")
     stamp = next((info[name] for name in names if info.get(name)), None)
     if stamp is None:
@@ -80,7 +106,7 @@ def stamp_of(url: str, options: Options | None = None) -> str:
     return f"{info.get('size')}-{str(stamp).strip(chr(34))}"
 
 
-def read_bytes(url: str, options: Options | None = None, most_bytes: int = MOST_BYTES) -> bytes:
+def read_bytes(url: str, most_bytes: int = MOST_BYTES) -> bytes:
     """A whole file.
 
     Raises
@@ -90,13 +116,13 @@ def read_bytes(url: str, options: Options | None = None, most_bytes: int = MOST_
     StoreInterruptedError
         The store broke off, each time.
     """
-    size = size_of(url, options)
+    size = size_of(url)
     if size > most_bytes:
         raise StoreError(f"{shown(url)} has {size} bytes, and {most_bytes} at most are expected; is it the right file?")
-    return read_ranges(url, [(0, size)], options)[0]
+    return read_ranges(url, [(0, size)])[0]
 
 
-def read_ranges(url: str, ranges: Sequence[tuple[int, int]], options: Options | None = None) -> list[bytes]:
+def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     """Parts of a file, each from a byte to before another; all that is asked for, or an error.
 
     Ranges of one call travel at the same time. A range that breaks off is asked for again from where it broke off.
@@ -109,7 +135,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]], options: Options | 
     path = local_path(url)
     if path is not None:
         return requested(lambda: _local_ranges(path, ranges), str(path), url)
-    fs, place = _opened(url, options)
+    fs, place = _opened(url)
     parts: list[list[bytes]] = [[] for _ in ranges]
 
     def missing() -> list[tuple[int, int, int]]:
@@ -144,11 +170,11 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]], options: Options | 
         at = f", stopped at byte {short[0][1]} of {shown(url)}" if short else ""
         return f"{got} of {sum(b - a for a, b in ranges)} bytes came{at}"
 
-    requested(ask, shown(url), url, options, how_far)
+    requested(ask, shown(url), url, how_far)
     return [b"".join(part) for part in parts]
 
 
-def write_once(url: str, data: bytes, options: Options | None = None) -> bool:
+def write_once(url: str, data: bytes) -> bool:
     """Write a file whole, unless it is there with the same bytes. Two who write at once leave one of the two, whole.
 
     On disks it is a temporary file that is renamed, with its folder made; in stores one request.
@@ -166,7 +192,7 @@ def write_once(url: str, data: bytes, options: Options | None = None) -> bool:
     path = local_path(url)
     if path is not None:
         return requested(lambda: _written_locally(path, data), f"{path}, which is to be written", url)
-    fs, place = _opened(url, options)
+    fs, place = _opened(url)
 
     def put() -> bool:
         try:
@@ -177,10 +203,10 @@ def write_once(url: str, data: bytes, options: Options | None = None) -> bool:
         fs.pipe_file(place, data)
         return False
 
-    return bool(requested(put, f"{shown(url)}, which is to be written", url, options))
+    return bool(requested(put, f"{shown(url)}, which is to be written", url))
 
 
-def listed(pattern: str, options: Options | None = None) -> list[str]:
+def listed(pattern: str) -> list[str]:
     """The URLs of files that a pattern with ``*``, ``?``, ``[]`` or ``**`` names, sorted; those of folders are not.
 
     Raises
@@ -192,13 +218,13 @@ def listed(pattern: str, options: Options | None = None) -> list[str]:
     if path is not None:
         found = requested(lambda: glob.glob(str(path), recursive=True), f"the files {path}", pattern)
         return sorted(each for each in found if os.path.isfile(each))
-    fs, place = _opened(pattern, options)
+    fs, place = _opened(pattern)
 
     def ask() -> dict[str, Any]:
         fs.invalidate_cache()  # another process may have written since
         return dict(fs.glob(place, detail=True))
 
-    answer = requested(ask, f"the files {shown(pattern)}", pattern, options)
+    answer = requested(ask, f"the files {shown(pattern)}", pattern)
     scheme = pattern.partition("://")[0]
     files = (name for name, info in answer.items() if info.get("type") != "directory")
     return sorted(name if "://" in name else f"{scheme}://{name.lstrip(chr(47))}" for name in files)
@@ -208,28 +234,29 @@ class StoppedEarlyError(OSError):
     """A store sent less than was asked for, and no error."""
 
 
-def _opened(url: str, options: Options | None) -> tuple[Any, str]:
+def _opened(url: str) -> tuple[Any, str]:
     """The file system of a URL, and the place in it."""
     scheme = url.partition("://")[0].lower()
-    core = imported("fsspec.core", "fleet", f"{shown(url)}")
-    if scheme == "s3":
-        imported("s3fs", "fleet", f"{shown(url)}")
-    given = {**_DEFAULTS.get(scheme, {}), **(options or {})}
+    with extra_named():
+        from fsspec import core
+
+        if scheme == "s3":
+            import s3fs  # noqa: F401  # for its own error, if it is missing
 
     def ask() -> tuple[Any, str]:
-        fs, place = core.url_to_fs(url, **given)
+        fs, place = core.url_to_fs(url, **_OPTIONS.get(scheme, {}))
         if scheme == "s3":
             fs.retries = 1  # `requested` tries again, and says so
         return fs, place
 
     try:
-        return requested(ask, shown(url), url, options, attempts=1)
+        return requested(ask, shown(url), url, attempts=1)
     except ImportError as error:
         raise StoreError(f"{shown(url)}: {error}") from error
 
 
-#: Options that callers' own replace. No block is read ahead and no listing kept, and nobody is waited for for ever.
-_DEFAULTS: dict[str, dict[str, Any]] = {
+#: Storage options of file systems. No block is read ahead and no listing kept, and nobody is waited for for ever.
+_OPTIONS: dict[str, dict[str, Any]] = {
     "s3": {
         "default_cache_type": "none",
         "use_listings_cache": False,
@@ -240,13 +267,13 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
 }
 
 
-def _info(url: str, options: Options | None) -> dict[str, Any]:
-    fs, place = _opened(url, options)
+def _info(url: str) -> dict[str, Any]:
+    fs, place = _opened(url)
 
     def ask() -> dict[str, Any]:
         return dict(fs.info(place))
 
-    return requested(ask, shown(url), url, options)
+    return requested(ask, shown(url), url)
 
 
 def _local_ranges(path: Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:

@@ -8,9 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.fleet.night_rows import Night, RobotFrames, names_of, why_not
-from gtsam_rwhec.fleet.rows import RobotRow
-from gtsam_rwhec.fleet.watch_events import (
+from gtsam_rwhec.fleet.drift_events import (
     AlarmEvent,
     Event,
     FramesEvent,
@@ -19,11 +17,12 @@ from gtsam_rwhec.fleet.watch_events import (
     NightEvent,
     NoAnswerEvent,
 )
+from gtsam_rwhec.fleet.fleet_rows import RobotRow
+from gtsam_rwhec.fleet.night_rows import Night, RobotFrames, names_of, why_not
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.control_chart import RATE, Alarm, Chart, NightTest
 from gtsam_rwhec.results.nights import FoundSpread, Nights, SpreadPool
-from gtsam_rwhec.solver.certificate import Basis
 
 #: Nanoseconds of a day.
 DAY_NS = 86_400_000_000_000
@@ -43,15 +42,12 @@ class Watched:
         Robots with at least one night that can be used.
     spread : FoundSpread
         How the nights scatter beside what their covariances say, from all of them.
-    of_moments : int
-        Nights whose answer is of the moments alone, without ``--refine``.
     """
 
     rate: float
     events: tuple[Event, ...]
     robots: dict[str, RobotChart]
     spread: FoundSpread
-    of_moments: int
 
     @property
     def alarms(self) -> tuple[AlarmEvent, ...]:
@@ -139,8 +135,7 @@ def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
         robot.last = [*robot.last[-1:], night]
     for each in fresh:
         pool.add(*each)
-    of_moments = sum(row.basis is Basis.MOMENTS for row in usable)
-    return Watched(rate, tuple(events), robots, pool.found(), of_moments)
+    return Watched(rate, tuple(events), robots, pool.found())
 
 
 def _one_for_each_time(rows: list[RobotRow]) -> list[RobotRow]:

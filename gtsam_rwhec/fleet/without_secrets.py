@@ -1,7 +1,7 @@
 """Words without secrets: no password, key, token or signature of an object store gets into a message, a log or a file.
 
 What a library says of an error may repeat the URL, a header or an option. So its words go through `without_secrets`,
-which takes out what is known to be secret (of the URL, of the storage options, of the environment), and then whatever
+which takes out what is known to be secret (of the URL, of the environment), and then whatever
 looks like one.
 """
 
@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 from urllib.parse import quote, quote_plus, unquote, unquote_plus
 
 #: What stands where a secret was.
@@ -41,7 +40,7 @@ def shown(url: str) -> str:
     return place + "?..." if mark and url.lower().startswith("http") else plain
 
 
-def without_secrets(text: str, url: str = "", options: Mapping[str, Any] | None = None) -> str:
+def without_secrets(text: str, url: str = "") -> str:
     """`text` with `HIDDEN` in place of what is secret, or looks like it.
 
     Parameters
@@ -50,10 +49,8 @@ def without_secrets(text: str, url: str = "", options: Mapping[str, Any] | None 
         What a library says, or anything that may repeat it.
     url
         Its user, password and query are secret.
-    options
-        The storage options: values under names such as ``secret``, at any depth, are secret.
     """
-    known = {*_of_url(url), *_of_options(options or {}), *_of_environment()}
+    known = {*_of_url(url), *_of_environment()}
     forms = {form for one in known for form in (one, quote(one, safe=""), quote_plus(one), repr(one)[1:-1])}
     for secret in sorted((form for form in forms if len(form) >= _SHORTEST), key=len, reverse=True):
         text = text.replace(secret, HIDDEN)
@@ -76,18 +73,6 @@ def _of_url(url: str) -> Iterator[str]:
             name, _, value = part.partition("=")
             if not _PLAIN_PARAMETER.match(name):
                 yield from {value, unquote_plus(value)}
-
-
-def _of_options(options: Mapping[str, Any], is_secret: bool = False) -> Iterator[str]:
-    for name, value in options.items():
-        secret = is_secret or _SECRET_NAME.search(str(name)) is not None
-        if isinstance(value, Mapping):
-            yield from _of_options(value, secret)
-        elif isinstance(value, str) and secret:
-            yield value
-            yield from (part for part in value.split() if len(part) >= 2 * _SHORTEST)  # "Bearer ..."
-        elif isinstance(value, str):
-            yield from _of_url(value)
 
 
 def _of_environment() -> Iterator[str]:

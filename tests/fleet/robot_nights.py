@@ -8,7 +8,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
-from gtsam_rwhec.fleet.rows import FailedLog, RobotRow, RowFrame
+from gtsam_rwhec.fleet.fleet_rows import FailedLog, RobotRow, RowFrame
 
 DAY_NS = 86_400_000_000_000
 FIRST_DAY = 20_000

@@ -1,12 +1,14 @@
-"""An s3 store on this machine, by moto, that counts the bytes of the objects that it sends and can break off."""
+"""An s3 store on this machine, by moto, which the environment names; it counts what it sends, and can break off."""
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
+from unittest.mock import patch
 
 from moto.server import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import WSGIRequestHandler, make_server
@@ -21,8 +23,6 @@ class S3Server:
 
     Attributes
     ----------
-    options : dict
-        The storage options of s3fs for it.
     sent : int
         Bytes of objects that it has sent, counted where they leave it.
     asked : int
@@ -31,7 +31,6 @@ class S3Server:
         Each answer with an object breaks off after so many bytes.
     """
 
-    options: dict[str, Any] = field(default_factory=dict)
     sent: int = 0
     asked: int = 0
     cut_after: int | None = None
@@ -62,14 +61,24 @@ def s3_server() -> Iterator[S3Server]:
     thread = threading.Thread(target=httpd.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     endpoint = f"http://127.0.0.1:{httpd.server_port}"
-    server.options = {"key": KEY, "secret": SECRET, "endpoint_url": endpoint}
+    names = {"AWS_ACCESS_KEY_ID": KEY, "AWS_SECRET_ACCESS_KEY": SECRET, "AWS_ENDPOINT_URL": endpoint}
     try:
-        s3fs.S3FileSystem(**server.options).mkdir(BUCKET)
-        yield server
+        with patch.dict(os.environ, names):
+            forget_stores()
+            s3fs.S3FileSystem().mkdir(BUCKET)
+            yield server
     finally:
+        forget_stores()
         httpd.shutdown()
         thread.join()
         httpd.server_close()
+
+
+def forget_stores() -> None:
+    """Make the next request ask the environment again for the store's address and keys."""
+    import s3fs
+
+    s3fs.S3FileSystem.clear_instance_cache()
 
 
 class _Silent(WSGIRequestHandler):

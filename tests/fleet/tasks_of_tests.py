@@ -8,8 +8,7 @@ import time
 from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.fleet.measured_task import measured_task
-from gtsam_rwhec.fleet.tasks import Failed, Receipt, Task
+from gtsam_rwhec.fleet.tasks import Engine, Failed, Receipt, Task, costs_of
 
 
 def tried(folder: str, name: str) -> int:
@@ -20,16 +19,9 @@ def tried(folder: str, name: str) -> int:
 
 
 def writes(folder: str, name: str) -> Receipt:
-    with measured_task(name) as measured:
+    with costs_of(name) as costs:
         tried(folder, name)
-        return measured.receipt(f"{name}.bin", str(os.getpid()))
-
-
-def joins(folder: str, name: str, done: tuple[Receipt | Failed, ...]) -> Receipt:
-    """A checksum of the words of what it comes after."""
-    tried(folder, name)
-    said = (each.file if isinstance(each, Receipt) else f"no {each.key}: {each.kind}" for each in done)
-    return Receipt(name, f"{name}.bin", " + ".join(said))
+        return costs.receipt(f"{name}.bin", str(os.getpid()))
 
 
 def refuses(folder: str, name: str) -> Receipt:
@@ -68,21 +60,7 @@ def dies_always(folder: str, name: str) -> Receipt:
 
 def floods(folder: str, name: str, count: int) -> Receipt:
     tried(folder, name)
-    return Receipt(name, f"{len(bytearray(count))}", "")
-
-
-def mixed(folder: str) -> list[Task]:
-    """Tasks of all ends but a dead worker, with a tree over them, in an order in which they cannot be done."""
-    leaves = [Task(f"w{i}", writes, (folder, f"w{i}")) for i in range(4)]
-    faults = [
-        Task(name, function, (folder, name))
-        for name, function in (
-            ("refused", refuses), ("once", breaks_off_once), ("always", always_breaks_off), ("fault", is_at_fault)
-        )
-    ]  # fmt: skip
-    low = Task("low", joins, (folder, "low"), after=("w1", "w0"))
-    high = Task("high", joins, (folder, "high"), after=("low", "refused", "w3"))
-    return [high, low, *leaves, *faults]
+    return Receipt(name, f"{len(bytearray(b'.') * count)}", "")
 
 
 def waits_for(folder: str, name: str) -> Receipt:
@@ -91,3 +69,21 @@ def waits_for(folder: str, name: str) -> Receipt:
     while not (Path(folder) / name).exists():
         time.sleep(0.01)
     return Receipt(name, f"{name}.bin", "")
+
+
+def check_failures(engine: Engine, folder: Path) -> None:
+    """What holds for every engine: each task once, what breaks off again, and failures as rows without secrets."""
+    faults = {"refused": refuses, "once": breaks_off_once, "always": always_breaks_off, "fault": is_at_fault}
+    functions = {**{f"w{i}": writes for i in range(4)}, **faults}
+    tasks = [Task(name, function, (str(folder), name)) for name, function in functions.items()]
+    outcomes = {each.key: each for each in engine.run(tasks)}
+    reasons = {key: each.reason for key, each in outcomes.items() if isinstance(each, Failed)}
+    assert set(outcomes) == set(functions)
+    assert set(reasons) == {"refused", "always", "fault"}
+    assert reasons["refused"] == "refused is not an MCAP file; give another."
+    assert "is slow" in reasons["always"]
+    assert "0123456789abcdef" not in reasons["always"]
+    assert "topsecret" not in reasons["always"]
+    assert "KeyError: 'lost' (tasks_of_tests.py, line" in reasons["fault"]
+    tries = {path.stem: path.stat().st_size for path in folder.glob("*.tried")}
+    assert tries == {**dict.fromkeys(functions, 1), "once": 2, "always": 3}

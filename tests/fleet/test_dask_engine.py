@@ -1,9 +1,8 @@
-"""The engine on Dask: order, failures, workers that die, a scheduler that dies, callers without a guard."""
+"""The engine on Dask: failures, workers that die, a scheduler that dies, callers without a guard."""
 
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,77 +10,87 @@ from pathlib import Path
 import psutil
 import pytest
 import requests
-from engine_checks import check_deaths, check_order_and_failures
-from tasks_of_tests import dies_once, joins, writes
+from tasks_of_tests import check_failures, dies_always, dies_once, floods, writes
 
 from gtsam_rwhec.errors import FleetError, OptionError
+from gtsam_rwhec.files.progress import Remark
 from gtsam_rwhec.fleet import dask_engine
-from gtsam_rwhec.fleet.dask_engine import FEWEST_TASKS, DaskEngine
-from gtsam_rwhec.fleet.extras import imported
-from gtsam_rwhec.fleet.tasks import Receipt, Task
+from gtsam_rwhec.fleet.dask_engine import FEWEST_TASKS, DaskEngine, bytes_of
+from gtsam_rwhec.fleet.tasks import Failed, Receipt, Task
 
 MEMORY = 400 << 20
 
 
-def test_what_is_not_installed_is_named_with_its_command() -> None:
-    words = r"robots: no_such_module is not installed: pip install 'gtsam-rwhec\[fleet\]'"
-    with pytest.raises(OptionError, match=words):
-        imported("no_such_module.part", "fleet", "robots")
-    assert imported("os.path", "fleet", "robots").sep == "/"
+def task(function: object, folder: Path, name: str, *more: object) -> Task:
+    return Task(name, function, (str(folder), name, *more))  # type: ignore[arg-type]
 
 
-def test_what_cannot_be_an_engine() -> None:
-    with pytest.raises(OptionError, match="0 workers cannot work"):
+@pytest.mark.parametrize(
+    ("size", "count"), [("2GB", 2 * 10**9), ("500 MB", 5 * 10**8), ("1.5GiB", 3 << 29), ("64k", 64000)]
+)
+def test_sizes_of_memory(size: str, count: int) -> None:
+    assert bytes_of(size) == count
+
+
+def test_what_cannot_be_an_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OptionError, match="0 workers"):
         DaskEngine(0)
-
-
-def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_engine, "CONNECT_S", 0.1)
-    with pytest.raises(FleetError, match=r"no scheduler of Dask answers at tcp://127.0.0.1:9 .* is the address right"):
-        DaskEngine(scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(FleetError, match=r"no scheduler of Dask answers at tcp://127.0.0.1:9 "):
+        DaskEngine(scheduler="tcp://127.0.0.1:9").start()
 
 
 def test_failures_a_death_and_the_end_of_the_scheduler(tmp_path: Path) -> None:
     """In one test, since the processes take a second or two to start."""
-    with DaskEngine(1, MEMORY, attempts=2, dashboard=False, pause_s=0.001) as engine:
-        assert engine.dashboard == ""
-        check_order_and_failures(engine, tmp_path, attempts=2)
-        (outcome,) = engine.run([Task("dies", dies_once, (str(tmp_path), "dies"))])
+    with DaskEngine(1, MEMORY, dashboard=False) as engine:
+        assert engine.cluster is None, "nothing is started before there is a task"
+        check_failures(engine, tmp_path)
+        (outcome,) = engine.run([task(dies_once, tmp_path, "dies")])
         assert outcome == Receipt("dies", "dies.bin", "")
         assert (tmp_path / "dies.tried").stat().st_size == 2
         assert engine.cluster is not None
-        first = Task("first", writes, (str(tmp_path), "first"))
-        running = engine.run([first, Task("second", joins, (str(tmp_path), "second"), after=("first",))])
-        assert next(running).key == "first"
-        os.kill(engine.cluster.scheduler_pid, signal.SIGKILL)
-        with pytest.raises(FleetError, match=r"scheduler is gone after 1 of 2 tasks: .* goes on from what is done"):
-            next(running)
+        running = engine.run([task(writes, tmp_path, f"n{i}") for i in range(2 * FEWEST_TASKS)])
+        next(running)
+        engine.cluster.scheduler.kill()
+        with pytest.raises(FleetError, match=r"scheduler is gone after \d+ of 32 tasks: .* goes on from what is done"):
+            list(running)
         folder = engine.cluster.folder
     assert not folder.exists()
 
 
 @pytest.mark.slow
 def test_deaths_on_two_workers_and_a_second_client(tmp_path: Path) -> None:
-    with DaskEngine(2, MEMORY) as engine:
-        check_deaths(engine, tmp_path, MEMORY, attempts=3)
+    said: list[object] = []
+    with DaskEngine(2, MEMORY, progress=said.append) as engine:
+        names = {"innocent1": writes, "once": dies_once, "killer": dies_always, "innocent2": writes}
+        tasks = [task(function, tmp_path, name) for name, function in names.items()]
+        by_key = {each.key: each for each in engine.run([*tasks, task(floods, tmp_path, "flood", 8 * MEMORY)])}
+        reasons = {key: each.reason for key, each in by_key.items() if isinstance(each, Failed)}
+        assert set(by_key) == {*names, "flood"}
+        assert set(reasons) == {"killer", "flood"}
+        for words in reasons.values():
+            assert "died, 3 times" in words
+            assert f"{MEMORY} bytes" in words
+        assert (tmp_path / "killer.tried").stat().st_size == 3
         # A second client, by address, of a scheduler that goes on when its engine is closed.
         with DaskEngine(scheduler=engine.address) as other:
-            done = list(other.run(Task(f"n{i}", writes, (str(tmp_path), f"n{i}")) for i in range(3 * FEWEST_TASKS)))
+            done = list(other.run(task(writes, tmp_path, f"n{i}") for i in range(3 * FEWEST_TASKS)))
         assert sorted(each.key for each in done) == sorted(f"n{i}" for i in range(3 * FEWEST_TASKS))
-        assert requests.get(engine.dashboard, timeout=10).ok
-        (again,) = engine.run([Task("again", writes, (str(tmp_path), "again"))])
+        (page,) = [str(one).rpartition(" ")[2] for one in said if isinstance(one, Remark)]
+        assert requests.get(page, timeout=10).ok
+        (again,) = engine.run([task(writes, tmp_path, "again")])
         assert again.key == "again"
 
 
 SCRIPT = """
 import sys
-from gtsam_rwhec.fleet import dask_engine
 from gtsam_rwhec.fleet.dask_engine import DaskEngine
-from gtsam_rwhec.fleet.tasks import Receipt, Task
+from gtsam_rwhec.fleet.tasks import Task
 from tasks_of_tests import waits_for, writes
 print("imported", flush=True)
 engine = DaskEngine(1, dashboard=False)
-print(engine.cluster.scheduler_pid, flush=True)
+engine.start()
+print(engine.cluster.scheduler.pid, flush=True)
 for each in engine.run([Task("a", writes, (sys.argv[1], "a")), Task("b", waits_for, (sys.argv[1], "b"))]):
     print(each.key, flush=True)
 """

@@ -6,14 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
-from test_rows import row
+from test_fleet_rows import row
 from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.fleet.engines import StartedLate, bytes_of
 from gtsam_rwhec.fleet.fleet_report import failures_of, summary, worst_first
 
 
@@ -34,7 +32,7 @@ def test_verdicts_first_then_the_worst_then_failures() -> None:
         "5 calibrations: 2 may be used, 1 to be used with care, 1 not to be used, 1 failed. 1 log could not be used."
     )
     assert [one.unit for one in worst_first(rows())] == ["c", "a@2026-11-22", "d", "b"]
-    assert failures_of(rows()) == ["e: no", "a@2026-11-22, a, s3://logs/a.mcap: it is empty"]
+    assert failures_of(rows()) == ["e: no", "a@2026-11-22, a, s3://logs/ä.mcap: it is empty"]
     assert summary([]) == "0 calibrations: none."
 
 
@@ -63,23 +61,3 @@ def test_the_command_and_its_exit_status(tmp_path: Path) -> None:
         refused = run(app, ["fleet", "run", *arguments, "-o", str(tmp_path / "out")])
         assert refused.exit_code == 2
         assert words in " ".join(refused.stderr.replace("│", " ").split())
-
-
-@pytest.mark.parametrize(
-    ("size", "count"), [("2GB", 2 * 10**9), ("500 MB", 5 * 10**8), ("1.5GiB", 3 << 29), ("64k", 64000)]
-)
-def test_sizes_of_memory(size: str, count: int) -> None:
-    assert bytes_of(size) == count
-
-
-def test_an_engine_that_has_nothing_to_do_is_not_started() -> None:
-    started: list[fleet.InProcess] = []
-
-    def start() -> fleet.InProcess:
-        started.append(fleet.InProcess())
-        return started[0]
-
-    with StartedLate(start) as engine:
-        assert not started
-        assert list(engine.run([])) == []
-    assert len(started) == 1

@@ -9,7 +9,7 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration import Finding, Ground
 from gtsam_rwhec.fleet.log_agreement import disagreeing_logs
-from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
+from gtsam_rwhec.fleet.unit_problem import UnitProblem
 from gtsam_rwhec.simulate import Noise, general
 
 LOGS = ("monday.mcap", "tuesday.mcap", "wednesday.mcap")
@@ -19,16 +19,14 @@ PER_LOG = 20
 def findings(moved_m: float, seed: int) -> tuple[Finding, ...]:
     """What is found where the sensor is elsewhere in the last log."""
     made = general(2, 1, seed=seed, number_of_measurements=len(LOGS) * PER_LOG, noise=Noise(0.001, 1e4))
-    problem, moments, log_of = rw.Problem(), rw.Problem(keep_measurements=False), {}
+    problem, log_of = rw.Problem(), {}
     step = se3.expmap(np.array([[0.0, 0.0, 0.0, moved_m, 0.0, 0.0]]))[0]
     for pair in made.problem.pairs:
         raw = made.problem.measurements(*pair)
         log_of[pair] = np.repeat(np.arange(len(LOGS)), PER_LOG)
         B = np.where((log_of[pair] == 2)[:, None, None], np.linalg.inv(step) @ raw.B, raw.B)
-        for one in (problem, moments):
-            one.add(*pair, raw.A, B)
-    measured = MeasuredProblem(problem, None, logs=LOGS, log_of=log_of)
-    return disagreeing_logs(rw.calibrate(moments), measured)
+        problem.add(*pair, raw.A, B)
+    return disagreeing_logs(rw.calibrate(problem), UnitProblem(problem, None, (), None, log_of), LOGS)
 
 
 @pytest.mark.parametrize("seed", range(5))

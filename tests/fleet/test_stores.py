@@ -13,7 +13,7 @@ import pytest
 
 from gtsam_rwhec.errors import StoreError, StoreInterruptedError
 from gtsam_rwhec.fleet import store_requests, stores
-from gtsam_rwhec.fleet.byte_count import counted_bytes
+from gtsam_rwhec.fleet.stores import counted_bytes
 
 CONTENT = bytes(range(256)) * 16
 

@@ -11,12 +11,10 @@ import pytest
 from robot_nights import DAY_NS, DEVIATIONS, day_ns, failed_night, robot_nights, with_constant_errors, with_free_height
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
-from gtsam_rwhec.fleet.rows import RobotRow
-from gtsam_rwhec.fleet.watch_events import FramesEvent, FreeEvent, NightEvent, NoAnswerEvent
-from gtsam_rwhec.fleet.watch_stream import stream
-from gtsam_rwhec.fleet.watch_words import remarks
+from gtsam_rwhec.fleet.drift_events import FramesEvent, FreeEvent, NightEvent, NoAnswerEvent
+from gtsam_rwhec.fleet.drift_words import stream
+from gtsam_rwhec.fleet.fleet_rows import RobotRow
 from gtsam_rwhec.fleet.watching import Watched, watch
-from gtsam_rwhec.solver.certificate import Basis
 
 ROBOTS = [f"arm_{i}" for i in range(6)]
 
@@ -102,14 +100,6 @@ def test_what_all_nights_share_does_not_count(rows: list[RobotRow], watched: Wat
     for first, second in zip(watched.events, found.events, strict=True):
         if isinstance(first, NightEvent):
             assert second.chance == pytest.approx(first.chance, rel=1e-6)
-
-
-def test_nights_of_moments_alone_are_said(watched: Watched) -> None:
-    assert watched.of_moments == 0
-    assert "moments" not in " ".join(remarks(watched))
-    found = watch([replace(row, basis=Basis.MOMENTS) for row in robot_nights("arm", 3)])
-    assert found.of_moments == 3
-    assert remarks(found)[1].startswith("3 nights are of moments alone")
 
 
 def test_the_stream_is_json_with_a_version(watched: Watched) -> None:

@@ -32,19 +32,19 @@ def test_urls_are_shown_without_them(url: str, words: str) -> None:
         '{"aws_session_token": "s1gnature"}',
         "the key is 'quoted/and+more='",
         "the key is quoted%2Fand%2Bmore%3D",
-        "user ANNA0001, password letmein99",
+        "user anna, password letmein99",
         "token of the environment: fromenvironment",
     ],
 )
 def test_words_are_without_them(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SESSION_TOKEN", "fromenvironment")
-    options = {"secret": "quoted/and+more=", "client_kwargs": {"headers": {"key": "ANNA0001"}}, "anon": False}
-    clean = without_secrets(said, "https://anna:letmein99@host/a?sig=s1gnature", options)
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "quoted/and+more=")
+    clean = without_secrets(said, "https://anna:letmein99@host/a?sig=s1gnature")
     assert "***" in clean or "//host" in clean
-    for secret in ("AKIAIOSF", "abcdefgh", "s1gnature", "quoted", "ANNA0001", "letmein99", "fromenvironment"):
+    for secret in ("AKIAIOSF", "abcdefgh", "s1gnature", "quoted", "letmein99", "fromenvironment"):
         assert secret not in clean
 
 
 def test_other_words_stay() -> None:
     said = "s3://bucket/keys/a.mcap: The specified key does not exist. (region: eu-1, token bucket empty)"
-    assert without_secrets(said, "s3://bucket/keys/a.mcap", {"client_kwargs": {"region_name": "eu-1"}}) == said
+    assert without_secrets(said, "s3://bucket/keys/a.mcap") == said

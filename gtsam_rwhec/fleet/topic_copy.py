@@ -1,31 +1,28 @@
 """The part of a log that a rig needs, as a log on this machine's disk: only the chunks of its topics travel.
 
-The index at the end of an MCAP file says which channels each chunk has. Two small requests read it; then the chunks of
-the topics are read by ranges, and written behind each other with an index of their own. A chunk travels as it is: what
-else it holds comes with it. Logs without an index, unfinished or damaged ones, are read whole, and a `LogWarning` says
-why.
+The index at the end of an MCAP file says which channels each chunk has. Logs without an index, unfinished or damaged
+ones, are read whole, and a `LogWarning` says why.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeAlias
 
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Header, McapRecord, MetadataIndex, Schema, Statistics
 
 from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
 from gtsam_rwhec.files.budgets import Spending
 from gtsam_rwhec.files.whole_files import atomic_stream
-from gtsam_rwhec.fleet.byte_count import count_bytes, counted_bytes
-from gtsam_rwhec.fleet.mcap_copy import McapCopy
-from gtsam_rwhec.fleet.stores import Options, local_path, read_ranges, size_of
+from gtsam_rwhec.fleet.stores import count_bytes, counted_bytes, local_path, read_ranges, size_of
 from gtsam_rwhec.fleet.without_secrets import shown
-from gtsam_rwhec.logs.mcap_file import FAULTS, RECORD, read_index
+from gtsam_rwhec.logs.mcap_file import FAULTS, MAGIC, RECORD, read_index
 from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
 #: Bytes. A file on disk that is smaller is read where it is, whatever is in it.
@@ -44,14 +41,7 @@ _OF_STAGES = ("detected.mcap", "clean.mcap")
 
 
 class LocalCopy(NamedTuple):
-    """A log on this machine's disk: the file itself where it was there, or a copy.
-
-    Attributes
-    ----------
-    path : Path
-    bytes_read : int
-        Bytes that came from the store, or that the file in its place has.
-    """
+    """A log on this machine's disk: the file where it was there, or a copy; and the bytes that were read for it."""
 
     path: Path
     bytes_read: int
@@ -76,19 +66,10 @@ class Needed:
         return sum(chunk.chunk_length for chunk in self.chunks)
 
 
-def local_copy_of_topics(url: str, topics: Collection[str], folder: Path, options: Options | None = None) -> LocalCopy:
+def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> LocalCopy:
     """A log on disk that has all messages of some topics, and may have others.
 
-    Parameters
-    ----------
-    url
-        An MCAP file.
-    topics
-        By name. With ``/tf`` or ``/tf_static`` all topics of transforms are meant.
-    folder
-        Where a copy is made.
-    options
-        Storage options.
+    With ``/tf`` or ``/tf_static`` among the topics all topics of transforms are meant. A copy is made in `folder`.
 
     Raises
     ------
@@ -98,12 +79,12 @@ def local_copy_of_topics(url: str, topics: Collection[str], folder: Path, option
         The copy cannot be written.
     """
     path = local_path(url)
-    size = size_of(url, options)
+    size = size_of(url)
     if path is not None and size < SMALL:
         count_bytes(size)
         return LocalCopy(path, size)
     with counted_bytes() as count:
-        needed = needed_of(url, size, topics, options)
+        needed = needed_of(url, size, topics)
         is_worth_it = not isinstance(needed, str) and needed.chunk_bytes < SHARE * size
         if path is not None and not is_worth_it:
             count_bytes(size)
@@ -111,18 +92,18 @@ def local_copy_of_topics(url: str, topics: Collection[str], folder: Path, option
         name = shown(url).removesuffix("?...").rpartition("/")[2]
         copy = folder / (f"log_{name}" if name in _OF_STAGES else name)
         if not isinstance(needed, str):
-            needed = _copied(url, needed, copy, options)
+            needed = _copied(url, needed, copy)
         if needed:
             warnings.warn(f"{shown(url)}: {needed}; all of its {size} bytes are read", LogWarning, stacklevel=2)
-            _copied_whole(url, size, copy, options)
+            _copied_whole(url, size, copy)
     return LocalCopy(copy, count.count)
 
 
-def needed_of(url: str, size: int, topics: Collection[str], options: Options | None = None) -> Needed | str:
+def needed_of(url: str, size: int, topics: Collection[str]) -> Needed | str:
     """What a log of `size` bytes has of some topics, by its index; or why the index does not tell."""
 
     def read(offset: int, length: int) -> bytes:
-        return read_ranges(url, [(offset, min(size, offset + length))], options)[0]
+        return read_ranges(url, [(offset, min(size, offset + length))])[0]
 
     place = Path(shown(url))
     try:
@@ -161,18 +142,18 @@ def _is_tf(channel: Channel, schema: Schema | None) -> bool:
     return Topic(channel.topic, schema.name if schema else "", "", 0, None, None, "").is_tf
 
 
-def _copied(url: str, needed: Needed, copy: Path, options: Options | None) -> str:
+def _copied(url: str, needed: Needed, copy: Path) -> str:
     """Write the needed part; why it could not be, where the index does not tell the truth."""
     places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in needed.chunks]
     extras = [(extra.offset, extra.length) for extra in needed.metadata]
     with _written(copy) as stream:
         out = McapCopy(stream)
-        for chunk, data in zip(needed.chunks, _parts(url, places, options), strict=True):
+        for chunk, data in zip(needed.chunks, _parts(url, places), strict=True):
             opcode, length = RECORD.unpack_from(data)
             if opcode != Opcode.CHUNK or RECORD.size + length != chunk.chunk_length:
                 return f"its index says that a chunk is at byte {chunk.chunk_start_offset}, and none is there"
             out.chunk(chunk, data)
-        for extra, data in zip(needed.metadata, _parts(url, extras, options), strict=True):
+        for extra, data in zip(needed.metadata, _parts(url, extras), strict=True):
             out.metadata(extra.name, data)
         out.finish(needed.descriptions, needed.statistics)
     return ""
@@ -189,19 +170,17 @@ def _written(copy: Path) -> Iterator[BinaryIO]:
         raise LogError(f"{copy} cannot be written: {error.strerror}.") from error
 
 
-def _copied_whole(url: str, size: int, copy: Path, options: Options | None) -> None:
+def _copied_whole(url: str, size: int, copy: Path) -> None:
     places = [(at, min(REQUEST, size - at)) for at in range(0, size, REQUEST)]
     with _written(copy) as stream:
-        for data in _parts(url, places, options):
+        for data in _parts(url, places):
             stream.write(data)
 
 
-def _parts(url: str, places: list[tuple[int, int]], options: Options | None) -> Iterator[bytes]:
+def _parts(url: str, places: list[tuple[int, int]]) -> Iterator[bytes]:
     """The bytes of places (offset, length), in their order, by few requests."""
     for group in _together(_joined(places)):
-        for (start, _, members), data in zip(
-            group, read_ranges(url, [each[:2] for each in group], options), strict=True
-        ):
+        for (start, _, members), data in zip(group, read_ranges(url, [each[:2] for each in group]), strict=True):
             for offset, length in members:
                 yield data[offset - start : offset - start + length]
 
@@ -232,3 +211,54 @@ def _together(requests: list[_Request]) -> Iterator[list[_Request]]:
         size += request[1] - request[0]
     if group:
         yield group
+
+
+class McapCopy:
+    """Writes an MCAP file of chunks and metadata of another one, byte for byte, with an index of its own."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream, self._at = stream, 0
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._write(MAGIC)
+        self._write_record(Header(profile="", library="gtsam-rwhec"))
+
+    def chunk(self, index: ChunkIndex, record: bytes) -> None:
+        """Write a chunk. Its index of messages is not copied: readers that need it find that there is none."""
+        # The numbers of its channels stay, as they say what is in it.
+        offsets = dict.fromkeys(index.message_index_offsets, 0)
+        self._chunks.append(
+            replace(index, chunk_start_offset=self._at, message_index_offsets=offsets, message_index_length=0)
+        )
+        self._write(record)
+
+    def metadata(self, name: str, record: bytes) -> None:
+        """Write a record of metadata."""
+        self._metadata.append(MetadataIndex(offset=self._at, length=len(record), name=name))
+        self._write(record)
+
+    def finish(self, descriptions: Sequence[McapRecord], statistics: Statistics) -> None:
+        """Write the index: schemas and channels, and the counts of the channels that are whole."""
+        self._write_record(DataEnd(data_section_crc=0))
+        begins = self._at
+        counted = replace(
+            statistics,
+            chunk_count=len(self._chunks),
+            attachment_count=0,
+            metadata_count=len(self._metadata),
+            message_count=sum(statistics.channel_message_counts.values()),
+        )
+        for entry in (*descriptions, counted, *self._chunks, *self._metadata):
+            self._write_record(entry)
+        self._write_record(Footer(summary_start=begins, summary_offset_start=0, summary_crc=0))
+        self._write(MAGIC)
+
+    def _write_record(self, record: McapRecord) -> None:
+        builder = RecordBuilder()
+        record.write(builder)
+        content: bytes = builder.end()  # type: ignore[no-untyped-call]
+        self._write(content)
+
+    def _write(self, data: bytes) -> None:
+        self._stream.write(data)
+        self._at += len(data)

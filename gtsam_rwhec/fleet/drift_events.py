@@ -1,10 +1,17 @@
-"""What the watch says, one event a line, as records."""
+"""What the watch of a fleet says, one event a line: as records, and as JSON lines, which programs read.
+
+The stream begins with a line ``"event": "watch"`` with the format's name and version and how it was counted, and ends
+with ``"event": "end"``. Times are UTC, as ISO 8601 text and as nanoseconds (``_ns``). docs/drift.md has every field.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 from gtsam_rwhec.files.terminal_text import rounded, shown
 
@@ -143,3 +150,53 @@ def time_text(when_ns: int) -> str:
 def day_text(when_ns: int) -> str:
     """A day in UTC."""
     return time_text(when_ns)[:10]
+
+
+_NAMES = {
+    NightEvent: "night",
+    NoAnswerEvent: "no_answer",
+    FramesEvent: "frames",
+    FreeEvent: "free",
+    AlarmEvent: "alarm",
+}
+
+
+def event_fields(event: Event) -> dict[str, Any]:
+    """The fields of an event's line."""
+    fields: dict[str, Any] = {"event": _NAMES[type(event)], "robot": event.robot, **time_fields("when", event.when_ns)}
+    match event:
+        case NightEvent():
+            fields |= {"nights": event.nights, "chance": event.chance, "limit": event.limit}
+        case NoAnswerEvent():
+            fields |= {"reason": event.reason}
+        case FramesEvent():
+            fields |= {"appeared": event.appeared, "missing": event.missing}
+        case FreeEvent():
+            fields |= {"free": dict(event.free)}
+        case AlarmEvent():
+            for name in ("last_unchanged", "first_changed", "earliest", "latest"):
+                fields |= time_fields(name, getattr(event, f"{name}_ns"))
+            fields["frames"] = [
+                {
+                    "name": frame.name,
+                    "translation_mm": frame.translation_mm,
+                    "rotation_deg": frame.rotation_deg,
+                    "deviations": frame.deviations if math.isfinite(frame.deviations) else None,
+                    "xi": frame.xi,
+                }
+                for frame in event.frames
+            ]
+            for name in ("is_of_all", "kind", "drift_gain", "chance", "limit", "is_back", "unit"):
+                fields[name] = getattr(event, name)
+            fields["words"] = str(event)
+    return fields
+
+
+def time_fields(name: str, when_ns: int | None) -> dict[str, Any]:
+    """A time as the lines have it: as text, and in nanoseconds."""
+    return {name: None if when_ns is None else time_text(when_ns), f"{name}_ns": when_ns}
+
+
+def json_line(fields: Mapping[str, Any]) -> str:
+    """A line of the stream."""
+    return json.dumps(fields, ensure_ascii=True, allow_nan=False)

@@ -6,7 +6,7 @@ import pytest
 from fleets import rig_text
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.fleet.consistency import check_rigs
+from gtsam_rwhec.fleet.unit_problem import check_rigs
 from gtsam_rwhec.rig import Rig, parse_rig
 
 CAMS = ["cam_0"]
@@ -38,5 +38,5 @@ def test_the_carrier_of_targets_and_how_sizes_are_taken() -> None:
     with pytest.raises(rw.errors.RigError) as caught:
         check_rigs({"a": [("a.yaml", rig())], "b": [("s3://user:word@store/b.yaml", rig(text))]})
     assert "is base in a.yaml and floor in s3://store/b.yaml" in str(caught.value)
-    assert "sizes: is known in a.yaml and estimate in" in str(caught.value)
+    assert "sizes is known in a.yaml and estimate in" in str(caught.value)
     assert "word" not in str(caught.value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -14,23 +13,22 @@ from fleets import MadeFleet, write_fleet
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
 from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.fleet.fleet_parquet import read_parquet
 from gtsam_rwhec.fleet.fleet_report import remarks_of
-from gtsam_rwhec.fleet.in_process import InProcess
-from gtsam_rwhec.fleet.parquet import read_parquet
-from gtsam_rwhec.fleet.planning import planned
-from gtsam_rwhec.fleet.running import PARQUET_FILE
+from gtsam_rwhec.fleet.fleet_rows import PARQUET_FILE
+from gtsam_rwhec.fleet.fleet_run import planned_logs
+from gtsam_rwhec.fleet.tasks import InProcess
 from gtsam_rwhec.geometry.pose_covariances import error_of
 
 
 class Backwards(InProcess):
-    """Tasks of the map in the opposite order, as another number of workers may end them; and it counts them."""
+    """Tasks in the opposite order, as another number of workers may end them; and it counts them."""
 
     def __init__(self) -> None:
-        super().__init__()
         self.keys: list[str] = []
 
     def run(self, tasks: Iterable[fleet.Task]) -> Iterator[fleet.Receipt | fleet.Failed]:
-        listed = sorted(tasks, key=lambda task: (bool(task.after), task.key), reverse=True)
+        listed = sorted(tasks, key=lambda task: task.key, reverse=True)
         self.keys += [task.key for task in listed]
         return super().run(listed)
 
@@ -59,13 +57,10 @@ def test_every_robot_has_a_row_with_its_poses(made: MadeFleet, first: tuple[str,
         ("hall", "robot_002"),
     ]
     for row in run.rows:
-        assert row.basis is rw.Basis.MOMENTS
         assert row.status is rw.Status.CERTIFIED
         assert [frame.name for frame in row.frames] == ["cam_0", "tag_0", "tag_1"]
         assert row.covariance is not None
         assert row.covariance.shape == (18, 18)
-        assert row.condition is not None
-        assert row.condition > 1.0
         assert row.cpu_s > 0.0
         for i, frame in enumerate(row.frames):
             xi = error_of(gtsam.Pose3(made.truth[row.robot][frame.name]), frame.T)
@@ -77,23 +72,24 @@ def test_every_robot_has_a_row_with_its_poses(made: MadeFleet, first: tuple[str,
     alone, *at_site = run.rows
     assert [log.url for log in alone.failed_logs] == [str(made.logs["robot_000"][1])]
     assert "is not an MCAP file" in alone.failed_logs[0].reason
-    assert (alone.logs, alone.measurements) == (1, 24)
+    assert alone.logs == 1
+    assert 20 <= alone.measurements <= 24, "less the outliers"
     assert not run.is_fine
     assert [row.logs for row in at_site] == [2, 2]
     assert at_site[0].frames[1].T.tolist() == at_site[1].frames[1].T.tolist(), "the site's tags are shared"
     assert all(row.is_fine for row in at_site)
-    assert fleet.read_fleet(output)[0].moments_sha256 == alone.moments_sha256
+    assert fleet.read_fleet(output)[0].measurements_sha256 == alone.measurements_sha256
     table = read_parquet((Path(output) / PARQUET_FILE).read_bytes(), PARQUET_FILE)
-    assert [row.moments_sha256 for row in table] == [row.moments_sha256 for row in run.rows]
+    assert [row.measurements_sha256 for row in table] == [row.measurements_sha256 for row in run.rows]
 
 
 def test_a_second_run_reads_receipts(made: MadeFleet, first: tuple[str, fleet.FleetRun]) -> None:
     output, run = first
     engine = Backwards()
     again = fleet.run(fleet.read_manifest(made.manifest), output, engine=engine)
-    assert len(engine.keys) == 2, "only the log that failed is tried again, for its robot"
+    assert len(engine.keys) == 1, "only the log that failed is tried again"
     assert (again.new_tasks, again.earlier_tasks) == (0, 7)
-    assert [row.moments_sha256 for row in again.rows] == [row.moments_sha256 for row in run.rows]
+    assert [row.measurements_sha256 for row in again.rows] == [row.measurements_sha256 for row in run.rows]
 
 
 def test_who_does_what_when_changes_no_bit(made: MadeFleet, first: tuple[str, fleet.FleetRun], tmp_path: Path) -> None:
@@ -104,7 +100,7 @@ def test_who_does_what_when_changes_no_bit(made: MadeFleet, first: tuple[str, fl
     for path in sorted(whole)[::2]:
         (tmp_path / "partials" / path.name).write_bytes(path.read_bytes())
     again = fleet.run(fleet.read_manifest(made.manifest), str(tmp_path), engine=Backwards())
-    assert [row.moments_sha256 for row in again.rows] == [row.moments_sha256 for row in run.rows]
+    assert [row.measurements_sha256 for row in again.rows] == [row.measurements_sha256 for row in run.rows]
     for before, after in zip(run.rows, again.rows, strict=True):
         for one, other in zip(before.frames, after.frames, strict=True):
             assert one.T.tobytes() == other.T.tobytes()
@@ -113,7 +109,7 @@ def test_who_does_what_when_changes_no_bit(made: MadeFleet, first: tuple[str, fl
 def test_a_calibration_of_each_night_or_log(made: MadeFleet, first: tuple[str, fleet.FleetRun]) -> None:
     output, _ = first
     manifest = fleet.read_manifest(made.manifest)
-    nights = fleet.run(manifest, output, fleet.FleetOptions(each="day"))
+    nights = fleet.run(manifest, output, "day")
     assert nights.new_tasks == 2, "the logs are read already"
     assert [(row.unit, row.failure is None) for row in nights.rows] == [
         ("robot_000", False),
@@ -123,7 +119,7 @@ def test_a_calibration_of_each_night_or_log(made: MadeFleet, first: tuple[str, f
         ("hall@2026-11-01", True),
         ("hall@2026-11-02", True),
     ]
-    alone = fleet.run(manifest, output, fleet.FleetOptions(each="log"))
+    alone = fleet.run(manifest, output, "log")
     assert [row.unit for row in alone.rows if row.failure is None] == [
         "robot_000@night_00",
         "robot_001@night_00",
@@ -134,41 +130,13 @@ def test_a_calibration_of_each_night_or_log(made: MadeFleet, first: tuple[str, f
     assert {row.site for row in alone.rows if row.failure is None} == {None}
 
 
-def test_many_logs_are_merged_by_tasks_of_their_own(made: MadeFleet, tmp_path: Path) -> None:
-    """A plan for 40 logs of a robot: three sums, and their sum, before the solution."""
-    manifest = fleet.read_manifest(made.manifest)
-    for i in range(40):
-        (tmp_path / f"{i}.mcap").write_bytes(b"")
-    logs = (replace(manifest.robots[0].logs[0], url=f"{tmp_path}/*.mcap"),)
-    plan = planned(replace(manifest, robots=(replace(manifest.robots[0], logs=logs),)), fleet.FleetOptions())
-    assert [len(merge.inputs) for merge in plan.merges] == [16, 16, 8]
-    assert plan.units[0].inputs == tuple(merge.key for merge in plan.merges)
-    assert plan.units[0].members == ()
-    assert sorted(member.key for merge in plan.merges for member in merge.members) == [
-        member.key for merge in plan.merges for member in merge.members
-    ]
-
-
-def test_sums_of_chunks_are_the_same_bits(
-    made: MadeFleet, first: tuple[str, fleet.FleetRun], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With chunks of two logs the site's four are merged by two tasks first."""
-    output, run = first
-    monkeypatch.setattr("gtsam_rwhec.fleet.planning.CHUNK", 2)
-    again = fleet.run(fleet.read_manifest(made.manifest), output)
-    assert again.new_tasks == 3, "two sums, and the site's answer from them"
-    assert len(list(Path(output).glob("merged/*.merged"))) == 2
-    assert [row.moments_sha256 for row in again.rows] == [row.moments_sha256 for row in run.rows]
-    assert [(row.logs, row.measurements) for row in again.rows] == [(1, 24), (2, 48), (2, 48)]
-
-
 def test_a_log_is_the_same_from_another_working_folder(made: MadeFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = Path(made.manifest).parent
     keys = []
     for here, manifest in ((folder, "fleet.yaml"), (folder / "logs", "../fleet.yaml")):
         monkeypatch.chdir(here)
-        plan = planned(fleet.read_manifest(manifest), fleet.FleetOptions())
-        keys.append([log.task.key for log in plan.logs if log.task is not None])
+        logs = planned_logs(fleet.read_manifest(manifest))
+        keys.append([log.task.key for log in logs if log.task is not None])
     assert keys[0] == keys[1]
     assert len(keys[0]) == 6
 

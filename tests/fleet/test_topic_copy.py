@@ -12,14 +12,12 @@ import pytest
 from mcap.reader import NonSeekingReader
 from mcap.writer import IndexType
 from mixed_log import TOPICS, write_mixed_log
-from s3_server import BUCKET, KEY, SECRET, S3Server, s3_server
+from s3_server import BUCKET, KEY, SECRET, S3Server, forget_stores, s3_server
 
 from gtsam_rwhec.errors import LogWarning, StoreError, StoreInterruptedError
-from gtsam_rwhec.fleet import log_parts, store_requests, stores
-from gtsam_rwhec.fleet.attempts import attempted
-from gtsam_rwhec.fleet.byte_count import counted_bytes
-from gtsam_rwhec.fleet.log_parts import Needed, local_copy_of_topics, needed_of
-from gtsam_rwhec.fleet.tasks import Failed, Receipt, Task
+from gtsam_rwhec.fleet import store_requests, stores, topic_copy
+from gtsam_rwhec.fleet.stores import counted_bytes
+from gtsam_rwhec.fleet.topic_copy import Needed, local_copy_of_topics, needed_of
 from gtsam_rwhec.logs import Log, open_log
 
 URL = f"s3://{BUCKET}/robot_1/run.mcap"
@@ -35,7 +33,7 @@ def server() -> Iterator[S3Server]:
 def log(tmp_path_factory: pytest.TempPathFactory, server: S3Server) -> Path:
     path = tmp_path_factory.mktemp("logs") / "run.mcap"
     write_mixed_log(path, seconds=10, large_bytes=100_000)
-    stores.write_once(URL, path.read_bytes(), server.options)
+    stores.write_once(URL, path.read_bytes())
     return path
 
 
@@ -59,7 +57,7 @@ def blocks_of(log: Log) -> int:
 def test_few_bytes_travel_and_the_copy_has_all(log: Path, server: S3Server, tmp_path: Path) -> None:
     server.sent = 0
     with counted_bytes() as count:
-        copy = local_copy_of_topics(URL, TOPICS, tmp_path, server.options)
+        copy = local_copy_of_topics(URL, TOPICS, tmp_path)
     needed = needed_of(str(log), log.stat().st_size, TOPICS)
     assert isinstance(needed, Needed)
     assert needed.chunk_bytes < 0.3 * log.stat().st_size
@@ -82,7 +80,7 @@ def test_files_on_disk_are_read_where_they_are_if_that_is_cheaper(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert local_copy_of_topics(str(log), TOPICS, tmp_path) == (log, log.stat().st_size)
-    monkeypatch.setattr(log_parts, "SMALL", 0)
+    monkeypatch.setattr(topic_copy, "SMALL", 0)
     copy = local_copy_of_topics(log.as_uri(), TOPICS, tmp_path)
     assert copy.path == tmp_path / "run.mcap"
     assert copy.bytes_read < 0.3 * log.stat().st_size
@@ -104,9 +102,9 @@ def test_logs_without_a_good_index_are_read_whole(kind: str, server: S3Server, l
         content[needed.chunks[0].chunk_start_offset] ^= 0x40  # no chunk begins there
         path.write_bytes(content)
     url = f"s3://{BUCKET}/{kind}/clean.mcap"
-    stores.write_once(url, path.read_bytes(), server.options)
+    stores.write_once(url, path.read_bytes())
     with pytest.warns(LogWarning, match=rf"{url}: .*; all of its {path.stat().st_size} bytes are read"):
-        copy = local_copy_of_topics(url, TOPICS, tmp_path, server.options)
+        copy = local_copy_of_topics(url, TOPICS, tmp_path)
     assert copy.path == tmp_path / "log_clean.mcap"  # the stages write a clean.mcap beside it
     assert copy.path.read_bytes() == path.read_bytes()
 
@@ -116,7 +114,7 @@ def test_a_store_that_stops_half_way(log: Path, server: S3Server, tmp_path: Path
     server.cut_after = 50_000  # the index comes, the chunks do not
     try:
         with pytest.raises(StoreInterruptedError) as told:
-            local_copy_of_topics(URL, TOPICS, tmp_path, server.options)
+            local_copy_of_topics(URL, TOPICS, tmp_path)
     finally:
         server.cut_after = None
     assert f"{URL}: the store broke off or did not answer, 4 times" in str(told.value)
@@ -126,21 +124,25 @@ def test_a_store_that_stops_half_way(log: Path, server: S3Server, tmp_path: Path
 
 @pytest.mark.usefixtures("quick")
 def test_no_message_no_log_and_no_file_has_a_secret(
-    log: Path, server: S3Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+    log: Path,
+    server: S3Server,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     caplog.set_level(logging.INFO)
-    dead = "http://127.0.0.1:9"  # nobody listens
     said = []
-    for options in (
-        {"key": KEY, "secret": SECRET, "endpoint_url": dead},
-        {**server.options, "client_kwargs": {"verify": f"/no/{SECRET}"}},
-        {"key": KEY, "secret": SECRET, "endpoint_url": f"http://anna:{SECRET}@127.0.0.1:9"},
-    ):
-        task = Task("a", reads, (URL, str(tmp_path), options))
-        outcome = attempted(task, attempts=1)
-        said.append(outcome.reason if isinstance(outcome, Failed) else "")
+    for endpoint in ("http://127.0.0.1:9", f"http://anna:{SECRET}@127.0.0.1:9"):  # nobody listens
+        monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+        forget_stores()
+        with pytest.raises((StoreError, StoreInterruptedError)) as told:
+            local_copy_of_topics(URL, TOPICS, tmp_path)
+        said.append(str(told.value))
+    monkeypatch.undo()
+    forget_stores()
     with pytest.raises(StoreError, match="it is not there") as told:
-        stores.read_bytes(f"s3://{BUCKET}/nothing", server.options)
+        stores.read_bytes(f"s3://{BUCKET}/nothing")
     captured = capfd.readouterr()
     files = [path.read_text(encoding="utf-8", errors="replace") for path in tmp_path.rglob("*") if path.is_file()]
     assert "the store broke off or did not answer" in said[0]
@@ -149,17 +151,12 @@ def test_no_message_no_log_and_no_file_has_a_secret(
         assert KEY not in words
 
 
-def reads(url: str, folder: str, options: dict[str, object]) -> Receipt:
-    local_copy_of_topics(url, TOPICS, Path(folder), options)
-    return Receipt("a", "", "")
-
-
 def test_parts_are_cut_out_of_common_requests() -> None:
     content = np.random.default_rng(0).bytes(100_000)
     places = [(0, 10_000), (10_100, 9_000), (40_000, 50), (40_060, 5_000), (50_000, 50_000)]
-    assert [len(each[2]) for each in log_parts._joined(places)] == [2, 1, 1, 1]
+    assert [len(each[2]) for each in topic_copy._joined(places)] == [2, 1, 1, 1]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         url = "memory://parts/log"
         stores.write_once(url, content)
-        assert list(log_parts._parts(url, places, None)) == [content[a : a + n] for a, n in places]
+        assert list(topic_copy._parts(url, places)) == [content[a : a + n] for a, n in places]

@@ -1,4 +1,4 @@
-"""The map: one log becomes one partial result, by the stages that ``calibrate`` runs, in a folder of the worker."""
+"""One log becomes one partial result, by the stages that ``calibrate`` runs, in a folder of the worker."""
 
 from __future__ import annotations
 
@@ -15,16 +15,11 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, StoreInterruptedError
-from gtsam_rwhec.fleet.container import FORMAT_VERSION
-from gtsam_rwhec.fleet.log_facts import LogFacts, Weighting, camera_fields
-from gtsam_rwhec.fleet.log_parts import local_copy_of_topics
-from gtsam_rwhec.fleet.measured_task import measured_task
-from gtsam_rwhec.fleet.pair_moments import PairMoments
-from gtsam_rwhec.fleet.partial import FOLDER, KeptLog, KeptPair, Partial, checksum, in_single
-from gtsam_rwhec.fleet.receipts import below, keep_receipt, kept_receipt
+from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION, LogFacts, PairMeasurements, PartialResult, camera_fields
 from gtsam_rwhec.fleet.rig_source import RigSource
 from gtsam_rwhec.fleet.stores import stamp_of, write_once
-from gtsam_rwhec.fleet.tasks import Receipt
+from gtsam_rwhec.fleet.tasks import Receipt, below, costs_of, keep_receipt, kept_receipt
+from gtsam_rwhec.fleet.topic_copy import local_copy_of_topics
 from gtsam_rwhec.fleet.without_secrets import shown
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
@@ -38,21 +33,17 @@ from gtsam_rwhec.runs.detection_stage import detect_log
 from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
 from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, read_pairs
 from gtsam_rwhec.runs.run_log import CLEAN_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata
 from gtsam_rwhec.runs.topics_of_rig import wanted_topics
+
+#: The folder of partial results, below the output.
+FOLDER = "partials"
 
 
 @dataclass(frozen=True)
 class LogTask:
-    """One log to be mapped.
-
-    Attributes
-    ----------
-    url, stamp : str
-        The log, and what changes when it does.
-    rig : RigSource
-    """
+    """One log to be read: its URL, what changes when it does, and its rig file."""
 
     url: str
     stamp: str
@@ -67,27 +58,11 @@ class LogTask:
     @property
     def file(self) -> str:
         """The place of the partial result below the output."""
-        return partial_file(self.key)
-
-
-def partial_file(key: str) -> str:
-    """The place of a partial result below the output."""
-    return f"{FOLDER}/{key}.partial"
-
-
-def measurements_file(partial: str) -> str:
-    """The place of the measurements of a partial result."""
-    return partial.removesuffix(".partial") + ".measurements"
+        return f"{FOLDER}/{self.key}.partial"
 
 
 def map_log(task: LogTask, output: str) -> Receipt:
-    """Read a log, detect, clean, and keep its moments and measurements.
-
-    Parameters
-    ----------
-    task : LogTask
-    output : str
-        URL of the run's output.
+    """Read a log, detect, clean, and keep its measurements in the output, a folder or a URL.
 
     Raises
     ------
@@ -96,22 +71,17 @@ def map_log(task: LogTask, output: str) -> Receipt:
     OSError
         The store stopped.
     """
-    earlier = kept_receipt(output, task.file)
+    earlier = kept_receipt(output, task.key, task.file)
     if earlier is not None:
         return earlier
-    with measured_task(task.key) as measured, TemporaryDirectory(prefix="gtsam-rwhec-") as temporary:
-        folder = Path(temporary)
-        partial, kept = _partial(task, folder)
-        measurements = kept.packed()
-        facts = partial.facts.model_copy(update={"measurements_sha256": checksum(measurements)})
-        content = replace(partial, facts=facts).packed()
-        write_once(below(output, measurements_file(task.file)), measurements)
+    with costs_of(task.key) as costs, TemporaryDirectory(prefix="gtsam-rwhec-") as temporary:
+        content = _partial(task, Path(temporary)).packed()
         write_once(below(output, task.file), content)
-        receipt = measured.receipt(task.file, checksum(content))
+        receipt = costs.receipt(task.file, hashlib.sha256(content).hexdigest())
     return keep_receipt(output, receipt)
 
 
-def _partial(task: LogTask, folder: Path) -> tuple[Partial, KeptLog]:
+def _partial(task: LogTask, folder: Path) -> PartialResult:
     """The partial result of a log. What is said of files of the worker is said of the log."""
     rig = task.rig.rig(folder)
     _refuse_odometry(rig)
@@ -131,7 +101,7 @@ def _partial(task: LogTask, folder: Path) -> tuple[Partial, KeptLog]:
             places.append(str(path))
             if stamp_of(task.url) != task.stamp:
                 raise LogError(f"{shown(task.url)} changed while it was read; run again when it is whole")
-            partial, kept = _summed(task, path, rig, detected, cleaned)
+            partial = _of_stages(task, path, rig, detected, cleaned)
         except StoreInterruptedError:
             raise
         except RwhecError as error:
@@ -142,7 +112,7 @@ def _partial(task: LogTask, folder: Path) -> tuple[Partial, KeptLog]:
             said[in_words(warning.message)] = None
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    return replace(partial, facts=partial.facts.model_copy(update={"warnings": list(said)})), kept
+    return replace(partial, facts=partial.facts.model_copy(update={"warnings": list(said)}))
 
 
 def _refuse_odometry(rig: Rig) -> None:
@@ -155,8 +125,8 @@ def _refuse_odometry(rig: Rig) -> None:
         )
 
 
-def _summed(task: LogTask, path: Path, rig: Rig, detected: Path, cleaned: Path) -> tuple[Partial, KeptLog]:
-    """The stages, where they have not been, and their sums."""
+def _of_stages(task: LogTask, path: Path, rig: Rig, detected: Path, cleaned: Path) -> PartialResult:
+    """By the stages, where the log has not been through them."""
     with open_log(path) as log:
         is_detected = is_from_stage(log)
     if is_detected:
@@ -169,70 +139,41 @@ def _summed(task: LogTask, path: Path, rig: Rig, detected: Path, cleaned: Path) 
         return _of_cleaned(task, log, rig)
 
 
-def _of_cleaned(task: LogTask, log: Log, rig: Rig) -> tuple[Partial, KeptLog]:
-    """Moments, measurements and facts of a cleaned log."""
+def _of_cleaned(task: LogTask, log: Log, rig: Rig) -> PartialResult:
     metadata, motion = read_metadata(log), read_carrier_motion(log, rig)
-    cleaning = metadata.cleaning
-    assert cleaning is not None
-    pairs = {
-        pair: measured if measured.covariance is None else replace(measured, covariance=in_single(measured.covariance))
-        for pair, measured in read_pairs(log, rig).items()
-        if measured.used.any()
-    }
-    offsets_s = cleaning.time_offsets_s
-    free_sizes = rig.targets if rig.sizes == "estimate" else ()
-    problem = problem_of(pairs, rig, offsets_s, free_sizes)
+    assert metadata.cleaning is not None
+    pairs = {pair: measured for pair, measured in read_pairs(log, rig).items() if measured.used.any()}
     corners = LogCorners.of(log, rig, metadata.cameras)
-    kept = _kept(pairs, corners, offsets_s)
-    if any(sensor.time_offset == "estimate" for sensor in rig.sensors.values()):
-        kept = replace(kept, path=(motion.trajectory.stamps_ns, motion.trajectory.T))
-    stamps = [one.stamps_ns for one in kept.pairs.values()]
-    sources = (shown(task.url).rpartition("/")[2],)
+    kept = {pair: _kept(one, corners, metadata.cleaning.time_offsets_s) for pair, one in pairs.items()}
+    has_clocks = any(sensor.time_offset == "estimate" for sensor in rig.sensors.values())
     facts = LogFacts(
         url=shown(task.url),
-        stamp=task.stamp,
-        rig_sha256=task.rig.sha256,
-        version=version("gtsam-rwhec"),
-        begin_ns=min(int(each[0]) for each in stamps),
-        end_ns=max(int(each[-1]) for each in stamps),
-        sensor_carrier=rig.carriers.sensors,
-        target_carrier=rig.carriers.targets,
+        begin_ns=min(int(one.stamps_ns[0]) for one in kept.values()),
+        end_ns=max(int(one.stamps_ns[-1]) for one in kept.values()),
         about=motion.about,
-        weighting=_weighting(pairs, rig, is_relative=problem.is_relative),
         cameras={sensor: camera_fields(camera) for sensor, camera in metadata.cameras.items()},
-        detection=metadata.detection.model_copy(update={"sources": sources}),
-        cleaning=cleaning,
+        detection=metadata.detection.model_copy(update={"sources": (shown(task.url).rpartition("/")[2],)}),
+        cleaning=metadata.cleaning,
         poses=poses_used(pairs.values()),
         findings=[(f.ground, f.words) for f in _findings(log, rig, metadata, motion, pairs)],
     )
-    return Partial(facts, PairMoments.of(problem)), kept
+    return PartialResult(facts, kept, (motion.trajectory.stamps_ns, motion.trajectory.T) if has_clocks else None)
 
 
-def _kept(pairs: Mapping[Pair, MeasuredPairs], corners: LogCorners, offsets_s: Mapping[str, float]) -> KeptLog:
-    found = {}
-    for pair, measured in pairs.items():
-        used = np.flatnonzero(measured.used)
-        seen, pixels = corners.seen(measured)
-        of_used = None
-        if len(seen):
-            of_used = np.full((len(used), *pixels.shape[1:]), np.nan)
-            of_used[np.searchsorted(used, seen)] = pixels
-        found[pair] = KeptPair(
-            measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
-            measured.A[used],
-            measured.B[used],
-            None if measured.covariance is None else measured.covariance[used],
-            of_used,
-        )
-    return KeptLog(found)
-
-
-def _weighting(pairs: Mapping[Pair, MeasuredPairs], rig: Rig, *, is_relative: bool) -> Weighting:
-    """As `problem_of` weights them."""
-    if is_relative:
-        return "none"
-    is_stated = rig.noise != "estimate" and rig.noise.rotation_deg is not None and rig.noise.translation_mm is not None
-    return "stated" if is_stated else "covariances"
+def _kept(measured: MeasuredPairs, corners: LogCorners, offsets_s: Mapping[str, float]) -> PairMeasurements:
+    used = np.flatnonzero(measured.used)
+    with_corners, pixels = corners.seen(measured)
+    of_used = None
+    if len(with_corners):
+        of_used = np.full((len(used), *pixels.shape[1:]), np.nan)
+        of_used[np.searchsorted(used, with_corners)] = pixels
+    return PairMeasurements(
+        measured.stamps_ns[used] + round(1e9 * offsets_s.get(measured.sensor, 0.0)),
+        measured.A[used],
+        measured.B[used],
+        None if measured.covariance is None else measured.covariance[used],
+        of_used,
+    )
 
 
 def _findings(

@@ -1,22 +1,34 @@
-"""What the watch found, in words: the verdict first, and what to keep in mind."""
+"""What the watch of a fleet found, in words for people, and as the stream of JSON lines."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from datetime import UTC, date, datetime
+from importlib.metadata import version
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief, shown
-from gtsam_rwhec.fleet.watch_events import AlarmEvent, NoAnswerEvent, day_text
+from gtsam_rwhec.fleet.drift_events import (
+    AlarmEvent,
+    NightEvent,
+    NoAnswerEvent,
+    day_text,
+    event_fields,
+    json_line,
+    time_fields,
+)
 from gtsam_rwhec.fleet.watching import Watched
 
+#: What the stream calls itself, and the version of its fields.
+FORMAT, FORMAT_VERSION = "gtsam-rwhec watch", 1
 #: Variances over the stated ones that are as good as one, and correlations as good as none.
 AS_STATED, NO_CORRELATION = (0.8, 1.25), 0.05
 #: So many names, or reasons, are said; of more, how many.
 SAID = 5
 
 
-def verdict(watched: Watched, since_ns: int = 0) -> str:
+def drift_verdict(watched: Watched, since_ns: int = 0) -> str:
     """What the watch found, in a sentence or two, with what to do."""
     if not watched.robots:
         return "Nothing was watched: no robot has a night that says where its frames are."
@@ -32,7 +44,7 @@ def verdict(watched: Watched, since_ns: int = 0) -> str:
     )
 
 
-def remarks(watched: Watched) -> tuple[str, ...]:
+def drift_remarks(watched: Watched) -> tuple[str, ...]:
     """What to keep in mind."""
     tests = [test for robot in watched.robots.values() for test in robot.tests]
     found = []
@@ -41,11 +53,6 @@ def remarks(watched: Watched) -> tuple[str, ...]:
         found.append(
             f"A robot that nothing happens to has one false alarm in {1.0 / watched.rate:,.0f} nights: of the {tested} "
             f"nights that were tested, about {tested * watched.rate:.2g}."
-        )
-    if watched.of_moments:
-        found.append(
-            f"{watched.of_moments} nights are of moments alone, whose covariances do not hold errors of the carriers' "
-            "poses: where these matter, false alarms are more frequent than stated. --refine finds the noise."
         )
     variance, correlation = watched.spread.variance, watched.spread.correlation
     if not AS_STATED[0] <= variance <= AS_STATED[1]:
@@ -91,3 +98,29 @@ def day_ns_of(text: str | None) -> int:
 def _some(names: list[str], between: str = ", ") -> str:
     more = len(names) - SAID
     return between.join(names[:SAID]) + (f"{between}and {more} more" if more > 0 else "")
+
+
+def stream(watched: Watched, *, every_night: bool = False) -> Iterator[str]:
+    """The lines of the stream, without line ends; lines of nights only where they are asked for."""
+    times = [when for robot in watched.robots.values() for when in (robot.when_ns[0], robot.when_ns[-1])]
+    spread = watched.spread
+    yield json_line(
+        {
+            "event": "watch",
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "written_by": f"gtsam-rwhec {version('gtsam-rwhec')}",
+            "nights_between_false_alarms": 1.0 / watched.rate,
+            "robots": len(watched.robots),
+            "nights": sum(len(robot.tests) for robot in watched.robots.values()),
+            **time_fields("first", min(times, default=None)),
+            **time_fields("last", max(times, default=None)),
+            "variance_over_stated": spread.variance,
+            "correlation_of_nights": spread.correlation,
+        }
+    )
+    for event in watched.events:
+        if every_night or not isinstance(event, NightEvent):
+            yield json_line(event_fields(event))
+    changed = sorted(watched.changed)
+    yield json_line({"event": "end", "alarms": len(watched.alarms), "robots_changed": changed})

@@ -1,0 +1,230 @@
+"""The problem of a robot, or of the robots of a site, from the measurements of their logs, which must agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fleet.partial_result import LogFacts, PairMeasurements, PartialResult
+from gtsam_rwhec.fleet.tasks import Receipt
+from gtsam_rwhec.fleet.without_secrets import shown
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.rig import Rig
+
+#: Pixels: the standard deviation of a corner where the rig file states none, as for one log.
+CORNER_PX = 0.1
+#: A message names at most this many contradictions.
+MOST_NAMED = 10
+
+
+@dataclass(frozen=True, eq=False)
+class UnitLog:
+    """A log of a unit: its robot, the receipt of its file, its measurements and facts with the unit's names."""
+
+    robot: str
+    receipt: Receipt
+    partial: PartialResult
+
+    @property
+    def facts(self) -> LogFacts:
+        """Of the log."""
+        return self.partial.facts
+
+
+@dataclass(frozen=True, eq=False)
+class UnitProblem:
+    """The problem of a unit, and what its rig files state beside it.
+
+    Attributes
+    ----------
+    problem : Problem
+    carrier_noise : CarrierNoise or None
+    estimated : tuple of str
+        Sensors whose clocks are to be estimated along `path`.
+    path : Trajectory or None
+    log_of : dict of (target, sensor) to (N,) integers
+        The place of each measurement's log among the unit's.
+    """
+
+    problem: Problem
+    carrier_noise: CarrierNoise | None
+    estimated: tuple[str, ...]
+    path: Trajectory | None
+    log_of: dict[Pair, np.ndarray]
+
+
+def sensor_name(robot: str, sensor: str) -> str:
+    """The name of a robot's sensor where several robots are solved together."""
+    return f"{robot}/{sensor}"
+
+
+def unit_problem(logs: Sequence[UnitLog], rigs: Mapping[str, Rig], *, at_site: bool) -> UnitProblem:
+    """The problem of logs in order of time.
+
+    At a site several robots are solved together, each with carriers of its own: their clocks are not estimated.
+
+    Raises
+    ------
+    RigError
+        The logs contradict each other.
+    """
+    rig = next(iter(rigs.values()))
+    noise_is = check_logs(logs, rig)
+    problem = Problem("per_target" if rig.sizes == "estimate" else "known")
+    problem.sensor_carrier, problem.target_carrier = None if at_site else rig.carriers.sensors, rig.carriers.targets
+    clocks = () if at_site else tuple(n for n, one in rig.sensors.items() if one.time_offset == "estimate")
+    common_s = _common_offsets(logs, clocks)
+    paths: list[tuple[np.ndarray, Array]] = []
+    log_of: dict[Pair, list[np.ndarray]] = {}
+    for i, log in enumerate(logs):
+        moved = _at_offsets(log.partial, common_s)
+        for pair, one in moved.items():
+            _add(problem, pair, one, rig, noise_is, log.facts.url)
+            log_of.setdefault(pair, []).append(np.full(len(one.A), i))
+        for name in log.facts.cameras:
+            if name in problem.sensors and any(p.sensor == name and one.pixels is not None for p, one in moved.items()):
+                problem.cameras[name] = log.facts.camera(name)
+        if log.partial.path is not None:
+            paths.append(log.partial.path)
+    if problem.cameras:
+        boards = {target.name: target.corners() for each in rigs.values() for target in each.target_list}
+        problem.boards.update({name: boards[name] for name in problem.targets if name in boards})
+        problem.corner_px = rig.corner_px or CORNER_PX
+    noise = rig.carriers.noise
+    estimated = tuple(name for name in clocks if name in problem.sensors) if paths else ()
+    return UnitProblem(
+        problem,
+        None
+        if noise is None
+        else CarrierNoise(
+            float(np.radians(noise.rotation_deg)), 1e-3 * noise.translation_mm, about=logs[0].facts.about
+        ),
+        estimated,
+        _joined(paths) if estimated else None,
+        {pair: np.concatenate(places) for pair, places in log_of.items()},
+    )
+
+
+def _common_offsets(logs: Sequence[UnitLog], clocks: Sequence[str]) -> dict[str, float]:
+    """One time offset, seconds, for each sensor whose clock is estimated: the mean of what the logs' rotations tell."""
+    told = {name: [log.facts.cleaning.time_offsets_s.get(name) for log in logs] for name in clocks}
+    known = {name: [offset_s for offset_s in each if offset_s is not None] for name, each in told.items()}
+    return {name: float(np.mean(each)) for name, each in known.items() if each}
+
+
+def _at_offsets(log: PartialResult, common_s: Mapping[str, float]) -> Mapping[Pair, PairMeasurements]:
+    """The measurements of a log with A at common time offsets in place of those at which it was taken."""
+    if log.path is None or not common_s:
+        return log.pairs
+    path = Trajectory.of(*log.path, "the carriers' path of a log")
+    taken_s = log.facts.cleaning.time_offsets_s
+    pairs = dict(log.pairs)
+    for pair, one in log.pairs.items():
+        if pair.sensor in common_s:
+            stamps = one.stamps_ns + round(1e9 * common_s[pair.sensor]) - round(1e9 * taken_s[pair.sensor])
+            pairs[pair] = replace(one, stamps_ns=stamps, A=path.at(stamps)[0])
+    return pairs
+
+
+def _add(problem: Problem, pair: Pair, one: PairMeasurements, rig: Rig, noise_is: str, where: str) -> None:
+    sigma = kappa = None
+    if noise_is == STATED and rig.noise != "estimate" and rig.noise.rotation_deg and rig.noise.translation_mm:
+        sigma, kappa = 1e-3 * rig.noise.translation_mm, 1.0 / (2.0 * np.radians(rig.noise.rotation_deg) ** 2)
+    covariances = one.covariances if noise_is == OF_CORNERS else None
+    problem.add_batch(
+        pair, GivenMeasurements(one.A, one.B, sigma, kappa, None, one.stamps_ns, covariances, where, one.pixels)
+    )
+
+
+def _joined(paths: list[tuple[np.ndarray, Array]]) -> Trajectory:
+    """One path of several logs, in order of time; of two poses at a stamp the first is taken."""
+    stamps, first = np.unique(np.concatenate([stamps for stamps, _ in paths]), return_index=True)
+    return Trajectory.of(stamps, np.concatenate([T for _, T in paths])[first], "the carriers' paths of the logs")
+
+
+#: How the noise of a log's measurements is known.
+STATED, OF_CORNERS, UNKNOWN = "stated", "from corners", "detections without corners or covariances"
+
+
+def check_logs(logs: Sequence[UnitLog], rig: Rig) -> str:
+    """How the noise of logs is known; a RigError where they know it in different ways, or cameras differ."""
+    found: list[str] = []
+    cameras: dict[str, UnitLog] = {}
+    for log in logs:
+        for name in log.facts.cameras:
+            first = cameras.setdefault(name, log)
+            one, other = first.facts.camera(name), log.facts.camera(name)
+            same = (one.model, one.width, one.height) == (other.model, other.width, other.height)
+            if not (same and np.array_equal(one.K, other.K) and np.array_equal(one.D, other.D)):
+                said = f"fx {one.K[0, 0]:g} and fx {other.K[0, 0]:g}"
+                found.append(f"{name} has other intrinsics in {log.facts.url} than in {first.facts.url} ({said})")
+    known = [_noise_of(log.partial, rig) for log in logs]
+    found += [
+        f"the noise of {log.facts.url} is known otherwise ({own}) than that of {logs[0].facts.url} ({known[0]}): state "
+        "it in the rig file (noise: {rotation_deg: ..., translation_mm: ...})"
+        for log, own in zip(logs, known, strict=True)
+        if own != known[0]
+    ]
+    _refuse(found)
+    return known[0]
+
+
+def _noise_of(log: PartialResult, rig: Rig) -> str:
+    if rig.noise != "estimate" and rig.noise.rotation_deg is not None and rig.noise.translation_mm is not None:
+        return STATED
+    return OF_CORNERS if all(one.covariances is not None for one in log.pairs.values()) else UNKNOWN
+
+
+def check_rigs(rigs: Mapping[str, Sequence[tuple[str, Rig]]]) -> None:
+    """Refuse rig files that say different things of one thing; each with its URL, by robot.
+
+    Raises
+    ------
+    RigError
+        A target has another type or size in one than in the other, a sensor of a robot other intrinsics, the carriers
+        other frames, or sizes and noise are treated otherwise; all are named.
+    """
+    found: list[str] = []
+    everyone = [(robot, url, rig) for robot, several in rigs.items() for url, rig in several]
+    first_robot, first_url, first = everyone[0]
+    for robot, url, rig in everyone[1:]:
+        own, others = shown(url), shown(first_url)
+        for name in sorted(first.targets.keys() & rig.targets.keys()):
+            if differs := _difference(first.targets[name], rig.targets[name]):
+                found.append(f"target {name} differs between {others} and {own} ({differs})")
+        stated = {
+            "the carrier of the targets": (first.carriers.targets, rig.carriers.targets),
+            "sizes": (first.sizes, rig.sizes),
+            "noise": (first.noise, rig.noise),
+        }
+        if robot == first_robot:
+            stated["the carrier of the sensors"] = first.carriers.sensors, rig.carriers.sensors
+            for name in sorted(first.sensors.keys() & rig.sensors.keys()):
+                one, other = first.sensors[name].intrinsics, rig.sensors[name].intrinsics
+                if one != other:
+                    differs = _difference(one, other) if one and other else ""
+                    found.append(f"sensor {name} has other intrinsics in {own} than in {others} ({differs})")
+        found += [f"{what} is {a} in {others} and {b} in {own}" for what, (a, b) in stated.items() if a != b]
+    _refuse(found)
+
+
+def _refuse(found: list[str]) -> None:
+    if found:
+        more = f"; and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
+        raise RigError(
+            f"rig files or logs that are to be solved together contradict each other: {'; '.join(found[:MOST_NAMED])}"
+            f"{more}. Correct the wrong one, or solve them apart (robots of their own, --each log)"
+        )
+
+
+def _difference(one: object, other: object) -> str:
+    before, now = (dict(each) for each in (one, other))  # type: ignore[call-overload]
+    keys = [key for key in before.keys() | now.keys() if before.get(key) != now.get(key)]
+    return ", ".join(f"{key}: {before.get(key)} and {now.get(key)}" for key in sorted(keys)[:3])
