@@ -25,7 +25,7 @@ from places import CELL
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.runs import log_report, whole_runs
+from gtsam_rwhec.runs import log_evidence, whole_runs
 
 SECONDS, MEGABYTES = 3.0, 5.0
 
@@ -50,7 +50,7 @@ class Timed:
 
 def demo(folder: Path, timed: Timed) -> None:
     """Calibrate the demo's log; its report is timed."""
-    timed.function = log_report.write_report
+    timed.function = log_evidence.write_report
     whole_runs.write_report = timed  # type: ignore[assignment]
     rw.calibrate_log(CELL / "robot_cell.mcap", rw.rig.read_rig(CELL / "rig.yaml"), folder)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
@@ -22,13 +21,13 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning
 from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, write_pairs
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, pair_records
 from gtsam_rwhec.runs.odometry_cleaning import odometry_steps
 from gtsam_rwhec.runs.odometry_pairs import odometry_pairs
-from gtsam_rwhec.runs.odometry_tracks import read_odometry, write_files
+from gtsam_rwhec.runs.odometry_tracks import read_odometry
 from gtsam_rwhec.runs.output_folder import check_writable
 from gtsam_rwhec.runs.pair_consensus import ConsensusOptions, find_consensus
-from gtsam_rwhec.runs.run_log import read_metadata, topics_up_to_detection
+from gtsam_rwhec.runs.run_log import RunLog, read_cleaning_report, write_run_log
 from gtsam_rwhec.runs.tracks import Track, read_tracks
 
 #: Nanoseconds. The carriers' speed at a stamp is measured from this time before it to this time after it.
@@ -72,62 +71,63 @@ def clean_log(
     LogWarning
         The motion does not determine the time offset of a sensor; the others are cleaned without it.
     """
-    tell = progress or silent
     check_writable(out_path)
     with open_log(detected_path) as log:
-        rig = rig_for_cleaning(log, rig)
-        metadata = read_metadata(log)
-        tell("reading the carriers' poses")
-        motion = read_carrier_motion(log, rig)
-        path = motion.trajectory
-        pairs: list[MeasuredPairs] = []
-        offsets_s: dict[str, float] = {}
-        sigmas_s: dict[str, float] = {}
-        unknown: dict[str, StampError] = {}
-        for sensor in rig.sensors:
-            tell(f"synchronising {sensor}")
-            tracks = read_tracks(log, rig, sensor)
-            try:
-                offsets_s[sensor], sigma_s = _time_offset(rig, sensor, path, tracks)
-            except StampError as error:  # the other sensors have an answer without this one
-                unknown[sensor] = error
-                pairs += [clean_track(track.without(RemovalReason.CLOCK_UNKNOWN), path, rig, 0.0) for track in tracks]
-                continue
-            if sigma_s is not None:
-                sigmas_s[sensor] = sigma_s
-            _check_overlap(tracks, path, sensor, offsets_s[sensor])
-            pairs += [clean_track(track, path, rig, offsets_s[sensor]) for track in tracks]
-        if rig.is_of_odometries:
-            assert rig.reference is not None
-            reference = read_odometry(log, rig, rig.reference)
-            for sensor, section in rig.odometries.items():
-                tell(f"cleaning {sensor}")
-                pairs.append(odometry_steps(log, rig, reference, sensor))
-                offsets_s[sensor] = 0.0 if section.time_offset == "estimate" else float(section.time_offset)
-        for sensor in (name for name in rig.odometries if name != rig.reference and not rig.is_of_odometries):
-            tell(f"comparing the motions of {sensor}")
-            motions, offsets_s[sensor], sigma_s = odometry_pairs(log, rig, sensor, motion)
-            if sigma_s is not None:
-                sigmas_s[sensor] = sigma_s
-            pairs.append(motions)
-        report = CleaningReport(
-            tracks=tuple(measured.count for measured in pairs), time_offsets_s=offsets_s, coarse_sigma_s=sigmas_s
+        found = cleaned(log, rig, progress)
+        (progress or silent)("writing pairs")
+        write_run_log(found, out_path, images)
+    return read_cleaning_report(found)
+
+
+def cleaned(log: Log, rig: Rig | None = None, progress: Progress | None = None) -> RunLog:
+    """The log with the pairs, as `clean_log` writes it."""
+    tell = progress or silent
+    rig = rig_for_cleaning(log, rig)
+    tell("reading the carriers' poses")
+    motion = read_carrier_motion(log, rig)
+    path = motion.trajectory
+    pairs: list[MeasuredPairs] = []
+    offsets_s: dict[str, float] = {}
+    sigmas_s: dict[str, float] = {}
+    unknown: dict[str, StampError] = {}
+    for sensor in rig.sensors:
+        tell(f"synchronising {sensor}")
+        tracks = read_tracks(log, rig, sensor)
+        try:
+            offsets_s[sensor], sigma_s = _time_offset(rig, sensor, path, tracks)
+        except StampError as error:  # the other sensors have an answer without this one
+            unknown[sensor] = error
+            pairs += [clean_track(track.without(RemovalReason.CLOCK_UNKNOWN), path, rig, 0.0) for track in tracks]
+            continue
+        if sigma_s is not None:
+            sigmas_s[sensor] = sigma_s
+        _check_overlap(tracks, path, sensor, offsets_s[sensor])
+        pairs += [clean_track(track, path, rig, offsets_s[sensor]) for track in tracks]
+    if rig.is_of_odometries:
+        assert rig.reference is not None
+        reference = read_odometry(log, rig, rig.reference)
+        for sensor, section in rig.odometries.items():
+            tell(f"cleaning {sensor}")
+            pairs.append(odometry_steps(log, rig, reference, sensor))
+            offsets_s[sensor] = 0.0 if section.time_offset == "estimate" else float(section.time_offset)
+    for sensor in (name for name in rig.odometries if name != rig.reference and not rig.is_of_odometries):
+        tell(f"comparing the motions of {sensor}")
+        motions, offsets_s[sensor], sigma_s = odometry_pairs(log, rig, sensor, motion)
+        if sigma_s is not None:
+            sigmas_s[sensor] = sigma_s
+        pairs.append(motions)
+    report = CleaningReport(
+        tracks=tuple(measured.count for measured in pairs), time_offsets_s=offsets_s, coarse_sigma_s=sigmas_s
+    )
+    if not any(track.used for track in report.tracks):
+        if unknown:
+            raise next(iter(unknown.values()))
+        raise LogError(
+            f"{log.files[0].path}: no measurement is left after cleaning. {'; '.join(map(str, report.tracks))}."
         )
-        if not any(track.used for track in report.tracks):
-            if unknown:
-                raise next(iter(unknown.values()))
-            raise LogError(
-                f"{log.files[0].path}: no measurement is left after cleaning. {'; '.join(map(str, report.tracks))}."
-            )
-        for why in unknown.values():
-            warnings.warn(f"none of the measurements is used of {why}", LogWarning, stacklevel=3)
-        tell("writing pairs")
-        with LogWriter(out_path) as out:
-            out.copy(log, topics_up_to_detection(log), images)
-            write_files(out, log, rig)
-            write_pairs(out, pairs)
-            replace(metadata, rig=rig, cleaning=report).write(out)
-    return report
+    for why in unknown.values():
+        warnings.warn(f"none of the measurements is used of {why}", LogWarning, stacklevel=3)
+    return RunLog.with_pairs(log, report, rig, pair_records(pairs))
 
 
 def clean_track(track: Track, path: Trajectory, rig: Rig, offset_s: float) -> MeasuredPairs:

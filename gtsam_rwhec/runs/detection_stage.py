@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError, OptionError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
@@ -23,18 +20,9 @@ from gtsam_rwhec.runs.driver_detections import read_driver_detections
 from gtsam_rwhec.runs.image_detections import check_usable, detect_in_log, detection_report
 from gtsam_rwhec.runs.image_pictures import check_drawable, draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.odometry_tracks import write_files
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
-from gtsam_rwhec.runs.run_log import (
-    RECORDED_LOG,
-    LogMetadata,
-    annotations_topic,
-    detections_topic,
-    image_names,
-    poses_topic,
-    raw_topics,
-)
+from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
 from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics, in_words, read_intrinsics, refuse_not_estimated
 from gtsam_rwhec.runs.topics_of_rig import check_topics
 from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_detections
@@ -74,7 +62,6 @@ def detect_log(
     sheet: str | Path | None = None,
     draw: str | Path | None = None,
     progress: Progress | None = None,
-    keep: Callable[[Log, Mapping[str, Camera]], KeptDetections] | None = None,
 ) -> DetectionReport:
     """Detect the targets, and write a log with the detections.
 
@@ -97,8 +84,6 @@ def detect_log(
         A PNG file for a contact sheet of the images, and a folder for a picture of each: written also where no target
         was detected. A sheet needs images; without any it is not written.
     progress : callable, optional
-    keep : callable, optional
-        Gives the file of the detections so far, for the log and the cameras, before anything is written.
 
     Raises
     ------
@@ -109,65 +94,65 @@ def detect_log(
     LogError, StampError, TransformError, CameraError, FrameError
         The log lacks a topic of the rig file or the carriers' poses, or no target was detected.
     """
-    tell = progress or silent
     check_writable(out_path)
     with open_log(log_path) as log:
         check_is_not_read(log, out_path)
         check_image_options(log, rig, images=images, workers=workers)
-        check_topics(log, rig)
-        if draw is not None:
-            check_drawable(rig, draw)
-        cameras = read_intrinsics(log, rig)
-        tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
-        motion = read_carrier_motion(log, rig)
-        estimated, failed = estimate_intrinsics(log, rig, workers=workers, progress=tell)
-        if failed:
-            refuse_not_estimated(log, rig, failed, motion, sheet)
-        cameras |= {sensor: of_sensor.camera for sensor, of_sensor in estimated.items()}
-        kept = None if keep is None else keep(log, cameras)
-        found = detect_in_log(log, rig, cameras, motion, workers=workers, progress=tell, kept=kept)
-        for sensor, of_camera in estimated.items():
-            found[sensor] = replace(found[sensor], remarks=(in_words(sensor, of_camera), *found[sensor].remarks))
-        for sensor, source in rig.sensors.items():
-            if source.detections is not None:
-                found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
-        report = detection_report(log, rig, found)
-        has_sheet = False
-        if sheet is not None:
-            tell("drawing the contact sheet")
-            has_sheet = write_contact_sheet(Path(sheet), log, rig, cameras, found)
-        if draw is not None:
-            draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
-        check_usable(log, rig, found)  # after the pictures: they show what is wrong
-        tell("looking for what hides targets")
-        blurred, likely = blurred_images(log, rig, cameras, found), likely_causes(log, rig, cameras, found)
-        report = report.model_copy(update={"likely": likely, "blurred": blurred})
-        if rig.sensors and not any(track.used for track in report.tracks):
-            report = report.model_copy(update={"likely": (*(f"{words}." for words in blurred), *likely)})
-            shown = f" {sheet} shows some of the images." if has_sheet else ""
-            raise LogError(f"{no_detections(log, report)}{shown}")
-        tell("writing detections")
-        with LogWriter(out_path) as out:
-            out.copy(log, raw_topics(log), images)
-            write_files(out, log, rig)
-            for sensor, of_sensor in found.items():
-                _write_detections(out, sensor, of_sensor.records)
-            LogMetadata(rig, cameras, report, image_names=image_names(log)).write(out)
-    return report
+        found = detected(log, rig, workers=workers, sheet=sheet, draw=draw, progress=progress)
+        (progress or silent)("writing detections")
+        write_run_log(found, out_path, images)
+    return found.stages.detection
 
 
-def _write_detections(out: LogWriter, sensor: str, records: list[DetectionRecord]) -> None:
-    of_image: dict[int, list[DetectionRecord]] = defaultdict(list)
-    for record in records:
-        of_image[record.stamp_ns].append(record)
-    for stamp, seen in sorted(of_image.items()):
-        out.detections(detections_topic(sensor), stamp, seen[0].frame, seen)
-        outlines = [(r.label, r.corners_px) for r in seen if r.corners_px is not None and len(r.corners_px)]
-        if outlines:
-            out.annotations(annotations_topic(sensor), stamp, outlines)
-        used = [r.T_camera_tag for r in seen if r.T_camera_tag is not None and not r.reason]
-        if used:
-            out.poses(poses_topic(sensor), stamp, seen[0].frame, np.array(used))
+def detected(
+    log: Log,
+    rig: Rig,
+    *,
+    workers: int | None = None,
+    sheet: str | Path | None = None,
+    draw: str | Path | None = None,
+    progress: Progress | None = None,
+    keep: Callable[[Mapping[str, Camera]], KeptDetections] | None = None,
+) -> RunLog:
+    """The log with the detections, as `detect_log` writes it.
+
+    `keep` gives the file of the detections so far, for the cameras, before anything is written.
+    """
+    tell = progress or silent
+    check_topics(log, rig)
+    if draw is not None:
+        check_drawable(rig, draw)
+    cameras = read_intrinsics(log, rig)
+    tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
+    motion = read_carrier_motion(log, rig)
+    estimated, failed = estimate_intrinsics(log, rig, workers=workers, progress=tell)
+    if failed:
+        refuse_not_estimated(log, rig, failed, motion, sheet)
+    cameras |= {sensor: of_sensor.camera for sensor, of_sensor in estimated.items()}
+    kept = None if keep is None else keep(cameras)
+    found = detect_in_log(log, rig, cameras, motion, workers=workers, progress=tell, kept=kept)
+    for sensor, of_camera in estimated.items():
+        found[sensor] = replace(found[sensor], remarks=(in_words(sensor, of_camera), *found[sensor].remarks))
+    for sensor, source in rig.sensors.items():
+        if source.detections is not None:
+            found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
+    report = detection_report(log, rig, found)
+    has_sheet = False
+    if sheet is not None:
+        tell("drawing the contact sheet")
+        has_sheet = write_contact_sheet(Path(sheet), log, rig, cameras, found)
+    if draw is not None:
+        draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
+    check_usable(log, rig, found)  # after the pictures: they show what is wrong
+    tell("looking for what hides targets")
+    blurred, likely = blurred_images(log, rig, cameras, found), likely_causes(log, rig, cameras, found)
+    report = report.model_copy(update={"likely": likely, "blurred": blurred})
+    if rig.sensors and not any(track.used for track in report.tracks):
+        report = report.model_copy(update={"likely": (*(f"{words}." for words in blurred), *likely)})
+        shown = f" {sheet} shows some of the images." if has_sheet else ""
+        raise LogError(f"{no_detections(log, report)}{shown}")
+    stages = LogMetadata(rig, cameras, report, image_names=image_names(log))
+    return RunLog.with_detections(log, stages, {sensor: of.records for sensor, of in found.items()})
 
 
 def sheet_beside(out_path: str | Path) -> Path:

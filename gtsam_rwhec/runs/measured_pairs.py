@@ -38,8 +38,8 @@ class MeasuredPairs(Track):
         return replace(self, A=A)
 
 
-def write_pairs(out: LogWriter, pairs: Iterable[MeasuredPairs]) -> None:
-    """Write every measurement that has a pose, in order of time."""
+def pair_records(pairs: Iterable[MeasuredPairs]) -> list[PairRecord]:
+    """Every measurement that has a pose, in order of time."""
     records = [
         PairRecord(
             logged_ns=stamp,
@@ -57,7 +57,12 @@ def write_pairs(out: LogWriter, pairs: Iterable[MeasuredPairs]) -> None:
         for i, (stamp, reason) in enumerate(zip(measured.stamps_ns.tolist(), measured.reasons, strict=True))
         if reason != Rejection.NO_POSE
     ]
-    for record in sorted(records, key=lambda record: record.stamp_ns):
+    return sorted(records, key=lambda record: record.stamp_ns)
+
+
+def write_pairs(out: LogWriter, pairs: Iterable[MeasuredPairs]) -> None:
+    """Write every measurement that has a pose, in order of time."""
+    for record in pair_records(pairs):
         out.pair(record)
 
 

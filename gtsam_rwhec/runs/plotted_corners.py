@@ -16,16 +16,16 @@ from gtsam_rwhec.runs.run_log import detections_topic, records_of
 from gtsam_rwhec.runs.solving_stage import Solved
 
 
-def seen_views(solved: Solved, log: Log, *, left_out: bool = False) -> dict[str, list[SeenView]]:
-    """The corners of used detections, with where the calibration has them, by camera.
+def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
+    """The corners of detections that are used, or that robust estimation left out, with where the calibration has them.
 
-    With `left_out` those that robust estimation left out are there too, marked as not used.
+    By camera; those that were left out are marked as not used.
     """
     path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
     boards = {name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X}
-    wanted = ("", RemovalReason.OUTLIER) if left_out else ("",)
+    wanted = ("", RemovalReason.OUTLIER)
     is_used = {
         (pair, stamp): not reason
         for pair, measured in solved.pairs.items()

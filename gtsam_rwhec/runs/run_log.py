@@ -1,32 +1,38 @@
-"""The contract of the stages: the names under which one stage writes and the next stage reads.
+"""The log of a run: what the stages agree on, and a log that holds in memory what they found.
 
-Detection copies the raw log and adds `detections_topic`, `annotations_topic` and `poses_topic` of each sensor, and the
-odometries that are in files. Cleaning
-copies the detected log and adds `pairs_topic` of each sensor. Solving copies the cleaned log, replaces its pairs by the
-pairs that the answer was computed from, and adds `SOLUTION_TOPIC`. Each stage writes the metadata of the stages before
-it again.
+Detection adds `detections_topic`, `annotations_topic` and `poses_topic` of each sensor, and odometries in files;
+cleaning adds `pairs_topic`; solving replaces the pairs by those of the answer and adds `SOLUTION_TOPIC`. Each stage
+takes a log and gives a `RunLog`, which the next one takes. It becomes a file once, at the end, with all of it; or after
+each stage that is run alone, and the next one reads that file.
 """
 
 from __future__ import annotations
 
+import heapq
 import json
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from pathlib import PurePosixPath
-from typing import NamedTuple, TypeVar
+from collections import defaultdict
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
+from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, Record
+from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, PairRecord, Record
+from gtsam_rwhec.logs.mcap_writer import Images
+from gtsam_rwhec.logs.records import MEASURED_PAIR, TAG_DETECTIONS, Topic, transforms
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig, parse_rig, rig_text
+from gtsam_rwhec.runs.odometry_tracks import write_files
 
 Kind = TypeVar("Kind", bound=Record)
+Report = TypeVar("Report", bound=BaseModel)
 
 #: This topic has the calibrated frames as static transforms, which viewers show at any time.
 SOLUTION_TOPIC = "/calibration/tf_static"
@@ -62,6 +68,8 @@ EVIDENCE_FILE = "evidence.json"
 REPORT_FILE = "report.html"
 #: The contact sheet of the images in the output folder: what was found, and what was not.
 SEEN_SHEET = "seen.png"
+#: A part of a file's name has at most this many characters.
+LONGEST = 80
 
 
 def image_key(topic: str, stamp_ns: int) -> str:
@@ -113,12 +121,10 @@ def records_of(log: Log, topics: Iterable[str], kind: type[Kind]) -> Iterator[Ki
         yield from (record for record in log.records(there) if isinstance(record, kind))
 
 
-#: A part of a file's name has at most this many characters.
-LONGEST = 80
-
-
 def image_names(log: Log) -> Mapping[str, str]:
     """The names of the files that a folder's images were, by `image_key`; empty for other logs."""
+    if isinstance(log, RunLog):
+        return log.stages.image_names
     return log.metadata().get(IMAGES_METADATA, {})
 
 
@@ -135,9 +141,6 @@ def picture_file(sensor: str, name: str) -> str:
 
 def _plain(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)[:LONGEST].strip(".") or "_"
-
-
-Report = TypeVar("Report", bound=BaseModel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,21 +167,154 @@ class LogMetadata:
     cleaning: CleaningReport | None = None
     image_names: Mapping[str, str] = field(default_factory=dict)
 
-    def write(self, out: LogWriter) -> None:
-        """Write the metadata into a log."""
-        out.metadata(RIG_METADATA, {"yaml": rig_text(self.rig)})
-        entries = {
+    def entries(self) -> dict[str, dict[str, str]]:
+        """The metadata records of a log, by name."""
+        cameras = {
             sensor: json.dumps(
                 {"width": c.width, "height": c.height, "model": c.model, "K": c.K.tolist(), "D": c.D.tolist()}
             )
             for sensor, c in self.cameras.items()
         }
-        out.metadata(CAMERAS_METADATA, entries)
-        out.metadata(DETECTION_METADATA, {"json": self.detection.model_dump_json()})
+        entries = {
+            RIG_METADATA: {"yaml": rig_text(self.rig)},
+            CAMERAS_METADATA: cameras,
+            DETECTION_METADATA: {"json": self.detection.model_dump_json()},
+        }
         if self.image_names:
-            out.metadata(IMAGES_METADATA, self.image_names)
+            entries[IMAGES_METADATA] = dict(self.image_names)
         if self.cleaning is not None:
-            out.metadata(CLEANING_METADATA, {"json": self.cleaning.model_dump_json()})
+            entries[CLEANING_METADATA] = {"json": self.cleaning.model_dump_json()}
+        return entries
+
+    def write(self, out: LogWriter) -> None:
+        """Write the metadata into a log."""
+        for name, entries in self.entries().items():
+            out.metadata(name, entries)
+
+
+class RunLog(Log):
+    """A log with what the stages found, in memory: it reads as the file that is written of it.
+
+    Parameters
+    ----------
+    recorded : Log
+        It stays open, and is read for all that no stage of this run found.
+    kept : collection of str
+        The topics of `recorded` that count; those of a stage that is run again do not.
+    stages : LogMetadata
+    found : mapping of str to sequence of Record
+        What the stages of this run found, by topic, in the order of time.
+    detections : mapping of str to sequence of DetectionRecord
+        The detections among it by sensor, as they are written.
+    """
+
+    def __init__(
+        self,
+        recorded: Log,
+        kept: Collection[str],
+        stages: LogMetadata,
+        found: Mapping[str, Sequence[Record]],
+        detections: Mapping[str, Sequence[DetectionRecord]],
+    ) -> None:
+        self.files, self.losses = recorded.files, recorded.losses
+        self.recorded, self.kept, self.stages = recorded, kept, stages
+        self.found, self.detections = found, detections
+
+    @staticmethod
+    def with_detections(log: Log, stages: LogMetadata, records: Mapping[str, Sequence[DetectionRecord]]) -> RunLog:
+        """A recorded log with the detections of each sensor."""
+        found = {detections_topic(sensor): _as_read(detections_topic(sensor), of) for sensor, of in records.items()}
+        return RunLog(log, raw_topics(log), stages, found, records)
+
+    @staticmethod
+    def with_pairs(log: Log, cleaning: CleaningReport, rig: Rig, records: Iterable[PairRecord]) -> RunLog:
+        """A log of detections with the pairs that cleaning made of them."""
+        found: dict[str, list[Record]] = defaultdict(list)
+        for record in records:
+            found[record.topic].append(record)
+        stages = replace(read_metadata(log), rig=rig, cleaning=cleaning)
+        if isinstance(log, RunLog):
+            return RunLog(log.recorded, log.kept, stages, {**log.found, **found}, log.detections)
+        return RunLog(log, topics_up_to_detection(log), stages, found, {})
+
+    def topics(self) -> tuple[Topic, ...]:
+        """Every topic, by name."""
+        schemas = {DetectionRecord: TAG_DETECTIONS, PairRecord: MEASURED_PAIR}
+        found = [
+            Topic(name, schemas[type(of[0])], "json", len(of), of[0].logged_ns, of[-1].logged_ns, "")
+            for name, of in self.found.items()
+            if of
+        ]
+        kept = [topic for topic in self.recorded.topics() if topic.name in self.kept and topic.name not in self.found]
+        return tuple(sorted([*kept, *found], key=lambda topic: topic.name))
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The metadata records that the file will have."""
+        return self.stages.entries()
+
+    def records(
+        self, topics: Iterable[str] | None = None, on_bad: Literal["warn", "raise"] = "warn"
+    ) -> Iterator[Record]:
+        """The records of some topics in the order of log time, as of any log."""
+        named = {topic.name for topic in self.topics()}
+        wanted = named if topics is None else {topics} if isinstance(topics, str) else set(topics)
+        found = [self.found[name] for name in sorted(wanted & self.found.keys())]
+        others = wanted - self.found.keys()
+        if others and not others <= named:
+            raise LogError(
+                f"{self.files[0].path} has no topic {min(others - named)}; it has: {self.topics_in_words()}."
+            )
+        recorded = self.recorded.records(others, on_bad) if others else ()
+        return heapq.merge(*found, recorded, key=lambda record: record.logged_ns)
+
+    def records_logged_at(self, topics: Iterable[str], logged_ns: Iterable[int]) -> Iterator[Record]:
+        """The recorded messages of some topics whose log time is one of these."""
+        return self.recorded.records_logged_at(topics, logged_ns)
+
+
+def write_up_to_detection(log: Log, out: LogWriter, images: Images) -> None:
+    """Write what was recorded, with odometries that are in files, and what was detected in it."""
+    write_files(out, log, read_embedded_rig(log))
+    if not isinstance(log, RunLog):
+        out.copy(log, topics_up_to_detection(log), images)
+        return
+    out.copy(log.recorded, log.kept, images)
+    for sensor, records in log.detections.items():
+        of_image: dict[int, list[DetectionRecord]] = defaultdict(list)
+        for record in records:
+            of_image[record.stamp_ns].append(record)
+        for stamp, seen in sorted(of_image.items()):
+            out.detections(detections_topic(sensor), stamp, seen[0].frame, seen)
+            outlines = [(r.label, r.corners_px) for r in seen if r.corners_px is not None and len(r.corners_px)]
+            if outlines:
+                out.annotations(annotations_topic(sensor), stamp, outlines)
+            used = [r.T_camera_tag for r in seen if r.T_camera_tag is not None and not r.reason]
+            if used:
+                out.poses(poses_topic(sensor), stamp, seen[0].frame, np.array(used))
+
+
+def write_run_log(log: RunLog, path: str | Path, images: Images) -> None:
+    """Write the log of a run that is not solved yet into an MCAP file."""
+    with LogWriter(path) as out:
+        write_up_to_detection(log, out, images)
+        for record in records_of(log, log.found, PairRecord):
+            out.pair(record)
+        log.stages.write(out)
+
+
+def _as_read(topic: str, records: Sequence[DetectionRecord]) -> list[DetectionRecord]:
+    """Detections as they are read of a file: in the order of time, with poses that went by way of quaternions.
+
+    So a run in one go finds the same, to the last bit, as one stage at a time.
+    """
+    posed = [record for record in records if record.T_camera_tag is not None]
+    T = np.array([record.T_camera_tag for record in posed]).reshape(-1, 4, 4)
+    of_quaternions, _ = transforms(T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat() if len(T) else T[:, 0])
+    read = {id(record): pose for record, pose in zip(posed, of_quaternions, strict=True)}
+    return [
+        replace(record, topic=topic, logged_ns=record.stamp_ns, T_camera_tag=read.get(id(record)))
+        for record in sorted(records, key=lambda record: record.stamp_ns)
+    ]
 
 
 def read_metadata(log: Log) -> LogMetadata:
@@ -189,6 +325,8 @@ def read_metadata(log: Log) -> LogMetadata:
     LogError
         No stage wrote the log, or its metadata is damaged.
     """
+    if isinstance(log, RunLog):
+        return log.stages
     rig = read_embedded_rig(log)
     cleaning = read_cleaning_report(log) if CLEANING_METADATA in log.metadata() else None
     detection = _report(log, DETECTION_METADATA, DetectionReport)
@@ -197,11 +335,15 @@ def read_metadata(log: Log) -> LogMetadata:
 
 def read_cleaning_report(log: Log) -> CleaningReport:
     """The report of cleaning; `LogError` if the log was not cleaned, or the report is damaged."""
+    if isinstance(log, RunLog) and log.stages.cleaning is not None:
+        return log.stages.cleaning
     return _report(log, CLEANING_METADATA, CleaningReport)
 
 
 def read_embedded_rig(log: Log) -> Rig:
     """The rig file that the last stage worked with; `LogError` if the log has none."""
+    if isinstance(log, RunLog):
+        return log.stages.rig
     found = log.metadata().get(RIG_METADATA)
     if found is None or "yaml" not in found:
         raise LogError(
@@ -219,6 +361,8 @@ def read_cameras(log: Log) -> dict[str, Camera]:
     LogError
         The intrinsics are damaged.
     """
+    if isinstance(log, RunLog):
+        return dict(log.stages.cameras)
     where = f"{log.files[0].path}, metadata {CAMERAS_METADATA}"
     cameras = {}
     for sensor, text in log.metadata().get(CAMERAS_METADATA, {}).items():

@@ -15,7 +15,7 @@ from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import decode_gray
 from gtsam_rwhec.detect.pictures import draw_errors, jpeg_of
 from gtsam_rwhec.errors import ImageError, LogError, LogWarning
-from gtsam_rwhec.logs import ImageRecord, Log, open_log
+from gtsam_rwhec.logs import ImageRecord, Log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.detection_evidence import (
     PIECES,
@@ -45,20 +45,19 @@ _BY_DETECTION = {str(reason) for reason in Rejection}
 
 @dataclass(frozen=True)
 class Pictures:
-    """Where images are: the recorded logs, and the contact sheet's file, which may be missing.
+    """Where images are: the log with them, and the contact sheet's file, which may be missing.
 
     With `may_show` False only the images' names are read.
     """
 
-    logs: tuple[Path, ...]
+    log: Log
     sheet: Path | None
     may_show: bool = True
 
 
-def seen_in_log(solved: Solved, log_path: str | Path, pictures: Pictures | None) -> SeenEvidence:
-    """What was seen, of a solved log; without `pictures` there are neither images nor their names."""
-    with open_log(log_path) as log:
-        views = seen_views(solved, log, left_out=True)
+def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvidence:
+    """What was seen, of a cleaned log; without `pictures` there are neither images nor their names."""
+    views = seen_views(solved, log)
     found = solved.refined.reprojection
     cameras = {sensor: camera_of(solved, sensor) for sensor in views}
     of_tracks = solved.log.detection.corner_px
@@ -115,13 +114,13 @@ def images_of(
     pictures: Pictures | None, rig: Rig, wanted: Sequence[RatedView]
 ) -> tuple[dict[tuple[str, int], ImageRecord], Mapping[str, str], str]:
     """Images by sensor and stamp, the names of the files that images were, and why there are no images."""
-    if pictures is None or not pictures.logs:
+    if pictures is None:
         return {}, {}, "the recorded log is not known any more."
+    names = image_names(pictures.log)
     try:
         # What is damaged in the log was said when it was read for its detections.
-        with warnings.catch_warnings(action="ignore", category=LogWarning), open_log(list(pictures.logs)) as log:
-            names = image_names(log)
-            found, why_not = _wanted_images(log, rig, wanted) if pictures.may_show else ({}, WITHOUT)
+        with warnings.catch_warnings(action="ignore", category=LogWarning):
+            found, why_not = _wanted_images(pictures.log, rig, wanted) if pictures.may_show else ({}, WITHOUT)
     except LogError as error:
         return {}, {}, f"the log with the images cannot be read: {error}"
     return found, names, why_not

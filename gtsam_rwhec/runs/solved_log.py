@@ -7,7 +7,7 @@ from pathlib import Path
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.results.result_file import parse_result, result_json
+from gtsam_rwhec.results.result_file import parse_result
 from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.run_log import (
     CERTIFICATE_METADATA,
@@ -18,7 +18,7 @@ from gtsam_rwhec.runs.run_log import (
     read_cameras,
     read_embedded_rig,
     records_of,
-    topics_up_to_detection,
+    write_up_to_detection,
 )
 from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
 
@@ -26,17 +26,15 @@ from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
 CALIBRATED = "_calibrated"
 
 
-def write_solved(
-    clean_path: str | Path, calibrated: Calibrated, out_path: str | Path, *, images: Images = "copy"
-) -> None:
-    """Write the cleaned log with its solution: frames as static transforms, certificate as metadata, result attached.
+def write_solved(log: Log, calibrated: Calibrated, out_path: str | Path, *, result: bytes, images: Images) -> None:
+    """Write a log with its solution: frames as static transforms, certificate as metadata, result attached.
 
-    `clean_path` is the log that ``clean_log`` wrote, and may be `out_path`, the MCAP file to write; `images` says
-    whether it has the images of the cleaned log. Raises `LogError` if a file cannot be read or written.
+    `log` is the cleaned log, whose file may be `out_path`, the MCAP file to write; `images` says whether its images are
+    written too. Raises `LogError` if the file cannot be written.
     """
     rig, refined, pairs = calibrated.rig, calibrated.refined, calibrated.pairs.values()
-    with open_log(clean_path) as log, LogWriter(out_path) as out:
-        out.copy(log, topics_up_to_detection(log), images)
+    with LogWriter(out_path) as out:
+        write_up_to_detection(log, out, images)
         write_pairs(out, pairs)
         first_ns = min(int(measured.stamps_ns.min()) for measured in pairs)
         taken = _raw_children(log)
@@ -59,7 +57,7 @@ def write_solved(
                 "free_directions": "; ".join(map(str, refined.free_directions)),
             },
         )
-        out.attachment(RESULT_FILE, "application/json", result_json(calibrated.calibration, calibrated.log), first_ns)
+        out.attachment(RESULT_FILE, "application/json", result, first_ns)
 
 
 def read_solved(path: str | Path) -> Solved:

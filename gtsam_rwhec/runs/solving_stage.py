@@ -15,7 +15,7 @@ from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields
 from gtsam_rwhec.results.removed_measurements import RemovalReason
@@ -94,12 +94,12 @@ class Calibrated(Solved):
 
 
 @one_blas_thread()
-def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progress | None = None) -> Calibrated:
+def solve_log(log: Log | str | Path, rig: Rig | None = None, *, progress: Progress | None = None) -> Calibrated:
     """Calibrate from a cleaned log.
 
     Parameters
     ----------
-    clean_path
+    log : Log or path
         The log that ``clean_log`` wrote.
     rig : Rig, optional
         By default the rig file embedded in the log.
@@ -112,31 +112,34 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     RwhecError
         As ``solve`` and ``refine`` do.
     """
-    with open_log(clean_path) as log:
-        rig = rig_for_solving(log, rig)
-        if rig.is_of_odometries:
-            raise LogError(f"{clean_path}: no sensor sees a target; solve it with solve_odometries")
-        if rig.given != GivenSection():
-            raise LogError(
-                f"{rig.source.place(('given',))}: what is given is not used where cameras see targets; "
-                "leave it out, or calibrate the odometries alone"
-            )
-        metadata, cleaning = read_metadata(log), read_cleaning_report(log)
-        pairs = read_pairs(log, rig)
-        used_sensors = {measured.sensor for measured in pairs.values() if measured.used.any()}
-        if not used_sensors:
-            raise LogError(f"{clean_path}: it has no usable pair of measurements")
-        motion = read_carrier_motion(log, rig)
-        logged = LogCorners.of(log, rig, metadata.cameras)
-        doubted = doubted_intrinsics(log, rig, metadata.cameras)
-        of_shapes = doubted_shapes(log, rig, metadata.cameras)
-        of_shapes += continued_boards(metadata.detection.strangers, rig)
+    if not isinstance(log, Log):
+        with open_log(log) as opened:
+            return solve_log(opened, rig, progress=progress)
+    path = log.files[0].path
+    rig = rig_for_solving(log, rig)
+    if rig.is_of_odometries:
+        raise LogError(f"{path}: no sensor sees a target; solve it with solve_odometries")
+    if rig.given != GivenSection():
+        raise LogError(
+            f"{rig.source.place(('given',))}: what is given is not used where cameras see targets; "
+            "leave it out, or calibrate the odometries alone"
+        )
+    metadata, cleaning = read_metadata(log), read_cleaning_report(log)
+    pairs = read_pairs(log, rig)
+    used_sensors = {measured.sensor for measured in pairs.values() if measured.used.any()}
+    if not used_sensors:
+        raise LogError(f"{path}: it has no usable pair of measurements")
+    motion = read_carrier_motion(log, rig)
+    logged = LogCorners.of(log, rig, metadata.cameras)
+    doubted = doubted_intrinsics(log, rig, metadata.cameras)
+    of_shapes = doubted_shapes(log, rig, metadata.cameras)
+    of_shapes += continued_boards(metadata.detection.strangers, rig)
     estimated = tuple(
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used_sensors
     )
     missing = [name for name in estimated if name not in cleaning.time_offsets_s]
     if missing:
-        raise LogError(f"{clean_path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
+        raise LogError(f"{path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
     rounds = SolvingRounds(rig, motion, estimated, progress or silent)
     given = with_comparable_noise(rounds, rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s))
     stated = [name for name in rig.sensors if name in used_sensors and name not in estimated]

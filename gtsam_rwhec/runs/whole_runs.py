@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
 from gtsam_rwhec.export.files import FILES, FOLDERS
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.results.result_file import write_calibration
+from gtsam_rwhec.results.result_file import result_json
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.changed_rig import changes
-from gtsam_rwhec.runs.cleaning_stage import clean_log
-from gtsam_rwhec.runs.detection_stage import check_image_options, detect_log
+from gtsam_rwhec.runs.cleaning_stage import cleaned
+from gtsam_rwhec.runs.detection_stage import check_image_options, detected
 from gtsam_rwhec.runs.image_detections import image_count
-from gtsam_rwhec.runs.kept_detections import KeptDetections, inputs_of
-from gtsam_rwhec.runs.log_report import write_report
+from gtsam_rwhec.runs.image_pictures import has_images
+from gtsam_rwhec.runs.kept_detections import inputs_of
+from gtsam_rwhec.runs.log_evidence import write_report
 from gtsam_rwhec.runs.output_folder import (
     LEFT,
     OutputFolder,
@@ -44,7 +44,6 @@ from gtsam_rwhec.runs.recorded_logs import (
 from gtsam_rwhec.runs.run_log import (
     CLEAN_LOG,
     CLEANING_METADATA,
-    DETECTED_LOG,
     RECORDED_LOG,
     RESULT_FILE,
     SEEN_SHEET,
@@ -56,7 +55,7 @@ from gtsam_rwhec.runs.seen_in_log import Pictures
 from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files
 from gtsam_rwhec.runs.solution_frames import frames_of
 from gtsam_rwhec.runs.solved_log import read_solved, write_solved
-from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
+from gtsam_rwhec.runs.solving_stage import Calibrated, Solved, solve_log
 
 #: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
 OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
@@ -148,109 +147,80 @@ def calibrate_log(
                 raise LogError(
                     f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one"
                 )
-            check_is_not_read(log, Path(out) / DETECTED_LOG)
             check_is_not_read(log, Path(out) / CLEAN_LOG)
             sources = tuple(file.name for file in files)
         else:
             _check_is_alone(log)
             sources = read_metadata(log).detection.sources
         check_image_options(log, rig if is_raw else None, images=images, workers=workers)
-        is_cleaned = CLEANING_METADATA in log.metadata() and (
-            rig is None or not changes(read_embedded_rig(log), rig).cleaning
-        )
-    with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
-        if is_raw:
-            assert rig is not None
-            return _from_raw(files, rig, output, choices, progress=progress)
-        output.begin()
-        pictures = Pictures(tuple(files), files[0].parent / SEEN_SHEET, choices.report_images)
-        return _from_stage(
-            files[0], rig, output.path, files, pictures, choices, is_cleaned=is_cleaned, progress=progress
-        )
-
-
-def _from_raw(
-    files: list[Path],
-    rig: Rig,
-    output: OutputFolder,
-    choices: _Choices,
-    folder: Path | None = None,
-    *,
-    progress: Progress | None,
-) -> Calibrated:
-    """All stages; `folder` is the one whose images the log has, if it is of a folder."""
-
-    def keep(log: Log, cameras: Mapping[str, Camera]) -> KeptDetections:
-        return output.kept_detections(inputs_of(log, rig, cameras, folder), image_count(log, rig))
-
-    detected = output.path / DETECTED_LOG
-    sheet = output.path / SEEN_SHEET
-    before = _version(sheet)
-    detect_log(
-        list(files),
-        rig,
-        detected,
-        images=choices.images,
-        workers=choices.workers,
-        sheet=sheet,
-        progress=progress,
-        keep=keep,
-    )
-    sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
-    # A driver's log has no sheet, and that of an earlier calibration is not its own.
-    pictures = Pictures(tuple(files), sheet if _version(sheet) != before else None, choices.report_images)
-    return _from_stage(detected, rig, output.path, sources, pictures, choices, is_cleaned=False, progress=progress)
-
-
-def _version(path: Path) -> tuple[int, int] | None:
-    """What tells a file that was written anew from the one before; None where there is none."""
-    stat = path.stat() if path.is_file() else None
-    return None if stat is None else (stat.st_ino, stat.st_mtime_ns)
-
-
-def _from_stage(
-    source: Path,
-    rig: Rig | None,
-    out: Path,
-    sources: list[Path],
-    pictures: Pictures,
-    choices: _Choices,
-    *,
-    is_cleaned: bool,
-    progress: Progress | None,
-) -> Calibrated:
-    """The stages after the one that wrote the log; the measurements come from the files `sources`."""
-    if not is_cleaned:
-        clean_log(source, out / CLEAN_LOG, rig, images=choices.images, progress=progress)
-        source = out / CLEAN_LOG
-    calibrated = solve_into(source, rig, out, images=choices.images, progress=progress)
-    export_solved(out / CLEAN_LOG, out, anyway=choices.anyway, progress=progress)
-    report = write_report(calibrated, out, sources, pictures, progress)
-    list_written(out, calibrated.log.detection.sources, report)
-    return calibrated
+        with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
+            return _stages(log, rig, output, choices, progress=progress)
 
 
 def _calibrate_files(
     source: Path, rig: Rig, out: str | Path, choices: _Choices, *, replace: bool, progress: Progress | None
 ) -> Calibrated:
     """As `calibrate_log`, by way of a log of a folder's images or of samples, which is removed at the end."""
-    has_images = source.is_dir()
-    if has_images:
-        rig = rig.model_copy(update={"folder": source})
+    folder = source if source.is_dir() else None
+    if folder is not None:
+        rig = rig.model_copy(update={"folder": folder})
     check_intrinsics_files(rig)  # before anything is copied
     name = f"{source.resolve().name}{RECORDED_LOG}"
     with output_folder(out, name, replace=replace) as output:
         recorded = output.path / name
         output.begin()
         try:
-            if has_images:
-                write_folder_log(source, rig, recorded, progress=progress)
+            if folder is not None:
+                write_folder_log(folder, rig, recorded, progress=progress)
             else:
                 (progress or silent)(write_samples_log(source, rig, recorded))
-            folder = source if has_images else None
-            return _from_raw([recorded], rig, output, choices, folder, progress=progress)
+            with open_log(recorded) as log:
+                return _stages(log, rig, output, choices, folder, progress=progress)
         finally:
             recorded.unlink(missing_ok=True)
+
+
+def _stages(
+    log: Log,
+    rig: Rig | None,
+    output: OutputFolder,
+    choices: _Choices,
+    folder: Path | None = None,
+    *,
+    progress: Progress | None,
+) -> Calibrated:
+    """The stages that a log still needs, and what is written; `folder` is the one whose images the log has."""
+    out, sources = output.path, [file.path for file in log.files]
+    if is_from_stage(log):
+        output.begin()
+        found, sheet = log, sources[0].parent / SEEN_SHEET
+    else:
+        assert rig is not None
+        sheet = out / SEEN_SHEET
+        found = detected(
+            log,
+            rig,
+            workers=choices.workers,
+            sheet=sheet,
+            progress=progress,
+            keep=lambda cameras: output.kept_detections(inputs_of(log, rig, cameras, folder), image_count(log, rig)),
+        )
+        if folder is not None:
+            sources = sorted(path for path in folder.rglob("*") if path.is_file())
+    if not _is_cleaned(found, rig):
+        found = cleaned(found, rig, progress)
+    calibrated = solve_log(found, rig, progress=progress)
+    result = _write_solution(found, calibrated, out, choices.images)
+    _export(calibrated, out, anyway=choices.anyway, progress=progress)
+    # A driver's log has no sheet, and that of an earlier calibration is not its own.
+    pictures = Pictures(log, sheet if has_images(calibrated.rig) else None, choices.report_images)
+    write_report(calibrated, found, out, sources, pictures, result, progress)
+    return calibrated
+
+
+def _is_cleaned(log: Log, rig: Rig | None) -> bool:
+    """Whether a log was cleaned as the rig file says."""
+    return CLEANING_METADATA in log.metadata() and (rig is None or not changes(read_embedded_rig(log), rig).cleaning)
 
 
 def _check_is_alone(log: Log) -> None:
@@ -278,11 +248,19 @@ def solve_into(
         As `solve_log` does.
     """
     out = made_output_folder(out)
-    calibrated = solve_log(clean_path, rig, progress=progress)
-    write_calibration(calibrated.calibration, out / RESULT_FILE, calibrated.log)
-    write_solved(clean_path, calibrated, out / CLEAN_LOG, images=images)
+    with open_log(clean_path) as log:
+        calibrated = solve_log(log, rig, progress=progress)
+        _write_solution(log, calibrated, out, images)
     list_written(out, calibrated.log.detection.sources, [out / RESULT_FILE, out / CLEAN_LOG])
     return calibrated
+
+
+def _write_solution(log: Log, calibrated: Calibrated, out: Path, images: Images) -> bytes:
+    """Write the result, and the log with all that was found; return the result's content."""
+    content = result_json(calibrated.calibration, calibrated.log, out / RESULT_FILE)
+    write_atomically(out / RESULT_FILE, content)
+    write_solved(log, calibrated, out / CLEAN_LOG, result=content, images=images)
+    return content
 
 
 @one_blas_thread()
@@ -311,9 +289,15 @@ def export_solved(
         A file cannot be written.
     """
     out = made_folder(out)
-    tell = progress or silent
-    tell("exporting")
     solved = read_solved(solved_path)
+    written = _export(solved, out, anyway=anyway, progress=progress)
+    list_written(out, solved.log.detection.sources, written)
+    return written
+
+
+def _export(solved: Solved, out: Path, *, anyway: bool, progress: Progress | None) -> list[Path]:
+    """The files for other programs."""
+    (progress or silent)("exporting")
     written = []
     if solved.judgement.verdict is Verdict.DO_NOT_USE and not anyway:
         for name in FILES:
@@ -321,5 +305,4 @@ def export_solved(
     else:
         written = export_all(frames_of(solved), out)
     remove_unchanged(out, FOLDERS, keep=written)
-    list_written(out, solved.log.detection.sources, written)
     return written

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import synthetic_logs as made
 
-from gtsam_rwhec.logs import LogWriter
+from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.results.image_errors import CornerErrors, RatedView, SeenView
 from gtsam_rwhec.runs.seen_in_log import (
     CLEANING,
@@ -42,7 +42,8 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibrat
 
 def test_counts_are_those_of_the_result(calibrated: tuple[Path, Calibrated]) -> None:
     folder, answer = calibrated
-    seen = seen_in_log(answer, folder / "detected.mcap", Pictures((folder / "raw.mcap",), folder / "seen.png"))
+    with open_log(folder / "detected.mcap") as log, open_log(folder / "raw.mcap") as raw:
+        seen = seen_in_log(answer, log, Pictures(raw, folder / "seen.png"))
     assert seen.used == sum(count.used for count in answer.log.outliers)
     by_reason = {(one.target, one.sensor, one.reason): one.count for one in seen.removed_counts}
     for track in answer.log.cleaning.tracks:
@@ -79,16 +80,15 @@ def test_images_come_from_the_log_and_only_if_they_may(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "raw.mcap") as out:  # at its stamp, and later than its stamp
         for stamp in (STAMP_NS - 1, STAMP_NS):
             out.compressed_image("/cam_0/image", stamp, "cam_0", "png", b"an image")
-    pictures = Pictures((tmp_path / "raw.mcap",), tmp_path / "seen.png")
-    found, _, why_not = images_of(pictures, rig, wanted)
-    assert list(found) == [("cam_0", STAMP_NS)]
-    assert why_not == ""
-    hidden = Pictures(pictures.logs, pictures.sheet, may_show=False)
-    assert images_of(hidden, rig, wanted) == ({}, {}, "the report was made without images.")
-    assert images_of(pictures, rig, [rated("cam_1", STAMP_NS)])[2].startswith("no sensor has images")
-    assert "no images (any more)" in images_of(pictures, rig, [rated("cam_0", 7)])[2]
-    (tmp_path / "raw.mcap").write_bytes(b"no log")
-    assert "cannot be read" in images_of(pictures, rig, wanted)[2]
+    with open_log(tmp_path / "raw.mcap") as log:
+        pictures = Pictures(log, tmp_path / "seen.png")
+        found, _, why_not = images_of(pictures, rig, wanted)
+        assert list(found) == [("cam_0", STAMP_NS)]
+        assert why_not == ""
+        hidden = Pictures(log, pictures.sheet, may_show=False)
+        assert images_of(hidden, rig, wanted) == ({}, {}, "the report was made without images.")
+        assert images_of(pictures, rig, [rated("cam_1", STAMP_NS)])[2].startswith("no sensor has images")
+        assert "no images (any more)" in images_of(pictures, rig, [rated("cam_0", 7)])[2]
 
 
 def test_the_sheet_of_a_page_is_small(tmp_path: Path) -> None:

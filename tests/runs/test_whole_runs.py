@@ -1,4 +1,4 @@
-"""Options that count only for images are refused where there are none: in a stage's log, and in a driver's."""
+"""All stages of a run: how often logs are read and written, and options that count only for images."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_logs as made
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogError, OptionError
-from gtsam_rwhec.logs import ImageRecord, LogWriter, open_log
-from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log
+from gtsam_rwhec.logs import ImageRecord, Log, LogWriter, open_log
+from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, solve_into
 
 
 @pytest.fixture(scope="module", params=["detected.mcap", "clean.mcap"])
@@ -75,3 +76,36 @@ def test_several_files_of_which_a_stage_wrote_one_are_refused(stage_log: Path, t
     raw = made.write(tmp_path / "raw.mcap", [made.transform(made.BEGIN_NS, "base", "hand", np.eye(4))])
     with pytest.raises(LogError, match="give that file alone"):
         calibrate_log([stage_log, raw], None, tmp_path / "out")
+
+
+def test_a_run_opens_its_log_once_and_writes_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All stages at once, and each alone, find the same."""
+    opened: list[Path] = []
+    written: list[Path] = []
+    of_reader, of_writer = Log.__init__, LogWriter.__init__
+
+    def reading(self: Log, files: list[Any]) -> None:
+        opened.extend(Path(file.path) for file in files)
+        of_reader(self, files)
+
+    def writing(self: LogWriter, path: Path) -> None:
+        written.append(Path(path))
+        of_writer(self, path)
+
+    raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
+    with monkeypatch.context() as counting:
+        counting.setattr(Log, "__init__", reading)
+        counting.setattr(LogWriter, "__init__", writing)
+        calibrate_log(raw, made.rig(), tmp_path / "out")
+    assert (opened, written) == ([raw], [tmp_path / "out" / "clean.mcap"])
+
+    detect_log(raw, made.rig(), tmp_path / "one.mcap")
+    clean_log(tmp_path / "one.mcap", tmp_path / "one.mcap")
+    solve_into(tmp_path / "one.mcap", None, tmp_path / "stages")
+    assert messages_of(tmp_path / "stages" / "clean.mcap") == messages_of(tmp_path / "out" / "clean.mcap")
+
+
+def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
+    """All messages of a log, by topic and time."""
+    with path.open("rb") as stream:
+        return sorted((c.topic, m.log_time, bytes(m.data)) for _, c, m in make_reader(stream).iter_messages())
