@@ -1,15 +1,12 @@
 """Fixtures that several tests share."""
 
 from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path
-
 import cv2
 import pytest
 from places import REPOSITORY
-
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/detect/test_other_opencv.py brings OpenCV 4.
@@ -17,7 +14,7 @@ BESIDE_OPENCV_4 = ["methods/test_beside_opencv4.py", "methods/test_opencv4.py"]
 collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OPENCV_4
 
 #: Packages whose functions users reach only through calls that hold the limit of one BLAS thread.
-BELOW_THE_LIMIT = ("noise_model", "solver")
+BELOW_THE_LIMIT = ("fitting", "solver")
 
 
 @pytest.fixture(scope="module", autouse=True)

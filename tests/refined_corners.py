@@ -14,7 +14,7 @@ from gtsam_rwhec.fitting.held_out import held_out_errors
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.reprojection_record import TriedModel
 
-sys.path.insert(0, str(REPOSITORY / "tests" / "reprojection"))
+sys.path.insert(0, str(REPOSITORY / "tests" / "fitting"))
 from simulated_cells import Cell, cell
 
 TRIED = (

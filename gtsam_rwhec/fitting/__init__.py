@@ -1,5 +1,5 @@
 """GTSAM after the certified solution: refinement from poses and from corners, noise, outliers, covariances."""
 
-import lazy_loader
+from gtsam_rwhec.files.optional_packages import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

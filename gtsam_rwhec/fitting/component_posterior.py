@@ -29,20 +29,12 @@ FLATTEST = 0.1
 
 @dataclass(frozen=True)
 class Fitted:
-    """Components at their most probable values.
-
-    Attributes
-    ----------
-    sizes : Sizes
-    logs : (k,) array
-        Logarithms of the standard deviations.
-    objective : float
-        -2 log of the posterior density there.
-    estimate : Estimate
-    """
+    """Components at their most probable values."""
 
     sizes: Sizes
+    #: (k,): Logarithms of the standard deviations.
     logs: Array
+    #: -2 log of the posterior density there.
     objective: float
     estimate: Estimate
 
@@ -167,22 +159,16 @@ ROOT_STEPS = 60
 
 @dataclass(frozen=True)
 class Mixture:
-    """The unknowns under all probable components.
+    """The unknowns under all probable components."""
 
-    Attributes
-    ----------
-    step : (p,) array
-    covariance : (p, p) array
-    logs, weights : (n, k) and (n,) arrays
-        The samples of the components' logarithms, and their weights.
-    estimates : tuple of Estimate
-        For each sample.
-    """
-
+    #: (p,)
     step: Array
+    #: (p, p)
     covariance: Array
+    #: (n, k) and (n,): The samples of the components' logarithms, and their weights.
     logs: Array
     weights: Array
+    #: For each sample.
     estimates: tuple[Estimate, ...]
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Array:

@@ -35,46 +35,30 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What is observed and what is known of it.
-
-    Attributes
-    ----------
-    stacks : tuple of Stack
-    A : (I, 4, 4) array
-        The carriers' poses as measured.
-    A_noise : (6,) array or None
-        Standard deviations of A's perturbation [omega, v], rad and m; None: A is exact.
-    about : "targetcarrier" or "sensorcarrier"
-        The carrier whose axes and origin A's perturbation has: A Expmap(xi), or Expmap(xi) A.
-    camera_of : dict of str to str
-        The camera of each sensor: several sensors may share one.
-    camera_priors : dict of str to (mean (m,), deviation (m,))
-        By camera. A deviation may be infinite.
-    shape_priors : dict of str to (3,) array
-        Deviations of a board's shape by target; zero: that number is not free.
-    corner_px : float
-        Standard deviation of a corner along each axis.
-    weights : tuple of (V, n) arrays
-        Of each corner's squared residual, by stack.
-    offset_priors : dict of str to float
-        Deviations, s, of the clocks' offsets that are free, by sensor; their means are zero.
-    corner_priors : dict of str to float
-        Deviations, metres, of corners from their places along each axis, by target whose corners are free.
-    stated_px : float
-        Standard deviation of a corner as it was stated: it counts where corners are too few to tell theirs.
-    """
+    """What is observed and what is known of it."""
 
     stacks: tuple[Stack, ...]
+    #: (I, 4, 4): The carriers' poses as measured.
     A: Array
+    #: (6,): Standard deviations of A's perturbation [omega, v], rad and m; None: A is exact.
     A_noise: Array | None
+    #: The carrier whose axes and origin A's perturbation has: A Expmap(xi), or Expmap(xi) A.
     about: About
+    #: The camera of each sensor: several sensors may share one.
     camera_of: dict[str, str]
+    #: Mean (m,) and deviation (m,) by camera. A deviation may be infinite.
     camera_priors: dict[str, tuple[Array, Array]]
+    #: (3,) each. Deviations of a board's shape by target; zero: that number is not free.
     shape_priors: dict[str, Array]
+    #: Standard deviation of a corner along each axis.
     corner_px: float
+    #: Of each corner's squared residual, by stack.
     weights: tuple[Array, ...]
+    #: Deviations, s, of the clocks' offsets that are free, by sensor; their means are zero.
     offset_priors: dict[str, float] = field(default_factory=dict)
+    #: Deviations, metres, of corners from their places along each axis, by target whose corners are free.
     corner_priors: dict[str, float] = field(default_factory=dict)
+    #: Standard deviation of a corner as it was stated: it counts where corners are too few to tell theirs.
     stated_px: float = 0.1
 
     @property
@@ -160,22 +144,15 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class FewRows:
-    """The rows of a stack's images that have A, and one triangle of the rest for all of them.
+    """The rows of a stack's images that have A, and one triangle of the rest for all of them."""
 
-    Attributes
-    ----------
-    of_images : (V, 6, columns) array
-        Of each image, by all unknowns but A; the last column is the residual. V = 0 where A is exact.
-    by_A : (V, 6, 6) array
-    together : (columns, columns) array
-        Of all images.
-    columns : dict of str to slice
-        Of each variable but A.
-    """
-
+    #: (V, 6, columns): Of each image, by all unknowns but A; the last column is the residual. V = 0 where A is exact.
     of_images: Array
+    #: (V, 6, 6)
     by_A: Array
+    #: (columns, columns): Of all images.
     together: Array
+    #: Of each variable but A.
     columns: dict[str, slice]
 
 

@@ -65,29 +65,21 @@ class _WithoutCarriers:
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """Sums of the rows.
+    """Sums of the rows."""
 
-    Attributes
-    ----------
-    slots : dict of (letter, name) to slice
-        "x", "y", "k", "b", "t", "p" with the frame's name: its rows in theta.
-    G, g : (d, d) and (d,) arrays
-    C, M, b : (I, 6, d), (I, 6, 6) and (I, 6) arrays
-    rr : float
-    count : float
-        Number of residuals, weights counted.
-    prior : (d,) array
-        Precisions of the priors on theta, and `prior_off` (d,) how far the point is from their means.
-    """
-
+    #: "x", "y", "k", "b", "t", "p" with the frame's name: its rows in theta.
     slots: Mapping[tuple[str, str], slice]
+    #: (d, d) and (d,)
     G: Array
     g: Array
+    #: (I, 6, d)
     C: Array
     M: Array
     b: Array
     rr: float
+    #: Number of residuals, weights counted.
     count: float
+    #: (d,): Precisions of the priors on theta, and `prior_off` (d,) how far the point is from their means.
     prior: Array
     prior_off: Array
 

@@ -8,15 +8,14 @@ the carriers' velocity at the instant.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
-
+from dataclasses import dataclass
+from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
-
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives, pixels_of
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_of
 from gtsam_rwhec.geometry.poses import Array
 
 #: The shape of a board: s (a share), w_x and w_y (metres).
@@ -27,31 +26,20 @@ NEAREST_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """All images of one target by one sensor.
-
-    Attributes
-    ----------
-    target, sensor : str
-    instant : (V,) integers
-        Which pose of the carriers each image has.
-    points : (n, 3) array
-        Corners in the target's frame, metres.
-    pixels : (V, n, 2) array
-        Zero where a corner was not seen.
-    known : (V, n) booleans
-    camera : Camera
-        Its model; its parameters are a variable.
-    twist : (V, 6) array, optional
-        The carriers' velocity at each image, [omega rad/s, v m/s].
-    """
+    """All images of one target by one sensor."""
 
     target: str
     sensor: str
+    #: Which pose of the carriers each image has.
     instant: np.ndarray
+    #: (n, 3): Corners in the target's frame, metres.
     points: Array
+    #: (V, n, 2): Zero where a corner was not seen.
     pixels: Array
     known: np.ndarray
+    #: Its model; its parameters are a variable.
     camera: Camera
+    #: (V, 6): The carriers' velocity at each image, [omega rad/s, v m/s].
     twist: Array | None = None
 
     def selected(self, which: np.ndarray) -> Stack:
@@ -69,26 +57,21 @@ class Linear:
     Poses move as T Expmap([omega, v]), A at its instant. All of them move the target's pose in the sensor's frame, B =
     Y^-1 A Expmap(t w) X, so the derivatives by B turn into theirs by adjoints, when they are asked for. A residual is
     infinite where a corner is behind its camera.
-
-    Attributes
-    ----------
-    residual : (V, 2n) array
-    by_B : (V, 2n, 6) array
-    by_camera : (V, 2n, m) array
-    B : (V, 4, 4) array
-    X : (4, 4) array
-    shapes : (n, 3, k) array
-        Derivatives of the corners' places by the numbers of the shape.
-    twist : (V, 6) array, optional
-    offset_s : float
     """
 
+    #: (V, 2n)
     residual: Array
+    #: (V, 2n, 6)
     by_B: Array
+    #: (V, 2n, m)
     by_camera: Array
+    #: (V, 4, 4)
     B: Array
+    #: (4, 4)
     X: Array
+    #: (n, 3, k): Derivatives of the corners' places by the numbers of the shape.
     shapes: Array
+    #: (V, 6)
     twist: Array | None
     offset_s: float
 
@@ -174,26 +157,19 @@ def shaped(points: Array, shape: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A stack's corners on their way to the camera.
+    """A stack's corners on their way to the camera."""
 
-    Attributes
-    ----------
-    p : (n, 3) array
-        In the target's frame, shaped; `by_shape` (n, 3, 3) are its derivatives.
-    B : (V, 4, 4) array
-        Poses T_sensor_target.
-    P, z, x : (V, n, 3), (V, n) and (V, n, 2) arrays
-        In the sensor's frame, their depths, and normalised coordinates; 1 and 0 for corners that were not seen.
-    behind : (V, n) booleans
-        Seen, and behind the camera.
-    """
-
+    #: (n, 3): In the target's frame, shaped; `by_shape` (n, 3, 3) are its derivatives.
     p: Array
     by_shape: Array
+    #: (V, 4, 4): Poses T_sensor_target.
     B: Array
+    #: (V, n, 3): In the sensor's frame, their depths, and normalised coordinates; 1 and 0 for corners that were not
+    #: seen.
     P: Array
     z: Array
     x: Array
+    #: Seen, and behind the camera.
     behind: np.ndarray
 
     def errors(self, stack: Stack, pixels: Array) -> Array:

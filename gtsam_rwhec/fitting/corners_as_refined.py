@@ -54,7 +54,6 @@ def as_refined(
     ----------
     base : Refined
         The refinement from the same images' poses.
-    corners : CornersRefined
     reprojection, intrinsics
         The same in numbers.
     more : (d, d) array, optional
@@ -236,7 +235,6 @@ def numbers_of(
     ----------
     observations, options
         What was refined from, and how.
-    corners : CornersRefined
     held_out : dict of str to HeldOut, optional
         Errors in images that were left out, by sensor.
     tried : tuple of TriedModel

@@ -1,49 +1,40 @@
 """."""
 
 from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-
+from dataclasses import dataclass
+from dataclasses import field
 import gtsam
 import numpy as np
-from scipy.special import chdtri, fdtri
-
+from scipy.special import chdtri
+from scipy.special import fdtri
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.files.terminal_text import brief, rounded
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corner_model import Point
 from gtsam_rwhec.fitting.corner_noise import Noise
-from gtsam_rwhec.fitting.stated_intrinsics import Innovation, held_by_prior
+from gtsam_rwhec.fitting.stated_intrinsics import Innovation
+from gtsam_rwhec.fitting.stated_intrinsics import held_by_prior
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 
-
 @dataclass(frozen=True, eq=False)
 class RefinedIntrinsics:
-    """A camera's intrinsics.
-
-    Attributes
-    ----------
-    camera : Camera
-    covariance : (m, m) array
-        Of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
-    stated_deviations : (m,) array
-        Of the prior, as widened.
-    widened : float
-        By how much: 1 where the images do not contradict what was stated.
-    innovation : Innovation
-        The test of the intrinsics as they were stated.
-    rms_px : float
-        Of the corners that count, along each axis.
-    """
+    """A camera's intrinsics."""
 
     camera: Camera
+    #: (m, m): Of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
     covariance: Array
+    #: (m,): Of the prior, as widened.
     stated_deviations: Array
+    #: By how much: 1 where the images do not contradict what was stated.
     widened: float
+    #: The test of the intrinsics as they were stated.
     innovation: Innovation
+    #: Of the corners that count, along each axis.
     rms_px: float
 
     @property
@@ -65,54 +56,37 @@ class RefinedIntrinsics:
 
 @dataclass(frozen=True, eq=False)
 class CornersRefined:
-    """Poses, cameras and boards refined from corners, with their joint covariance.
+    """Poses, cameras and boards refined from corners, with their joint covariance."""
 
-    Attributes
-    ----------
-    X, Y : dict of str to gtsam.Pose3
-        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
-    intrinsics : dict of str to RefinedIntrinsics
-        By sensor.
-    shapes : dict of str to (3,) array
-        By target: its size less the stated one, a share; heights of its edge over its middle along x and y, metres.
-    corners : dict of str to (n, 3) array
-        By target: its corners in its frame, with its size, its bend and what each is off its place, metres.
-    time_offsets_s : dict of str to float
-        By sensor whose clock's offset was free: its images were taken that long after the times of their A.
-    noise : Noise
-    joint : (d, d) array
-        Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
-    freedom : dict of (letter, name) to float
-        Degrees of freedom of each unknown's covariance, whose noise was estimated.
-    left_out : dict of (target, sensor) to (V, n) booleans
-        Corners that disagree with all others.
-    graph : CornerGraph
-        The GTSAM graph at the optimum's noise, with its model and its variables' keys.
-    point : Point
-        The values of all variables, with the carriers' poses at the instants.
-    iterations : int
-        Levenberg-Marquardt steps, in all rounds together.
-    last_step : float
-        What one more Gauss-Newton step would move, in deviations: it is far below 1 at an optimum.
-    findings : tuple of str
-        What is doubtful, in words with the figures, the gravest first; empty where nothing is.
-    """
-
+    #: T_targetcarrier_target and T_sensorcarrier_sensor, metres.
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
+    #: By sensor.
     intrinsics: dict[str, RefinedIntrinsics]
+    #: (3,) each. By target: its size less the stated one, a share; heights of its edge over its middle along x and y,
+    #: metres.
     shapes: dict[str, Array]
+    #: (n, 3) each. By target: its corners in its frame, with its size, its bend and what each is off its place, metres.
     corners: dict[str, Array]
+    #: By sensor whose clock's offset was free: its images were taken that long after the times of their A.
     time_offsets_s: dict[str, float]
     noise: Noise
+    #: (d, d): Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
     joint: Array = field(repr=False)
     slots: Mapping[tuple[str, str], slice] = field(repr=False)
+    #: Degrees of freedom of each unknown's covariance, whose noise was estimated.
     freedom: Mapping[tuple[str, str], float] = field(repr=False)
+    #: (V, n) each. Corners that disagree with all others.
     left_out: dict[tuple[str, str], np.ndarray] = field(repr=False)
+    #: The GTSAM graph at the optimum's noise, with its model and its variables' keys.
     graph: CornerGraph = field(repr=False)
+    #: The values of all variables, with the carriers' poses at the instants.
     point: Point = field(repr=False)
+    #: Levenberg-Marquardt steps, in all rounds together.
     iterations: int
+    #: What one more Gauss-Newton step would move, in deviations: it is far below 1 at an optimum.
     last_step: float
+    #: What is doubtful, in words with the figures, the gravest first; empty where nothing is.
     findings: tuple[str, ...] = ()
 
     def __str__(self) -> str:

@@ -27,21 +27,13 @@ SMALLEST, SMALLEST_SHARE = 1e-12, 1e-4
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """The walk of all tracks' states from instant to instant.
+    """The walk of all tracks' states from instant to instant."""
 
-    Attributes
-    ----------
-    transport : (T - 1, s, s) array
-        From the state of one instant to that of the next.
-    variance : (T, s) array
-        Of the steps, in those of a typical step.
-    linked : (T - 1,) array
-        Whether an instant continues the one before.
-    walk : Walk
-    """
-
+    #: (T - 1, s, s): From the state of one instant to that of the next.
     transport: Array
+    #: (T, s): Of the steps, in those of a typical step.
     variance: Array
+    #: (T - 1,): Whether an instant continues the one before.
     linked: np.ndarray
     walk: Walk
 
@@ -170,20 +162,13 @@ def own_directions(rows: Rows, prior: DriftPrior) -> Array:
 
 @dataclass(frozen=True)
 class ChainFactor:
-    """The Cholesky factor L of a precision P = L L' of T states of s numbers, each tied to the one before.
+    """The Cholesky factor L of a precision P = L L' of T states of s numbers, each tied to the one before."""
 
-    Attributes
-    ----------
-    inverse : (T, s, s) array
-        Of the blocks L_tt.
-    below : (T - 1, s, s) array
-        The blocks L_t+1,t.
-    log_det : float
-        log|P|.
-    """
-
+    #: (T, s, s): Of the blocks L_tt.
     inverse: Array
+    #: (T - 1, s, s): The blocks L_t+1,t.
     below: Array
+    #: log|P|.
     log_det: float
 
     @staticmethod
@@ -251,31 +236,21 @@ def lower_inverse(L: Array) -> Array:
 
 @dataclass(frozen=True)
 class EliminatedDrift:
-    """What the elimination of the drift leaves.
-
-    Attributes
-    ----------
-    factor : ChainFactor
-        Of the precision of the unit states.
-    half : (T, s, q + m) array
-        L^-1 of their products with the columns of the systematic errors, the unknowns and the residual.
-    unit : (s,) array
-        The states' standard deviations.
-    systematic : (6,) array
-        Standard deviations of the systematic errors.
-    features : (T, k) array
-        f of each instant; the columns of the systematic errors are E f.
-    log_det : float
-        log|precision| - log|prior precision|.
-    """
+    """What the elimination of the drift leaves."""
 
     prior: DriftPrior
     sigma: dict[C, float]
+    #: Of the precision of the unit states.
     factor: ChainFactor
+    #: (T, s, q + m): L^-1 of their products with the columns of the systematic errors, the unknowns and the residual.
     half: Array
+    #: (s,): The states' standard deviations.
     unit: Array
+    #: (6,): Standard deviations of the systematic errors.
     systematic: Array
+    #: (T, k): f of each instant; the columns of the systematic errors are E f.
     features: Array
+    #: log|precision| - log|prior precision|.
     log_det: float
 
     @staticmethod

@@ -1,18 +1,22 @@
 """The options of a refinement, and the noise of carrier poses."""
 
 from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field
 from enum import StrEnum
-from typing import Literal, NamedTuple, get_args
-
+from typing import Literal
+from typing import NamedTuple
+from typing import get_args
 import numpy as np
-
-from gtsam_rwhec.errors import NoiseError, OptionError
+from gtsam_rwhec.errors import NoiseError
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE
+from gtsam_rwhec.geometry.real_numbers import is_one_of
+from gtsam_rwhec.geometry.real_numbers import is_real
+from gtsam_rwhec.geometry.real_numbers import is_whole
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import ByPair
 
@@ -27,22 +31,15 @@ ObservationKind = Literal["poses", "corners"]
 
 @dataclass(frozen=True)
 class CarrierNoise:
-    """Noise of the carrier poses A = T_sensorcarrier_targetcarrier, from kinematics or motion capture.
+    """Noise of the carrier poses A = T_sensorcarrier_targetcarrier, from kinematics or motion capture."""
 
-    Attributes
-    ----------
-    rotation_rad, translation_m : float
-        Standard deviations about each axis, rad, and along each axis, m.
-    covariances : dict of (target, sensor) to (N, 6, 6) array, optional
-        A covariance for each measurement, in place of the standard deviations; rotation first.
-    about : "targetcarrier" or "sensorcarrier"
-        The carrier whose axes and origin the perturbation has: A Expmap(xi) for the target carrier (the error of an
-        arm's hand in its own frame, with A = T_base_hand), Expmap(xi) A for the sensor carrier.
-    """
-
+    #: Standard deviations about each axis, rad, and along each axis, m.
     rotation_rad: float = 0.0
     translation_m: float = 0.0
+    #: (N, 6, 6) each. A covariance for each measurement, in place of the standard deviations; rotation first.
     covariances: ByPair[Array] | None = None
+    #: The carrier whose axes and origin the perturbation has: A Expmap(xi) for the target carrier (the error of an
+    #: arm's hand in its own frame, with A = T_base_hand), Expmap(xi) A for the sensor carrier.
     about: About = "targetcarrier"
 
     def __post_init__(self) -> None:
@@ -68,55 +65,40 @@ class CarrierNoise:
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """The options of ``refine``.
+    """The options of ``refine``."""
 
-    Attributes
-    ----------
-    noise : "auto", "given" or "estimate"
-        The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": these times variance
-        factors, one for rotations and one for translations, estimated from the residuals. "auto": given if there are
-        weights, else estimated.
-    noise_groups : "all", "sensor" or "pair"
-        The groups of residuals that share a variance factor.
-    residual : "geodesic" or "chordal"
-        "geodesic": Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements. "chordal": the certified
-        cost's residual, from moments alone; then GTSAM's optimum is the certified optimum.
-    robust : "none", "huber", "cauchy", "tukey", "geman_mcclure" or "gnc"
-        GTSAM's losses start at the certified solution, by way of "huber", and have 95 % efficiency for Gaussian noise.
-        Many gross outliers pull this start away. "gnc" is graduated truncated least squares around the certified
-        solver. It needs no good start, and leaves outliers out.
-    inlier_confidence : float
-        With "gnc": probability that a good measurement is kept, at least: all good ones together are kept with 95 %.
-    carrier_noise : CarrierNoise, optional
-        The noise of A. Without it A counts as exact; if A is not exact, covariances are then too small.
-    carrier_model : "auto", "propagated" or "variables"
-        "propagated": A's noise is propagated into each residual to first order. "variables": each A is a variable,
-        shared by the measurements of one stamp. "auto": variables if measurements share a stamp; else propagated, which
-        is then the same.
-    time_offsets : bool or tuple of str
-        Estimate the clock offset of each sensor, or of the named sensors: a sensor's stamp t is the carriers' t +
-        offset (Kalibr's convention). The measurements need stamps.
-    carrier_path : Trajectory, optional
-        T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Time offsets move A
-        along this path. Without it the measurements' own A give the carriers' motion.
-    max_iterations : int
-        Largest number of Levenberg-Marquardt steps.
-    observations : "poses" or "corners"
-        What is refined from: the measured poses B, or, from there on, the corners of the images that the problem holds
-        (``problem.add_corners``). The other options are then those of the poses, of which outliers among images are
-        left out too (``robust="gnc"``); ``rw.CornerOptions`` has those of the corners.
-    """
-
+    #: The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": these times variance factors,
+    #: one for rotations and one for translations, estimated from the residuals. "auto": given if there are weights,
+    #: else estimated.
     noise: NoiseSource = "auto"
+    #: The groups of residuals that share a variance factor.
     noise_groups: NoiseGroups = "all"
+    #: "geodesic": Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements. "chordal": the certified
+    #: cost's residual, from moments alone; then GTSAM's optimum is the certified optimum.
     residual: ResidualKind = "geodesic"
+    #: GTSAM's losses start at the certified solution, by way of "huber", and have 95 % efficiency for Gaussian noise.
+    #: Many gross outliers pull this start away. "gnc" is graduated truncated least squares around the certified solver.
+    #: It needs no good start, and leaves outliers out.
     robust: Robust = "none"
+    #: With "gnc": probability that a good measurement is kept, at least: all good ones together are kept with 95 %.
     inlier_confidence: float = 0.997
+    #: The noise of A. Without it A counts as exact; if A is not exact, covariances are then too small.
     carrier_noise: CarrierNoise | None = None
+    #: "propagated": A's noise is propagated into each residual to first order. "variables": each A is a variable,
+    #: shared by the measurements of one stamp. "auto": variables if measurements share a stamp; else propagated, which
+    #: is then the same.
     carrier_model: CarrierModel = "auto"
+    #: Estimate the clock offset of each sensor, or of the named sensors: a sensor's stamp t is the carriers' t + offset
+    #: (Kalibr's convention). The measurements need stamps.
     time_offsets: bool | tuple[str, ...] = False
+    #: T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Time offsets move A along
+    #: this path. Without it the measurements' own A give the carriers' motion.
     carrier_path: Trajectory | None = None
+    #: Largest number of Levenberg-Marquardt steps.
     max_iterations: int = 100
+    #: What is refined from: the measured poses B, or, from there on, the corners of the images that the problem holds
+    #: (``problem.add_corners``). The other options are then those of the poses, of which outliers among images are left
+    #: out too (``robust="gnc"``); ``rw.CornerOptions`` has those of the corners.
     observations: ObservationKind = "poses"
 
     def __post_init__(self) -> None:
@@ -213,26 +195,17 @@ Drift = Literal["auto", "walk", "correlated", "none"]
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """The options of ``modelled``; each one overrules a choice that the data make.
+    """The options of ``modelled``; each one overrules a choice that the data make."""
 
-    Attributes
-    ----------
-    stated : dict of Component to float
-        Standard deviations that are known. Those of B are factors of the covariances that the problem states.
-    carrier : bool
-        Whether A has noise.
-    systematic : bool
-        Whether A has errors that vary smoothly with the configuration.
-    drift : "auto", "walk", "correlated", "none" or Walk
-        "auto": as the residuals' correlation in time shows. A ``Walk``: this kind, which was found before.
-    side : "targetcarrier", "sensorcarrier" or None
-        Which carrier the errors of A are fixed to: an arm's hand. None: as the data show.
-    """
-
+    #: Standard deviations that are known. Those of B are factors of the covariances that the problem states.
     stated: dict[Component, float] = field(default_factory=dict)
+    #: Whether A has noise.
     carrier: bool = True
+    #: Whether A has errors that vary smoothly with the configuration.
     systematic: bool = True
+    #: "auto": as the residuals' correlation in time shows. A ``Walk``: this kind, which was found before.
     drift: Drift | Walk = "auto"
+    #: Which carrier the errors of A are fixed to: an arm's hand. None: as the data show.
     side: About | None = None
 
 
@@ -241,49 +214,35 @@ CarrierPoses = Literal["exact", "estimate"]
 
 @dataclass(frozen=True)
 class CornerOptions:
-    """The options of `refine_corners`.
+    """The options of `refine_corners`."""
 
-    Attributes
-    ----------
-    stated : "exact", "calibration", "nominal" or "unknown", or a dict of them by sensor
-        Where the stated intrinsics come from. A calibration's are right to 0.3 % of f and 3 pixels of c, nominal ones
-        to 3 % and to 30 pixels or 2 % of the width; the images alone say unknown ones, and exact ones are held. Sensors
-        that a dict lacks are nominal. Where the images contradict what is stated, the deviation is widened, and the
-        result says so.
-    shared : tuple of tuple of str
-        Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
-    size_share : float, or dict of str to float
-        Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated, as are those of targets
-        that a dict lacks.
-    warp_m : float
-        Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
-    corners_m : float
-        Standard deviation of each corner's place on its board along each axis, metres, such as a printer's 1e-4; 0:
-        they are where the board has them. With n corners there are 3n more unknowns: time grows with their square.
-    carrier_noise : CarrierNoise, "estimate" or "exact"
-        The noise of the carriers' poses A: given (standard deviations), estimated, or none.
-    about : "targetcarrier" or "sensorcarrier"
-        The carrier whose axes and origin A's noise has, where it is estimated: the one that moves.
-    time_offsets : tuple of str
-        Sensors whose clock's offset is free: images were taken that long after the times of their A, at which the views
-        have the carriers' velocity (`Views.twist`). A prior of 1 s about no offset keeps it finite. Offsets above some
-        milliseconds want A taken at the new time, and another refinement. A rolling shutter, whose rows are seen one
-        after the other, is not modelled: an offset is that of the mean row.
-    outliers : bool
-        Leave corners out that disagree with all others.
-    max_iterations : int
-        Largest number of Levenberg-Marquardt steps of one round.
-    """
-
+    #: Where the stated intrinsics come from. A calibration's are right to 0.3 % of f and 3 pixels of c, nominal ones to
+    #: 3 % and to 30 pixels or 2 % of the width; the images alone say unknown ones, and exact ones are held. Sensors
+    #: that a dict lacks are nominal. Where the images contradict what is stated, the deviation is widened, and the
+    #: result says so.
     stated: Stated | Mapping[str, Stated] = "nominal"
+    #: Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
     shared: tuple[tuple[str, ...], ...] = field(default=())
+    #: Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated, as are those of targets
+    #: that a dict lacks.
     size_share: float | Mapping[str, float] = 0.0
+    #: Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
     warp_m: float = 0.0
+    #: Standard deviation of each corner's place on its board along each axis, metres, such as a printer's 1e-4; 0: they
+    #: are where the board has them. With n corners there are 3n more unknowns: time grows with their square.
     corners_m: float = 0.0
+    #: The noise of the carriers' poses A: given (standard deviations), estimated, or none.
     carrier_noise: CarrierNoise | CarrierPoses = "estimate"
+    #: The carrier whose axes and origin A's noise has, where it is estimated: the one that moves.
     about: About = "targetcarrier"
+    #: Sensors whose clock's offset is free: images were taken that long after the times of their A, at which the views
+    #: have the carriers' velocity (`Views.twist`). A prior of 1 s about no offset keeps it finite. Offsets above some
+    #: milliseconds want A taken at the new time, and another refinement. A rolling shutter, whose rows are seen one
+    #: after the other, is not modelled: an offset is that of the mean row.
     time_offsets: tuple[str, ...] = ()
+    #: Leave corners out that disagree with all others.
     outliers: bool = True
+    #: Largest number of Levenberg-Marquardt steps of one round.
     max_iterations: int = 100
 
     def __post_init__(self) -> None:

@@ -6,23 +6,26 @@ to a tenth of a pixel, whatever is wrong with the arm: its residuals prove nothi
 """
 
 from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
+from dataclasses import dataclass
+from dataclasses import replace
 import gtsam
 import numpy as np
 from rwhec_factors import se3
-
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CountError, OptionError
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
-from gtsam_rwhec.fitting.corner_residuals import Stack, stacks_of
+from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.corner_residuals import stacks_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
-from gtsam_rwhec.fitting.observations import Observations, Views
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.fit_options import CornerOptions
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.observations import Views
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_whole
@@ -33,39 +36,25 @@ REGIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Errors of a sensor's corners in images that were left out.
+    """Errors of a sensor's corners in images that were left out."""
 
-    Attributes
-    ----------
-    rms_px, rms_mm : float
-        Root mean square length of the error, in pixels, and on the target: pixels by depth over focal length.
-    corners : int
-    expected_px : float
-        What the covariances say of `rms_px`: errors that are larger by far show what the model lacks.
-    regions_px : (3, 3) array
-        The same in pixels by region of the image, rows from the top; nan where no corner was seen.
-    """
-
+    #: Root mean square length of the error, in pixels, and on the target: pixels by depth over focal length.
     rms_px: float
     rms_mm: float
     corners: int
+    #: What the covariances say of `rms_px`: errors that are larger by far show what the model lacks.
     expected_px: float
+    #: (3, 3): The same in pixels by region of the image, rows from the top; nan where no corner was seen.
     regions_px: Array
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """What leaving images out in blocks shows.
+    """What leaving images out in blocks shows."""
 
-    Attributes
-    ----------
-    errors : dict of str to HeldOut
-        By sensor.
-    spread : dict of (letter, name) to float
-        By unknown: how much the blocks' estimates differ, over what their covariance says (the jackknife).
-    """
-
+    #: By sensor.
     errors: dict[str, HeldOut]
+    #: By unknown: how much the blocks' estimates differ, over what their covariance says (the jackknife).
     spread: dict[tuple[str, str], float]
 
 
@@ -100,7 +89,6 @@ def left_out(
         Its poses are the start, and its noise of A is given; corners that it left out do not count.
     folds : int
         Blocks of instants that are left out in turns, at least two.
-    progress : callable, optional
 
     Raises
     ------

@@ -21,34 +21,24 @@ from gtsam_rwhec.geometry.poses import Array
 
 @dataclass(frozen=True)
 class Measurements:
-    """What of the rows does not depend on the components.
-
-    Attributes
-    ----------
-    columns : (N, 6, c) array
-        Of each row: J by its unknowns, the residual, the twists of A, the states of its drift.
-    places : (N, c) array
-        Their places among all m + 6 + s columns.
-    m, states : int
-        The number of all unknowns and the residual, and that of the drift's states.
-    pairs : tuple of pairs of Component
-        Whose product of standard deviations is with each term.
-    terms : (k, 6, 6, N) array
-        Of the variance of a measurement; symmetric. Where an instant has one measurement, A's noise is in them.
-    shared : (S,) array
-        The instants that have several measurements.
-    members, shared_of : (M,) arrays
-        The measurements of these instants, and the place of each one's instant in ``shared``.
-    """
+    """What of the rows does not depend on the components."""
 
     instants: Instants
+    #: (N, 6, c): Of each row: J by its unknowns, the residual, the twists of A, the states of its drift.
     columns: Array
+    #: (N, c): Their places among all m + 6 + s columns.
     places: np.ndarray
+    #: The number of all unknowns and the residual, and that of the drift's states.
     m: int
     states: int
+    #: Whose product of standard deviations is with each term.
     pairs: tuple[tuple[C, C], ...]
+    #: (k, 6, 6, N): Of the variance of a measurement; symmetric. Where an instant has one measurement, A's noise is in
+    #: them.
     terms: Array
+    #: (S,): The instants that have several measurements.
     shared: np.ndarray
+    #: (M,): The measurements of these instants, and the place of each one's instant in ``shared``.
     members: np.ndarray
     shared_of: np.ndarray
 
@@ -184,29 +174,20 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Reduced:
-    """Products with V^-1 = D^-1 - D^-1 E K^-1 E' D^-1 of each instant, and what the way back needs.
-
-    Attributes
-    ----------
-    root, Z : (N, 6, 6) and (N, 6, c) arrays
-        L^-1 of the variances L L', and L^-1 of the rows' own columns.
-    carriers : tuple of (S, 6, 6) and (S, 6, m + 6 + s) arrays, or None
-        L_K^-1 S_A^(1/2), and the same by E' D^-1 of all columns, of the shared instants.
-    total : (m, m) array
-        [J | r]' V^-1 [J | r], of all instants.
-    cross : (T, 6 + s, m + 6 + s) array
-        [E | G]' V^-1 [J | r | E | G], of each instant.
-    log_det : float
-        log|V|.
-    """
+    """Products with V^-1 = D^-1 - D^-1 E K^-1 E' D^-1 of each instant, and what the way back needs."""
 
     of: Measurements
     sigma: dict[C, float]
+    #: (N, 6, 6) and (N, 6, c): L^-1 of the variances L L', and L^-1 of the rows' own columns.
     root: Array
     Z: Array
+    #: L_K^-1 S_A^(1/2), and the same by E' D^-1 of all columns, of the shared instants.
     carriers: tuple[Array, Array] | None
+    #: (m, m): [J | r]' V^-1 [J | r], of all instants.
     total: Array
+    #: (T, 6 + s, m + 6 + s): [E | G]' V^-1 [J | r | E | G], of each instant.
     cross: Array
+    #: log|V|.
     log_det: float
 
     @property

@@ -33,23 +33,15 @@ ROUNDING = 1e-13
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """The covariance of all unknowns together: dense, d x d.
+    """The covariance of all unknowns together: dense, d x d."""
 
-    Attributes
-    ----------
-    slots : dict of Unknown to slice
-        The rows of each unknown.
-    finite : (d, d) array
-        Q (Q' Lambda Q)^-1 Q'.
-    free : (d, k) array
-        Directions of infinite variance, orthonormal in units of ``unit``.
-    unit : (d,) array
-        The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
-    """
-
+    #: The rows of each unknown.
     slots: dict[Unknown, slice]
+    #: (d, d): Q (Q' Lambda Q)^-1 Q'.
     finite: Array
+    #: (d, k): Directions of infinite variance, orthonormal in units of ``unit``.
     free: Array
+    #: (d,): The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
     unit: Array
 
     @staticmethod
@@ -187,17 +179,11 @@ WORTH_IT = 0.3
 
 @dataclass(frozen=True)
 class EliminationOrder:
-    """Which parameters are eliminated at once.
+    """Which parameters are eliminated at once."""
 
-    Attributes
-    ----------
-    size : int
-        The number of all parameters.
-    levels : tuple of (n, w) arrays
-        n blocks of w parameters which nothing ties to one another once the levels before are eliminated.
-    """
-
+    #: The number of all parameters.
     size: int
+    #: n blocks of w parameters which nothing ties to one another once the levels before are eliminated.
     levels: tuple[np.ndarray, ...] = ()
 
     @staticmethod

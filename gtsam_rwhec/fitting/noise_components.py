@@ -30,20 +30,13 @@ SYSTEMATIC = (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)
 
 @dataclass(frozen=True)
 class Sizes:
-    """What is known of each component before the data.
+    """What is known of each component before the data."""
 
-    Attributes
-    ----------
-    active : tuple of Component
-        The components in the model.
-    typical : (k,) array
-        Each one's size if it alone made the residuals; it is between ``SMALLEST`` and ``LARGEST`` times that.
-    expected, spread : (k,) arrays
-        Mean and standard deviation of the logarithms.
-    """
-
+    #: The components in the model.
     active: tuple[Component, ...]
+    #: (k,): Each one's size if it alone made the residuals; it is between ``SMALLEST`` and ``LARGEST`` times that.
     typical: Array
+    #: (k,): Mean and standard deviation of the logarithms.
     expected: Array
     spread: Array
 

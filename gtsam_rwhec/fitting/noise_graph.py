@@ -11,27 +11,35 @@ With the effects eliminated the graph's information is that of ``NoiseModel`` at
 """
 
 from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from itertools import pairwise
-
 import gtsam
 import numpy as np
 from rwhec_factors.batch import robot_world_hand_eye_effects_factors
-
 from gtsam_rwhec.errors import NotConvergedWarning
-from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns
+from gtsam_rwhec.fitting.drift import TRACK
+from gtsam_rwhec.fitting.drift import DriftPrior
+from gtsam_rwhec.fitting.drift import drift_columns
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_components import C
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
-from gtsam_rwhec.fitting.noise_search import Settled, Task
-from gtsam_rwhec.fitting.pair_data import PairData, square_root_information
-from gtsam_rwhec.fitting.pose_graph import Optimum, add_fixed, add_priors, optimise
-from gtsam_rwhec.fitting.refined import PairNoise, Refined
-from gtsam_rwhec.fitting.refinement_from_poses import movements, scale_of
-from gtsam_rwhec.fitting.unknowns import State, UnknownKind, Variables
+from gtsam_rwhec.fitting.noise_search import Settled
+from gtsam_rwhec.fitting.noise_search import Task
+from gtsam_rwhec.fitting.pair_data import PairData
+from gtsam_rwhec.fitting.pair_data import square_root_information
+from gtsam_rwhec.fitting.pose_graph import Optimum
+from gtsam_rwhec.fitting.pose_graph import add_fixed
+from gtsam_rwhec.fitting.pose_graph import add_priors
+from gtsam_rwhec.fitting.pose_graph import optimise
+from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement_from_poses import movements
+from gtsam_rwhec.fitting.refinement_from_poses import scale_of
+from gtsam_rwhec.fitting.unknowns import State
+from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.unknowns import Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -63,41 +71,28 @@ def twist_key(instant: int) -> int:
 
 @dataclass(frozen=True)
 class NoiseGraph:
-    """A noise model's graph.
+    """A noise model's graph."""
 
-    Attributes
-    ----------
-    graph, values : gtsam.NonlinearFactorGraph, gtsam.Values
-        All factors, and the estimate with effects of zero.
-    unfixed : gtsam.NonlinearFactorGraph
-        The same factors without the constraints of fixed frames: what ``information_of`` takes.
-    keys : dict of str to int
-        The effects' keys: "drift:INSTANT", "systematic", "carrier:INSTANT"; instants as ``Instants`` counts them.
-    """
-
+    #: All factors, and the estimate with effects of zero.
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
+    #: The same factors without the constraints of fixed frames: what ``information_of`` takes.
     unfixed: gtsam.NonlinearFactorGraph
+    #: The effects' keys: "drift:INSTANT", "systematic", "carrier:INSTANT"; instants as ``Instants`` counts them.
     keys: dict[str, int]
 
 
 @dataclass(frozen=True)
 class _Effects:
-    """The effects' columns (N, 6, m) in the order of the rows, and the weights of what is left.
+    """The effects' columns (N, 6, m) in the order of the rows, and the weights of what is left."""
 
-    Attributes
-    ----------
-    root : (N, 6, 6) array
-        Square roots of the information of B's noise, and of A's where an instant has one measurement.
-    drift, twist, systematic : (N, 6, m) arrays, or None
-    shared : (T,) array
-        Whether an instant has a twist of its own.
-    """
-
+    #: (N, 6, 6): Square roots of the information of B's noise, and of A's where an instant has one measurement.
     root: Array
+    #: (N, 6, m)
     drift: Array | None
     twist: Array | None
     systematic: Array | None
+    #: (T,): Whether an instant has a twist of its own.
     shared: np.ndarray
 
     @staticmethod

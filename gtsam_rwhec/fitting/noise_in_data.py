@@ -1,13 +1,16 @@
 """What the data say of their noise, as a record that says so in words."""
 
 from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, Component, DriftFrame
-from gtsam_rwhec.fitting.noise_components import CARRIER, DRIFT, SYSTEMATIC
+from gtsam_rwhec.fitting.fit_options import About
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
+from gtsam_rwhec.fitting.fit_options import Component
+from gtsam_rwhec.fitting.fit_options import DriftFrame
+from gtsam_rwhec.fitting.noise_components import CARRIER
+from gtsam_rwhec.fitting.noise_components import DRIFT
+from gtsam_rwhec.fitting.noise_components import SYSTEMATIC
 
 C = Component
 #: A kind of noise is found where it raises twice the log likelihood by more than this, a parameter.
@@ -40,51 +43,34 @@ class Deviation:
 
 @dataclass(frozen=True)
 class NoiseInData:
-    """The noise that the data have.
-
-    Attributes
-    ----------
-    deviations : dict of Component to Deviation
-    instants : int
-        The carrier poses at which something was measured.
-    worth : float
-        As many instants with independent noise would determine the unknowns as well.
-    hand : "targetcarrier" or "sensorcarrier"
-        The carrier to which errors of A are fixed.
-    correlation : float or None
-        Of a track's errors from one step to the next; 1 is a random walk, None no drift.
-    frame : "sensor", "target", "detection" or None
-        In whose frame these errors are; "detection": rotations in the target's axes, translations along the sensor's.
-    drift_evidence, systematic_evidence : float
-        How much twice the log likelihood rose with drift, and with errors that vary with the configuration.
-    drift_not_sought : str
-        Why no drift was looked for; empty where it was, or an option says that there is none.
-    has_stamps : bool
-        Whether the order in time is known; without stamps it is that of rows.
-    is_drift_untried : bool
-        Whether residuals are correlated in time, and there are too many tracks for a model of it.
-    arms_assumed : bool
-        Whether the covariance has a constant error of A, which no residual shows, tied to the part that varies.
-    systematic_probability : float
-        That such errors are there: the covariance averages over both.
-    constant_deviations : tuple of two tuples of six float
-        Of the constant errors that the covariance has, [omega, v] in rad and m: of the targets' carrier in its own
-        axes, A Expmap(c), and of the sensors', Expmap(c) A.
-    """
+    """The noise that the data have."""
 
     deviations: dict[Component, Deviation]
+    #: The carrier poses at which something was measured.
     instants: int
+    #: As many instants with independent noise would determine the unknowns as well.
     worth: float
+    #: The carrier to which errors of A are fixed.
     hand: About
+    #: Of a track's errors from one step to the next; 1 is a random walk, None no drift.
     correlation: float | None
+    #: In whose frame these errors are; "detection": rotations in the target's axes, translations along the sensor's.
     frame: DriftFrame | None
+    #: How much twice the log likelihood rose with drift, and with errors that vary with the configuration.
     drift_evidence: float
     systematic_evidence: float
+    #: Why no drift was looked for; empty where it was, or an option says that there is none.
     drift_not_sought: str
+    #: Whether the order in time is known; without stamps it is that of rows.
     has_stamps: bool
+    #: Whether residuals are correlated in time, and there are too many tracks for a model of it.
     is_drift_untried: bool
+    #: Whether the covariance has a constant error of A, which no residual shows, tied to the part that varies.
     arms_assumed: bool
+    #: That such errors are there: the covariance averages over both.
     systematic_probability: float
+    #: Of the constant errors that the covariance has, [omega, v] in rad and m: of the targets' carrier in its own axes,
+    #: A Expmap(c), and of the sensors', Expmap(c) A.
     constant_deviations: tuple[tuple[float, ...], ...] = ((0.0,) * 6,) * 2
 
     @property

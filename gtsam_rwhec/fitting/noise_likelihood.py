@@ -27,42 +27,29 @@ from gtsam_rwhec.geometry.poses import Array
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one evaluation gives.
+    """What one evaluation gives."""
 
-    Attributes
-    ----------
-    minus_two_log : float
-        Of the restricted likelihood.
-    step : (p,) array
-        The unknowns' best change, in the basis of the model.
-    covariance : (p, p) array
-    """
-
+    #: Of the restricted likelihood.
     minus_two_log: float
+    #: (p,): The unknowns' best change, in the basis of the model.
     step: Array
+    #: (p, p)
     covariance: Array
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Rows, and what of them the components act on.
-
-    Attributes
-    ----------
-    basis : (d, p) array
-        The directions of the unknowns that the measurements determine.
-    prior_information, prior_gradient : (p, p) and (p,) arrays
-        What the problem's priors know of the unknowns' change.
-    features : (N, k) array
-        f, which measurements of one instant share.
-    """
+    """Rows, and what of them the components act on."""
 
     rows: Rows
     side: About
+    #: (d, p): The directions of the unknowns that the measurements determine.
     basis: Array
+    #: (p, p) and (p,): What the problem's priors know of the unknowns' change.
     prior_information: Array
     prior_gradient: Array
     drift: DriftPrior | None
+    #: (N, k): f, which measurements of one instant share.
     features: Array
 
     def evaluate(self, sigma: dict[C, float]) -> Estimate:
@@ -143,28 +130,18 @@ def _products(measured: Reduced, systematic: Array, f: Array, ff: Array) -> Arra
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What one evaluation of the likelihood leaves for its gradient.
+    """What one evaluation of the likelihood leaves for its gradient."""
 
-    Attributes
-    ----------
-    measured : Reduced
-        The single measurements.
-    drift : EliminatedDrift or None
-    covariance : (q + p, q + p) array
-        Of the unit systematic errors and the unknowns.
-    mean : (q + p,) array
-        Theirs.
-    systematic : (6,) array
-        Standard deviations of the systematic errors.
-    features, products : (T, k) and (T, k k) arrays
-        f of each instant, and f f'; k = 0 without systematic errors.
-    """
-
+    #: The single measurements.
     measured: Reduced
     drift: EliminatedDrift | None
+    #: (q + p, q + p): Of the unit systematic errors and the unknowns.
     covariance: Array
+    #: (q + p,): Theirs.
     mean: Array
+    #: (6,): Standard deviations of the systematic errors.
     systematic: Array
+    #: (T, k) and (T, k k): f of each instant, and f f'; k = 0 without systematic errors.
     features: Array
     products: Array
 

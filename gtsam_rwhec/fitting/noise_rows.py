@@ -38,38 +38,29 @@ STILL = 5e-5
 REVISITED, APART, SPREAD_M = (1e-3, 6e-3), 10.0, 0.3
 #: More pairs of near poses than this, an instant, are not those of visits to stations.
 MOST_LINKS = 50
+#: Stations are looked for where this share of some poses, so many of them, has another one near: half of all would have.
+FEWEST_REVISITED, SAMPLED = 0.2, 300
 #: A velocity is taken from neighbours that are no further apart than this, s.
 NEIGHBOURS_S = 0.5
 
 
 @dataclass(frozen=True)
 class Instants:
-    """Measurements grouped by instant: one carrier pose each, or one standstill, in order of time within a track.
+    """Measurements grouped by instant: one carrier pose each, or one standstill, in order of time within a track."""
 
-    Attributes
-    ----------
-    order : (N,) array
-        The measurements' places in the order of the pairs' data.
-    first : (T,) array
-        The first measurement of each instant, in that order.
-    index : (N,) array
-        The instant of each measurement, in that order.
-    chain : (N,) array
-        The place of each measurement's track in the state of its instant.
-    chains : int
-        The number of tracks in one state.
-    step : (T,) array
-        Time since the instant before, in typical steps; 0 where a track begins.
-    seconds : (T,) array or None
-        Time since the first instant.
-    """
-
+    #: (N,): The measurements' places in the order of the pairs' data.
     order: np.ndarray
+    #: (T,): The first measurement of each instant, in that order.
     first: np.ndarray
+    #: (N,): The instant of each measurement, in that order.
     index: np.ndarray
+    #: (N,): The place of each measurement's track in the state of its instant.
     chain: np.ndarray
+    #: The number of tracks in one state.
     chains: int
+    #: (T,): Time since the instant before, in typical steps; 0 where a track begins.
     step: Array
+    #: (T,): Time since the first instant.
     seconds: Array | None
 
     @property
@@ -138,13 +129,16 @@ def stations(A: Array) -> np.ndarray:
     spread = float(np.sqrt((A[:, 3::4].var(axis=0)).mean()))
     poses = A.copy()
     poses[:, 3::4] *= SPREAD_M / max(spread, SMALLEST_SPREAD)
-    tree = cKDTree(poses)
+    tree = None
+    some = np.random.default_rng(0).permutation(poses)[:SAMPLED]
+    squares = (some**2).sum(axis=1)[:, None] + (poses**2).sum(axis=1) - 2.0 * some @ poses.T
     for near in REVISITED:
-        number = (tree.count_neighbors(tree, APART * near) - len(A)) // 2
-        if number > MOST_LINKS * len(A):
+        neighbours = (squares < (APART * near) ** 2).sum(axis=1) - 1
+        if neighbours.mean() > 2.0 * MOST_LINKS:
             return alone
-        if number < len(A) // 2:
+        if (neighbours > 0).mean() < FEWEST_REVISITED:
             continue
+        tree = tree or cKDTree(poses)
         links = tree.query_pairs(APART * near, output_type="ndarray")
         graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(A), len(A)))
         count, station = connected_components(graph, directed=False)
@@ -157,38 +151,26 @@ def stations(A: Array) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Rows:
-    """The linear model about one estimate, in the order of its instants.
-
-    Attributes
-    ----------
-    residual : (N, 6) array
-    by_unknowns : SparseColumns
-        Its derivative by the d unknowns, in the order of ``Variables.unknowns``.
-    given : (N, 6, 6) array
-        B's covariance as stated; without weights 0.5 rad^2 (kappa = 1) and 1 m^2.
-    axis : (N, 3) array
-        The sensor's z axis in the target's frame.
-    twist : dict of side to (N, 6, 6) array
-        E: by a twist of A on either side.
-    configuration : dict of side to (N, 12) array
-        Rotation and translation of the moving carrier, by ``SMOOTH_RAD`` and ``SMOOTH_M``.
-    rate : (N, 6) array
-        The residual's change for a stamp that is one second late; zero where the velocity is not known.
-    predicted : (N, 4, 4) array
-        T_sensor_target, lengths as measured.
-    length : (N, 3) array
-        The residual's change by the logarithm of the track's scale.
-    """
+    """The linear model about one estimate, in the order of its instants."""
 
     instants: Instants
+    #: (N, 6)
     residual: Array
+    #: Its derivative by the d unknowns, in the order of ``Variables.unknowns``.
     by_unknowns: SparseColumns
+    #: (N, 6, 6): B's covariance as stated; without weights 0.5 rad^2 (kappa = 1) and 1 m^2.
     given: Array
+    #: (N, 3): The sensor's z axis in the target's frame.
     axis: Array
+    #: (N, 6, 6) each. E: by a twist of A on either side.
     twist: dict[About, Array]
+    #: (N, 12) each. Rotation and translation of the moving carrier, by ``SMOOTH_RAD`` and ``SMOOTH_M``.
     configuration: dict[About, Array]
+    #: (N, 6): The residual's change for a stamp that is one second late; zero where the velocity is not known.
     rate: Array
+    #: (N, 4, 4): T_sensor_target, lengths as measured.
     predicted: Array
+    #: (N, 3): The residual's change by the logarithm of the track's scale.
     length: Array
 
     @staticmethod
@@ -291,19 +273,13 @@ FEW = 2
 
 @dataclass(frozen=True)
 class SparseColumns:
-    """The numbers of some rows in columns that are zero elsewhere.
+    """The numbers of some rows in columns that are zero elsewhere."""
 
-    Attributes
-    ----------
-    values : (N, 6, w) array
-    places : (N, w) array
-        The column of each number; a row's columns may be named twice, and then add up.
-    count : int
-        The number of all columns.
-    """
-
+    #: (N, 6, w)
     values: Array
+    #: (N, w): The column of each number; a row's columns may be named twice, and then add up.
     places: np.ndarray
+    #: The number of all columns.
     count: int
 
     @staticmethod

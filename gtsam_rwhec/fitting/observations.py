@@ -1,30 +1,32 @@
 """What cameras saw: corners of targets in pixels, with the carriers' pose of each image."""
 
 from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
-
 import numpy as np
 from numpy.typing import ArrayLike
 from rwhec_factors import se3
-
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.unknown_intrinsics import Lens, estimated_intrinsics
-from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, OptionError, TargetError
+from gtsam_rwhec.cameras.unknown_intrinsics import Lens
+from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
+from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import NoiseError
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.pair_data import local_paths
-from gtsam_rwhec.geometry.poses import (
-    Array,
-    PoseLike,
-    PosesLike,
-    as_transforms,
-    checked_rows,
-    one_transform,
-    rows_to_transforms,
-)
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.poses import PosesLike
+from gtsam_rwhec.geometry.poses import as_transforms
+from gtsam_rwhec.geometry.poses import checked_rows
+from gtsam_rwhec.geometry.poses import one_transform
+from gtsam_rwhec.geometry.poses import rows_to_transforms
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.corners import check_in_image
 from gtsam_rwhec.problem.measurements import Pair
@@ -36,21 +38,14 @@ FLAT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Images of one target by one camera.
+    """Images of one target by one camera."""
 
-    Attributes
-    ----------
-    A : (N, 4, 4) array
-        T_sensorcarrier_targetcarrier of each image, metres.
-    pixels : (N, n, 2) array
-        nan where a corner was not seen.
-    twist : (N, 6) array, optional
-        The carriers' velocity at each image, [omega rad/s, v m/s] in the target carrier's axes: A(t + d) =
-        A Expmap(d twist). A time offset needs it.
-    """
-
+    #: (N, 4, 4): T_sensorcarrier_targetcarrier of each image, metres.
     A: Array
+    #: (N, n, 2): nan where a corner was not seen.
     pixels: Array
+    #: (N, 6): The carriers' velocity at each image, [omega rad/s, v m/s] in the target carrier's axes: A(t + d) = A
+    #: Expmap(d twist). A time offset needs it.
     twist: Array | None = None
 
     @property
@@ -65,22 +60,14 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What cameras saw.
+    """What cameras saw."""
 
-    Attributes
-    ----------
-    cameras : dict of str to Camera
-        By sensor.
-    corners : dict of str to (n, 3) array
-        By target, in its own frame, metres.
-    views : dict of (target, sensor) to Views
-    corner_px : float
-        Standard deviation of a corner along each axis, pixels.
-    """
-
+    #: By sensor.
     cameras: Mapping[str, Camera]
+    #: (n, 3) each. By target, in its own frame, metres.
     corners: Mapping[str, Array]
     views: Mapping[tuple[str, str], Views]
+    #: Standard deviation of a corner along each axis, pixels.
     corner_px: float = 0.1
 
     @staticmethod

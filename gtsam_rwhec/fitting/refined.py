@@ -1,25 +1,31 @@
 """The refined calibration: poses, covariances, noise, and the GTSAM graph."""
 
 from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field
 from itertools import pairwise
 from typing import Literal
-
 import gtsam
 import numpy as np
-from scipy.special import chdtri, fdtri
-
-from gtsam_rwhec.errors import FrameError, OptionError
+from scipy.special import chdtri
+from scipy.special import fdtri
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection
-from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
-from gtsam_rwhec.geometry.poses import Array, PoseLike
-from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics
+from gtsam_rwhec.fitting.reprojection_record import Reprojection
+from gtsam_rwhec.fitting.unknowns import Unknown
+from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.geometry.pose_covariances import error_of
+from gtsam_rwhec.geometry.pose_covariances import relative_jacobian
+from gtsam_rwhec.geometry.pose_covariances import standard_deviations
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.real_numbers import is_real
+from gtsam_rwhec.geometry.real_numbers import is_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.free_directions import FreeDirection
@@ -55,49 +61,32 @@ class RefinedPoses:
 
     Covariances are of right perturbations, T Expmap(xi), xi = [omega (rad), v (m)], in the frame's own axes (GTSAM's
     convention; ``rw.pose_covariances`` converts them). They are infinite along free directions.
-
-    Attributes
-    ----------
-    X, Y : dict of str to gtsam.Pose3
-        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
-    scale : float or dict of str to float
-    scale_mode : "known", "shared" or "per_target"
-    time_offsets_s : dict of str to float
-        By sensor, if estimated: the sensor's stamp t is the carriers' t + offset.
-    noise_source : "given" or "estimated"
-    noise : dict of (target, sensor) to PairNoise
-    cost, initial_cost : float
-        The graph's cost at the end, and at the certified solution.
-    iterations : int
-        Number of Levenberg-Marquardt steps, in all rounds of re-weighting together.
-    moved : dict of str to Movement
-    inlier_counts : dict of (target, sensor) to (int, int)
-        Numbers of inliers and of measurements with robust="gnc"; else empty.
-    free_directions : tuple of FreeDirection
-        Empty if everything is determined.
-    joint : JointCovariance
-        The covariance of all unknowns.
-    reprojection : Reprojection or None
-        Errors in pixels, and what was tried, where the refinement is from corners.
-    intrinsics : dict of str to Intrinsics
-        Of the sensors whose intrinsics were estimated with the poses; their covariance is that of "intrinsics:SENSOR".
     """
 
+    #: T_targetcarrier_target and T_sensorcarrier_sensor, metres.
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
     scale: float | dict[str, float]
     scale_mode: ScaleMode
+    #: By sensor, if estimated: the sensor's stamp t is the carriers' t + offset.
     time_offsets_s: dict[str, float]
     noise_source: Literal["given", "estimated"]
     noise: dict[Pair, PairNoise]
+    #: The graph's cost at the end, and at the certified solution.
     cost: float
     initial_cost: float
+    #: Number of Levenberg-Marquardt steps, in all rounds of re-weighting together.
     iterations: int
     moved: dict[str, Movement]
+    #: (int, int) each. Numbers of inliers and of measurements with robust="gnc"; else empty.
     inlier_counts: dict[Pair, tuple[int, int]]
+    #: Empty if everything is determined.
     free_directions: tuple[FreeDirection, ...]
+    #: The covariance of all unknowns.
     joint: JointCovariance = field(repr=False)
+    #: Errors in pixels, and what was tried, where the refinement is from corners.
     reprojection: Reprojection | None = field(default=None, kw_only=True, repr=False)
+    #: Of the sensors whose intrinsics were estimated with the poses; their covariance is that of "intrinsics:SENSOR".
     intrinsics: dict[str, Intrinsics] = field(default_factory=dict, kw_only=True, repr=False)
 
     def covariance(self, *names: str | Unknown) -> Array:
@@ -259,29 +248,19 @@ class RefinedPoses:
 
 @dataclass(frozen=True, repr=False)
 class Refined(RefinedPoses):
-    """A refined calibration, with everything that `RefinedPoses` has, and the graph.
+    """A refined calibration, with everything that `RefinedPoses` has, and the graph."""
 
-    Attributes
-    ----------
-    graph, values : gtsam.NonlinearFactorGraph, gtsam.Values
-        The graph and its values at the optimum, for further factors.
-    keys : dict of str to int
-        The variables' keys by name: frames, "scale" ("scale:NAME" with scale="per_target"), "time_offset:SENSOR".
-    inliers : dict of (target, sensor) to (N,) booleans
-        The inliers with robust="gnc"; else empty.
-    solution : Solution
-        The certified solution that was refined; with robust="gnc" it is the inliers' solution.
-    options : RefineOptions
-    noise_sentences : tuple of str
-        What was found of the noise of A and B, in time and over the configuration; empty where only B's was estimated.
-    """
-
+    #: The graph and its values at the optimum, for further factors.
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
+    #: The variables' keys by name: frames, "scale" ("scale:NAME" with scale="per_target"), "time_offset:SENSOR".
     keys: dict[str, int]
+    #: (N,) each. The inliers with robust="gnc"; else empty.
     inliers: dict[Pair, np.ndarray]
+    #: The certified solution that was refined; with robust="gnc" it is the inliers' solution.
     solution: Solution
     options: RefineOptions
+    #: What was found of the noise of A and B, in time and over the configuration; empty where only B's was estimated.
     noise_sentences: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

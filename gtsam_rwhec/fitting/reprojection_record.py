@@ -1,13 +1,10 @@
 """What a refinement from corners found besides poses: intrinsics, boards, and errors in pixels; as files keep it."""
 
 from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal
-
 import numpy as np
-
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import rounded
@@ -26,47 +23,31 @@ LEAST = 0.001
 
 @dataclass(frozen=True)
 class SensorReprojection:
-    """Errors of a sensor's corners.
+    """Errors of a sensor's corners."""
 
-    Attributes
-    ----------
-    images, corners, left_out : int
-        How many count, and corners that were left out because they disagree with all others.
-    rms_px : float
-        Root mean square of the corners that count, along each axis, pixels.
-    held_out_px, held_out_mm : float or None
-        Root mean square length of the error in images that were left out; in pixels, and on the target. None where
-        images are too few to leave some out.
-    expected_px : float or None
-        What the covariances say of `held_out_px`: errors that are larger by far show what the model lacks.
-    regions_px : tuple of tuple of float or None
-        `held_out_px` by region of the image, rows from the top; None where no corner was seen.
-    """
-
+    #: How many count, and corners that were left out because they disagree with all others.
     images: int
     corners: int
     left_out: int
+    #: Root mean square of the corners that count, along each axis, pixels.
     rms_px: float
+    #: Root mean square length of the error in images that were left out; in pixels, and on the target. None where
+    #: images are too few to leave some out.
     held_out_px: float | None = None
     held_out_mm: float | None = None
+    #: `held_out_px` by region of the image, rows from the top; None where no corner was seen.
     regions_px: Regions = ()
+    #: What the covariances say of `held_out_px`: errors that are larger by far show what the model lacks.
     expected_px: float | None = None
 
 
 @dataclass(frozen=True)
 class TriedModel:
-    """A model that was tried.
+    """A model that was tried."""
 
-    Attributes
-    ----------
-    words : str
-        What it takes as known.
-    held_out_px, held_out_mm : float
-        How well it predicts images that were left out: in pixels, and on the target.
-    is_chosen : bool
-    """
-
+    #: What it takes as known.
     words: str
+    #: How well it predicts images that were left out: in pixels, and on the target.
     held_out_px: float
     held_out_mm: float
     is_chosen: bool
@@ -79,19 +60,12 @@ class TriedModel:
 
 @dataclass(frozen=True)
 class Consequence:
-    """How far a frame would be off.
-
-    Attributes
-    ----------
-    frame : str
-    cause : str
-        In words, with its size.
-    rotation_deg, translation_mm : float
-        Of A's noise: one standard deviation, along the worst axis.
-    """
+    """How far a frame would be off."""
 
     frame: str
+    #: In words, with its size.
     cause: str
+    #: Of A's noise: one standard deviation, along the worst axis.
     rotation_deg: float
     translation_mm: float
 
@@ -105,23 +79,16 @@ class Consequence:
 
 @dataclass(frozen=True)
 class BoardShape:
-    """What was estimated of a board.
+    """What was estimated of a board."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        "size" (its size less the stated one, a share of 1), "warp_x" and "warp_y" (heights of its edge over its middle
-        along x and y, metres).
-    values, standard_deviations : tuple of float
-        In that order.
-    corners_off_m, corners_deviations_m : tuple of (x, y, z)
-        How far each corner is from its place on the board of that size and bend, in the target's axes, and its
-        deviations, metres; empty where corners were not free.
-    """
-
+    #: "size" (its size less the stated one, a share of 1), "warp_x" and "warp_y" (heights of its edge over its middle
+    #: along x and y, metres).
     names: tuple[str, ...]
+    #: In that order.
     values: tuple[float, ...]
     standard_deviations: tuple[float, ...]
+    #: How far each corner is from its place on the board of that size and bend, in the target's axes, and its
+    #: deviations, metres; empty where corners were not free.
     corners_off_m: tuple[tuple[float, ...], ...] = ()
     corners_deviations_m: tuple[tuple[float, ...], ...] = ()
 
@@ -149,35 +116,23 @@ class BoardShape:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """A refinement from corners in numbers.
+    """A refinement from corners in numbers."""
 
-    Attributes
-    ----------
-    rms_px : float
-        Root mean square of all corners that count, along each axis, pixels.
-    corner_px : float
-        Standard deviation of a corner along each axis, as estimated.
-    carrier_poses : "exact", "estimated" or "given"
-        Whether the carriers' poses A count as exact, or their noise was estimated or given.
-    carrier_rotation_rad, carrier_translation_m : float
-        A's noise about and along each axis; 0 where A is exact.
-    sensors : dict of str to SensorReprojection
-    boards : dict of str to BoardShape
-        By target, where something of it is free.
-    tried : tuple of TriedModel
-        The models that were compared, the best first.
-    consequences : tuple of Consequence
-        What errors of kept intrinsics, and of A, would do to each frame.
-    """
-
+    #: Root mean square of all corners that count, along each axis, pixels.
     rms_px: float
+    #: Standard deviation of a corner along each axis, as estimated.
     corner_px: float
+    #: Whether the carriers' poses A count as exact, or their noise was estimated or given.
     carrier_poses: Literal["exact", "estimated", "given"]
+    #: A's noise about and along each axis; 0 where A is exact.
     carrier_rotation_rad: float
     carrier_translation_m: float
     sensors: dict[str, SensorReprojection]
+    #: By target, where something of it is free.
     boards: dict[str, BoardShape]
+    #: The models that were compared, the best first.
     tried: tuple[TriedModel, ...]
+    #: What errors of kept intrinsics, and of A, would do to each frame.
     consequences: tuple[Consequence, ...]
 
     def __str__(self) -> str:
@@ -199,52 +154,34 @@ class Reprojection:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A sensor's intrinsics as they were estimated; its parameters are `Camera.parameters`.
+    """A sensor's intrinsics as they were estimated; its parameters are `Camera.parameters`."""
 
-    Attributes
-    ----------
-    model : str
-        As `Camera.model`.
-    width, height : int
-        Pixels.
-    shared_with : tuple of str
-        Other sensors with the same camera.
-    names : tuple of str
-        Of the parameters.
-    values, standard_deviations : tuple of float
-    stated : tuple of float
-        What was stated: the prior's mean.
-    stated_deviations : tuple of float
-        The prior's, as widened; infinite: no prior.
-    stated_as : "exact", "calibration", "nominal" or "unknown"
-    widened : float
-        By how much the prior was widened: 1 where the images do not contradict what was stated.
-    innovation_deviations : float
-        How far what was stated is from what the images say, in standard deviations.
-    held_by_prior : tuple of str
-        Parameters that the images do not determine.
-    rms_px : float
-        Of the corners that count, along each axis.
-    projection_px : tuple of tuple of float or None
-        Standard deviation of the projection of points at `projection_m` before the camera, pixels, by region of the
-        image: of the lens alone, with the pose that hides its errors best where corners were seen.
-    projection_m : float
-    """
-
+    #: As `Camera.model`.
     model: str
+    #: Pixels.
     width: int
     height: int
+    #: Other sensors with the same camera.
     shared_with: tuple[str, ...]
+    #: Of the parameters.
     names: tuple[str, ...]
     values: tuple[float, ...]
     standard_deviations: tuple[float, ...]
+    #: What was stated: the prior's mean.
     stated: tuple[float, ...]
+    #: The prior's, as widened; infinite: no prior.
     stated_deviations: tuple[float, ...]
     stated_as: Literal["exact", "calibration", "nominal", "unknown"]
+    #: By how much the prior was widened: 1 where the images do not contradict what was stated.
     widened: float
+    #: How far what was stated is from what the images say, in standard deviations.
     innovation_deviations: float
+    #: Parameters that the images do not determine.
     held_by_prior: tuple[str, ...]
+    #: Of the corners that count, along each axis.
     rms_px: float
+    #: Standard deviation of the projection of points at `projection_m` before the camera, pixels, by region of the
+    #: image: of the lens alone, with the pose that hides its errors best where corners were seen.
     projection_px: Regions = ()
     projection_m: float = 0.0
 

@@ -9,15 +9,14 @@ deviations are so small that no number of corners tells anything of them.
 """
 
 from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-
 import numpy as np
-from scipy.special import chdtrc, chdtri
-
+from scipy.special import chdtrc
+from scipy.special import chdtri
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.distortion import coefficient_jacobian, distorted
+from gtsam_rwhec.cameras.distortion import coefficient_jacobian
+from gtsam_rwhec.cameras.distortion import distorted
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.geometry.poses import Array
 
@@ -72,17 +71,11 @@ HELD = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """What the images say against stated intrinsics.
+    """What the images say against stated intrinsics."""
 
-    Attributes
-    ----------
-    off : (m,) array
-        Estimated less stated parameters.
-    probabilities : dict of str to float
-        That chance gives as much, by part ("focal length", "centre", "distortion").
-    """
-
+    #: (m,): Estimated less stated parameters.
     off: Array
+    #: That chance gives as much, by part ("focal length", "centre", "distortion").
     probabilities: Mapping[str, float]
 
     @property
