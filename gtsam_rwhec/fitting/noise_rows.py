@@ -38,7 +38,7 @@ STILL = 5e-5
 REVISITED, APART, SPREAD_M = (1e-3, 6e-3), 10.0, 0.3
 #: More pairs of near poses than this, an instant, are not those of visits to stations.
 MOST_LINKS = 50
-#: Stations are looked for where this share of some poses, so many of them, has another one near: half of all would have.
+#: Stations are looked for where this share of so many sampled poses has another one near: of stations half would have.
 FEWEST_REVISITED, SAMPLED = 0.2, 300
 #: A velocity is taken from neighbours that are no further apart than this, s.
 NEIGHBOURS_S = 0.5
