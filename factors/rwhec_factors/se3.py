@@ -93,9 +93,10 @@ def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
 
 def so3_left_jacobian_inverse(omega: Array) -> Array:
     """The inverse (N, 3, 3) of the SO(3) left Jacobian: I - hat/2 + d hat^2."""
-    W = hat(omega)
-    _, _, d = _coefficients(np.linalg.norm(omega, axis=1))
-    result: Array = np.eye(3) - 0.5 * W + d[:, None, None] * (W @ W)
+    angle = np.linalg.norm(omega, axis=1)
+    _, _, d = _coefficients(angle)
+    result: Array = (d[:, None] * omega)[:, :, None] * omega[:, None, :] - 0.5 * hat(omega)
+    result[:, np.arange(3), np.arange(3)] += (1.0 - d * angle**2)[:, None]  # W^2 = omega omega' - angle^2 I
     return result
 
 
@@ -135,9 +136,6 @@ def right_jacobian_inverse(xi: Array) -> Array:
 
 def _coupling(omega: Array, v: Array) -> Array:
     """Q(omega, v) of the SE(3) left Jacobian (Barfoot eq. 8.91b), (N, 3, 3)."""
-    W, V = hat(omega), hat(v)
-    WV, VW = W @ V, V @ W
-    WVW = WV @ W
     t = np.linalg.norm(omega, axis=1)
     small = t < 0.1  # differences of fourth order cancel at larger angles
     s = np.where(small, 1.0, t)
@@ -153,6 +151,12 @@ def _coupling(omega: Array, v: Array) -> Array:
         1.0 / 120.0 - t2 / 2520.0 * (1.0 - t2 / 48.0 * (1.0 - t2 / 82.5)),
         (2.0 * s - 3.0 * np.sin(s) + s * np.cos(s)) / (2.0 * s**5),
     )
-    c1, c2, c3 = (q[:, None, None] for q in (q1, q2, q3))
-    result: Array = 0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3.0 * WVW) + c3 * (WVW @ W + W @ WVW)
+    # With s = omega' v: W V = v omega' - s I, V W = omega v' - s I, W V W = -s W, W^2 = omega omega' - t^2 I.
+    dot = (omega * v).sum(axis=1)
+    turned = np.cross(omega, np.cross(omega, v))
+    result: Array = hat(0.5 * v + ((q2 - q1) * dot)[:, None] * omega + q2[:, None] * turned)
+    mixed = (q1[:, None] * v)[:, :, None] * omega[:, None, :]
+    result += mixed + mixed.transpose(0, 2, 1)
+    result -= ((2.0 * q3 * dot)[:, None] * omega)[:, :, None] * omega[:, None, :]
+    result[:, np.arange(3), np.arange(3)] += (2.0 * dot * (q3 * t2 - q1))[:, None]
     return result

@@ -71,21 +71,14 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class _Linear:
-    """Residuals in units of the noise as stated, (N, 6), and their Jacobian: blocks (N, 6, w), columns (N, w).
+class _PairRows:
+    """A pair's residuals e (n, 6) in units of the noise as stated, and their Jacobian J (n, 6, w) by unknowns (w,)."""
 
-    A column of -1 has no unknown.
-    """
-
+    rows: slice
+    sensor: str
     e: Array
-    blocks: Array
-    columns: np.ndarray
-    #: The unknowns' number.
-    size: int
-    #: (N,): the number of the measurement's sensor.
-    sensor: np.ndarray
-    #: (N,): whether both frames have poses.
-    known: np.ndarray
+    J: Array
+    unknowns: np.ndarray
 
 
 def judged(
@@ -103,64 +96,61 @@ def judged(
     ``noise_of`` (N,) are the measurements that show the noise, all kept ones by default. ``robust`` takes the variances
     from medians: for a fit to all measurements, of which some may be outliers.
     """
-    linear = _linearized(problem, measured, fit)
-    keep = keep & linear.known
-    noise_of = keep if noise_of is None else noise_of & linear.known
-    count = int(noise_of.sum())
-    nu = max(0.5 * (DOF * count - linear.size), 1.0)
+    pairs, size = _linearized(problem, measured, fit)
+    known = np.zeros(len(keep), dtype=bool)
+    for pair in pairs:
+        known[pair.rows] = True
+    keep = keep & known
+    noise_of = keep if noise_of is None else noise_of & known
+    nu = max(0.5 * (DOF * int(noise_of.sum()) - size), 1.0)
     threshold = DOF * float(fdtri(DOF, nu, 1.0 - rejected_share(confidence, len(keep))))
-    variances = _variances(linear, noise_of, robust=robust)
     square = np.full(len(keep), np.inf)
-    if linear.size > MOST_UNKNOWNS:
-        square[linear.known] = np.sum(linear.e**2 / variances, axis=1)[linear.known]
+    residuals = [pair.e for pair in pairs]
+    variances = _variances(pairs, residuals, noise_of, size, robust=robust)
+    if size > MOST_UNKNOWNS:
+        for pair, variance in zip(pairs, variances, strict=True):
+            square[pair.rows] = np.sum(pair.e**2 / variance, axis=1)
         return Judged(square, threshold)
-    e, own = _as_if_fitted(linear, keep, variances)
     for _ in range(2):  # the step moves residuals a little, and these the variances
-        variances = _variances(_with(linear, e), noise_of, robust=robust)
-        e, own = _as_if_fitted(linear, keep, variances)
-    C = np.where(keep[:, None, None], -own, own)
-    C[:, np.arange(DOF), np.arange(DOF)] += variances
-    # A measurement without which something is undetermined has no residual of its own.
-    values, vectors = np.linalg.eigh(C / np.sqrt(variances[:, :, None] * variances[:, None, :]))
-    whitened = np.einsum("nij,ni->nj", vectors, e / np.sqrt(variances))
-    parts = np.where(values > 1e-6, whitened**2 / np.maximum(values, 1e-6), 0.0)
-    square[linear.known] = parts.sum(axis=1)[linear.known]
+        residuals, _ = _as_if_fitted(pairs, keep, variances, size)
+        variances = _variances(pairs, residuals, noise_of, size, robust=robust)
+    residuals, C = _as_if_fitted(pairs, keep, variances, size)
+    for pair, e, variance in zip(pairs, residuals, variances, strict=True):
+        own = pair.J @ C[np.ix_(pair.unknowns, pair.unknowns)] @ pair.J.transpose(0, 2, 1)
+        own *= np.where(keep[pair.rows], -1.0, 1.0)[:, None, None]
+        deviation = np.sqrt(variance)
+        share = np.eye(DOF) + own / deviation[:, None] / deviation
+        # A measurement without which something is undetermined has no residual of its own.
+        values, vectors = np.linalg.eigh(share)
+        whitened = np.einsum("nij,ni->nj", vectors, e / deviation)
+        square[pair.rows] = np.where(values > 1e-6, whitened**2 / np.maximum(values, 1e-6), 0.0).sum(axis=1)
     return Judged(square, threshold)
 
 
-def _with(linear: _Linear, e: Array) -> _Linear:
-    return _Linear(e, linear.blocks, linear.columns, linear.size, linear.sensor, linear.known)
-
-
-def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> _Linear:
-    """Residuals and Jacobians of all measurements at a fit."""
-    count = len(measured.A)
+def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple[list[_PairRows], int]:
+    """Residuals and Jacobians at a fit, of the pairs whose frames have poses; and the number of all unknowns."""
     free = [name for name in problem.targets + problem.sensors if name not in problem.fixed and name in fit.poses]
-    first = {name: 6 * i for i, name in enumerate(free)}
-    scales = _scale_columns(problem.scale, problem, 6 * len(free))
-    e, blocks = np.zeros((count, 6)), np.zeros((count, 6, 13))
-    columns = np.full((count, 13), -1)
-    sensor, known = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
-    numbers = {name: i for i, name in enumerate(problem.sensors)}
+    first = {name: DOF * i for i, name in enumerate(free)}
+    scales = _scale_columns(problem.scale, problem, DOF * len(free))
+    pairs = []
     for pair, rows in zip(measured.pairs, measured.rows, strict=True):
-        sensor[rows] = numbers[pair.sensor]
         alpha = fit.alpha.get(pair.target, np.nan)
         if pair.target not in fit.poses or pair.sensor not in fit.poses or not (np.isfinite(alpha) and alpha > 0.0):
             continue
-        known[rows] = True
         at = BatchResiduals(measured.A[rows], measured.B[rows]).linearize(
             fit.poses[pair.target], fit.poses[pair.sensor], alpha
         )
-        parts = (at.target, at.sensor, at.scale[:, :, None])
+        blocks = {first[name]: J for name, J in ((pair.target, at.target), (pair.sensor, at.sensor)) if name in first}
+        if pair.target == pair.sensor and pair.target in first:  # a motion: one frame is both
+            blocks = {first[pair.target]: at.target + at.sensor}
+        if pair.target in scales:
+            blocks[scales[pair.target]] = at.scale[:, :, None]
+        unknowns = [np.arange(start, start + J.shape[2]) for start, J in blocks.items()]
         W = _whitening(measured, rows)
-        e[rows] = np.einsum("nij,nj->ni", W, at.residual)
-        blocks[rows] = W @ np.concatenate(parts, axis=2)
-        for name, at_column in ((pair.target, 0), (pair.sensor, 6)):
-            if name in first:
-                columns[rows, at_column : at_column + 6] = first[name] + np.arange(6)
-        columns[rows, 12] = scales.get(pair.target, -1)
-    blocks[np.broadcast_to((columns < 0)[:, None, :], blocks.shape)] = 0.0
-    return _Linear(e, blocks, columns, 6 * len(free) + len(set(scales.values())), sensor, known)
+        J = np.concatenate([np.zeros((len(W), DOF, 0)), *blocks.values()], axis=2)
+        e = np.einsum("nij,nj->ni", W, at.residual)
+        pairs.append(_PairRows(rows, pair.sensor, e, W @ J, np.concatenate([np.zeros(0, dtype=np.int64), *unknowns])))
+    return pairs, DOF * len(free) + len(set(scales.values()))
 
 
 def _scale_columns(mode: ScaleMode, problem: Problem, first: int) -> dict[str, int]:
@@ -184,53 +174,50 @@ def _whitening(measured: Measured, rows: slice) -> Array:
     return W
 
 
-def _variances(linear: _Linear, keep: np.ndarray, *, robust: bool) -> Array:
-    """Variances (N, 6) of the residuals, by axis and sensor."""
-    spare = max(1.0 - linear.size / (DOF * max(int(keep.sum()), 1)), 0.05)  # the unknowns take the rest
+def _variances(
+    pairs: list[_PairRows], residuals: list[Array], keep: np.ndarray, size: int, *, robust: bool
+) -> list[Array]:
+    """Variances (6,) of each pair's residuals, by axis and sensor."""
+    kept = [e[keep[pair.rows]] for pair, e in zip(pairs, residuals, strict=True)]
+    number = sum(map(len, kept))
+    if not number:
+        return [np.full(DOF, SMALLEST) for _ in pairs]
+    spare = max(1.0 - size / (DOF * number), 0.05)  # the unknowns take the rest
 
-    def of(rows: np.ndarray) -> Array:
-        square = linear.e[rows] ** 2
+    def of(parts: list[Array]) -> Array:
+        square = np.concatenate(parts) ** 2
         if robust:
             middle: Array = np.median(square, axis=0) / float(chdtri(1, 0.5)) / spare
             return middle
         mean: Array = square.mean(axis=0) / spare
         return mean
 
-    if not keep.any():
-        return np.full(linear.e.shape, SMALLEST)
-    by_axis = of(keep)
+    by_axis = of(kept)
     mean = np.repeat(by_axis.reshape(2, 3).mean(axis=1), 3)
-    count = float(keep.sum())
-    pooled = (count * by_axis + PRIOR_MEASUREMENTS * mean) / (count + PRIOR_MEASUREMENTS)
-    result = np.tile(pooled, (len(keep), 1))
-    for number in np.unique(linear.sensor[keep]):
-        own = linear.sensor == number
-        count = float((own & keep).sum())
-        result[own] = (count * of(own & keep) + PRIOR_MEASUREMENTS * pooled) / (count + PRIOR_MEASUREMENTS)
-    return np.maximum(result, SMALLEST)
+    pooled = (number * by_axis + PRIOR_MEASUREMENTS * mean) / (number + PRIOR_MEASUREMENTS)
+    of_sensor: dict[str, Array] = {}
+    for name in dict.fromkeys(pair.sensor for pair in pairs):
+        own = [part for pair, part in zip(pairs, kept, strict=True) if pair.sensor == name]
+        count = sum(map(len, own))
+        of_sensor[name] = (
+            (count * of(own) + PRIOR_MEASUREMENTS * pooled) / (count + PRIOR_MEASUREMENTS) if count else pooled
+        )
+    return [np.maximum(of_sensor[pair.sensor], SMALLEST) for pair in pairs]
 
 
-def _as_if_fitted(linear: _Linear, keep: np.ndarray, variances: Array) -> tuple[Array, Array]:
-    """Residuals (N, 6) after a Gauss-Newton step of the kept ones under the variances, and J C J' (N, 6, 6)."""
-    size, width = linear.size, linear.blocks.shape[2]
-    at = np.where(linear.columns < 0, size, linear.columns)  # a last row and column take what has no unknown
-    weighted = linear.blocks[keep] / variances[keep][:, :, None]
-    pairs = at[keep]
-    products = np.einsum("nij,nik->njk", weighted, linear.blocks[keep])
-    flat = pairs[:, :, None] * (size + 1) + pairs[:, None, :]
-    information = _summed(flat, products, (size + 1) ** 2).reshape(size + 1, size + 1)
-    gradient = _summed(pairs, np.einsum("nij,ni->nj", weighted, linear.e[keep]), size + 1)
-    C = np.zeros((size + 1, size + 1))
-    C[:-1, :-1] = _inverse(information[:-1, :-1])
+def _as_if_fitted(
+    pairs: list[_PairRows], keep: np.ndarray, variances: list[Array], size: int
+) -> tuple[list[Array], Array]:
+    """Residuals after a Gauss-Newton step of the kept ones under the variances, and the unknowns' covariance C."""
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    for pair, variance in zip(pairs, variances, strict=True):
+        kept = keep[pair.rows]
+        J = (pair.J[kept] / np.sqrt(variance)[:, None]).reshape(-1, len(pair.unknowns))
+        information[np.ix_(pair.unknowns, pair.unknowns)] += J.T @ J
+        gradient[pair.unknowns] += J.T @ (pair.e[kept] / np.sqrt(variance)).ravel()
+    C = _inverse(information)
     step = -C @ gradient
-    e = linear.e + np.einsum("nij,nj->ni", linear.blocks, step[at])
-    local = C[at[:, :, None], at[:, None, :]].reshape(len(at), width, width)
-    return e, linear.blocks @ local @ linear.blocks.transpose(0, 2, 1)
-
-
-def _summed(places: np.ndarray, values: Array, size: int) -> Array:
-    result: Array = np.asarray(np.bincount(places.ravel(), values.ravel(), size), dtype=np.float64)
-    return result
+    return [pair.e + pair.J @ step[pair.unknowns] for pair in pairs], C
 
 
 def _inverse(information: Array) -> Array:

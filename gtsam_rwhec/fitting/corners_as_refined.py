@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from gtsam_rwhec.fitting.held_out import HeldOut
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.projection_uncertainty import by_region
-from gtsam_rwhec.fitting.refined import PairNoise, Refined
+from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements
 from gtsam_rwhec.fitting.reprojection_record import (
     SIZE,
@@ -78,9 +79,7 @@ def as_refined(
         scale=_scale(base, corners),
         scale_mode=_scale_mode(base, corners),
         time_offsets_s=base.time_offsets_s | corners.time_offsets_s,
-        graph=graph.graph,
-        values=graph.values(corners.point),
-        keys=keys,
+        factor_graph=partial(FactorGraph, graph.graph, graph.values(corners.point), keys),
         noise_source="estimated",
         noise={
             pair: PairNoise(noise.rotation_rad, noise.translation_m, (freedom, freedom))

@@ -29,7 +29,6 @@ from gtsam_rwhec.fitting.noise_search import Settled
 from gtsam_rwhec.fitting.noise_search import Task
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.pair_data import square_root_information
-from gtsam_rwhec.fitting.pose_graph import Optimum
 from gtsam_rwhec.fitting.pose_graph import add_fixed
 from gtsam_rwhec.fitting.pose_graph import add_priors
 from gtsam_rwhec.fitting.pose_graph import optimise
@@ -38,19 +37,24 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements
 from gtsam_rwhec.fitting.refinement_from_poses import scale_of
 from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.fitting.unknowns import Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
+from functools import cache
+from gtsam_rwhec.fitting.noise_likelihood import Estimate
+from gtsam_rwhec.fitting.noise_rows import prior_terms
+from gtsam_rwhec.fitting.noise_search import moved
+from gtsam_rwhec.fitting.pose_models import linearized
+from gtsam_rwhec.fitting.refined import FactorGraph
 
 #: A factor has at most about this many numbers of effects that belong to single instants: 10 instants of one track.
 COLUMNS = 70
-#: A step that lowers the cost by less than this is the last: what is left is far below a thousandth of a deviation.
-LAST_STEP = 1e-7
-#: Where directions are free, steps of frames, scales and offsets are held by this standard deviation (rad, m, s).
-HELD = 10.0
+#: After a step of fewer standard deviations than this what is left is far below a thousandth of one.
+LINEAR = 1e-2
+#: An answer whose next step is longer than this, in standard deviations, has not converged.
+CONVERGED = 0.1
 #: The translation's step in a drift is at least this part of what the rotation's step adds to it by its lever.
 SMALLEST_STEP = 1e-2
 #: The key of the coefficients of the systematic errors.
@@ -67,19 +71,6 @@ def twist_key(instant: int) -> int:
     """Key of the twist of A at an instant that several measurements share."""
     key: int = gtsam.symbol("e", instant)
     return key
-
-
-@dataclass(frozen=True)
-class NoiseGraph:
-    """A noise model's graph."""
-
-    #: All factors, and the estimate with effects of zero.
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    #: The same factors without the constraints of fixed frames: what ``information_of`` takes.
-    unfixed: gtsam.NonlinearFactorGraph
-    #: The effects' keys: "drift:INSTANT", "systematic", "carrier:INSTANT"; instants as ``Instants`` counts them.
-    keys: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -132,8 +123,11 @@ class _Effects:
 
 def graph_of(
     model: NoiseModel, sigma: dict[C, float], data: list[PairData], variables: Variables, state: State, problem: Problem
-) -> NoiseGraph:
-    """The graph of a model whose rows were made at ``state``, at standard deviations of its components."""
+) -> FactorGraph:
+    """The graph of a model whose rows were made at ``state``, and the estimate with effects of zero.
+
+    The effects' keys are "drift:INSTANT", "systematic", "carrier:INSTANT"; instants as ``Instants`` counts them.
+    """
     if model.drift is not None:
         sigma = _with_smallest_step(sigma, model.drift)
     effects = _Effects.of(model, sigma)
@@ -155,9 +149,8 @@ def graph_of(
         values.insert(key, np.zeros(size))
         graph.add(gtsam.PriorFactorVector(key, np.zeros(size), gtsam.noiseModel.Unit.Create(size)))
     add_priors(graph, variables, problem, "geodesic")
-    unfixed = gtsam.NonlinearFactorGraph(graph)
     add_fixed(graph, variables, problem)
-    return NoiseGraph(graph, values, unfixed, keys)
+    return FactorGraph(graph, values, keys)
 
 
 def _add_measurements(
@@ -220,40 +213,6 @@ def _with_smallest_step(sigma: dict[C, float], prior: DriftPrior) -> dict[C, flo
     return sigma | {C.DRIFT_TRANSLATION: max(sigma[C.DRIFT_TRANSLATION], smallest)}
 
 
-def optimum_of(made: NoiseGraph, variables: Variables, *, has_free: bool, max_iterations: int) -> Optimum:
-    """The optimum by Gauss and Newton's steps from an estimate near it; by GTSAM's optimiser where they do not descend.
-
-    GTSAM's optimisers copy all values for every call of a factor in Python, which takes most of their time here.
-    """
-    values, cost = made.values, made.graph.error(made.values)
-    for iteration in range(1, max_iterations + 1):
-        linear = made.graph.linearize(values)
-        if has_free:
-            for unknown in variables.unknowns:
-                one, zero = np.eye(unknown.dimension), np.zeros(unknown.dimension)
-                held = gtsam.noiseModel.Isotropic.Sigma(unknown.dimension, HELD)
-                linear.add(gtsam.JacobianFactor(variables.keys[unknown], one, zero, held))
-        try:
-            step = linear.optimize()
-        except RuntimeError:  # GTSAM's IndeterminantLinearSystemException
-            break
-        gain = cost - linear.error(step)
-        moved = values.retract(step)
-        after = made.graph.error(moved)
-        if not after <= cost * (1.0 + 1e-12) + 1e-12:
-            break
-        values, cost = moved, after
-        if gain < LAST_STEP:
-            return Optimum(values, cost, iteration)
-    else:
-        return Optimum(values, cost, max_iterations)
-    return optimise(made.graph, values, max_iterations)
-
-
-#: The graph's optimum and the linear model's may differ by this part of a standard deviation: linearisation's share.
-AGREES = 0.1
-
-
 def refined_of(
     task: Task,
     settled: Settled,
@@ -263,9 +222,9 @@ def refined_of(
     solution: Solution,
     options: RefineOptions,
 ) -> Refined:
-    """The answer with its graph, at the graph's optimum.
+    """The answer at the optimum of the settled components, with its graph, which is made when it is asked for.
 
-    ``Refined.keys`` has the effects too: "drift:INSTANT", "systematic" and "carrier:INSTANT" (``noise_model.graph``).
+    ``Refined.keys`` has the effects too: "drift:INSTANT", "systematic" and "carrier:INSTANT".
     The graph has the components at their most probable values; the ``joint`` covariance also has their uncertainty
     and the constant error of an arm, so that the graph's own marginals are a little smaller.
 
@@ -283,46 +242,38 @@ def refined_of(
     Warns
     -----
     NotConvergedWarning
-        If the optimiser stopped at its limit, or its optimum is not that of the linear model.
+        If the steps stopped at their limit, or are those of no linear model.
     """
     sigma = settled.fit.sizes.values(settled.fit.logs)
-    made = graph_of(settled.model, sigma, task.data, task.variables, settled.state, task.problem)
-    optimum = optimum_of(
-        made, task.variables, has_free=bool(task.layout.free.shape[1]), max_iterations=options.max_iterations
-    )
-    state = task.variables.state(optimum.values)
-    if optimum.iterations >= options.max_iterations:
+    state, model, estimate, iterations = _optimum(task, settled, sigma, options.max_iterations)
+    variables = task.variables
+
+    @cache
+    def factor_graph() -> FactorGraph:
+        made = graph_of(model, sigma, task.data, variables, state, task.problem)
+        held = {variables.keys[u]: u.dimension for u in variables.unknowns} if task.layout.free.shape[1] else {}
+        optimum = optimise(made.graph, made.values, options.max_iterations, held)
+        return FactorGraph(made.graph, optimum.values, {str(u): key for u, key in variables.keys.items()} | made.keys)
+
+    if estimate.farthest > CONVERGED:
         warnings.warn(
-            f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "
-            "RefineOptions.max_iterations",
+            f"after {iterations} steps the next one is {estimate.farthest:.2g} standard deviations long: residuals are "
+            "too large for a linear model; look for outliers (robust='gnc'), or raise RefineOptions.max_iterations",
             NotConvergedWarning,
             stacklevel=3,
         )
-    share = disagreement(task, settled, sigma, state)
-    if share > AGREES:
-        warnings.warn(
-            f"the graph's optimum is {share:.2g} standard deviations from that of the linear model, to which the "
-            "covariance belongs: residuals are too large for a linear model; look for outliers (robust='gnc')",
-            NotConvergedWarning,
-            stacklevel=3,
-        )
-    start = gtsam.Values(made.values)
-    start.update(task.variables.values(task.variables.start(solution)))
-    keys = {str(unknown): key for unknown, key in task.variables.keys.items()}
     return Refined(
         X=state.X,
         Y=state.Y,
         scale=scale_of(task.problem, state),
         scale_mode=task.problem.scale,
         time_offsets_s=state.offsets_s,
-        graph=made.graph,
-        values=optimum.values,
-        keys=keys | made.keys,
+        factor_graph=factor_graph,
         noise_source="estimated",
-        noise=noise_of_pairs(settled.model, sigma, task.data, degrees_of_freedom),
-        cost=optimum.cost,
-        initial_cost=made.graph.error(start),
-        iterations=optimum.iterations,
+        noise=noise_of_pairs(model, sigma, task.data, degrees_of_freedom),
+        cost=estimate.cost,
+        initial_cost=_cost_without_effects(task, model, sigma, variables.start(solution)),
+        iterations=iterations,
         moved=movements(solution, state.X, state.Y),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
@@ -331,6 +282,30 @@ def refined_of(
         options=options,
         joint=joint,
     )
+
+
+def _optimum(
+    task: Task, settled: Settled, sigma: dict[C, float], max_iterations: int
+) -> tuple[State, NoiseModel, Estimate, int]:
+    """The optimum of the unknowns and all effects together by Gauss and Newton's steps, and the number of these."""
+    state, model = settled.state, settled.model
+    estimate = model.evaluate(sigma)
+    for iteration in range(1, max_iterations + 1):
+        state = moved(state, task.variables, task.layout, model.basis @ estimate.step)
+        if estimate.farthest < LINEAR:
+            return state, model, estimate, iteration
+        model = task.model_like(model, state)
+        estimate = model.evaluate(sigma)
+    return state, model, estimate, max_iterations
+
+
+def _cost_without_effects(task: Task, model: NoiseModel, sigma: dict[C, float], state: State) -> float:
+    """The graph's cost at an estimate, with all effects at zero."""
+    at = linearized(task.data, task.variables, state)
+    residual = np.concatenate([at[item.pair].residual for item in task.data])[model.rows.instants.order]
+    whitened = np.einsum("nij,nj->ni", _Effects.of(model, sigma).root, residual)
+    priors = prior_terms(task.problem, task.variables, state, task.layout, model.basis)[2]
+    return 0.5 * float((whitened**2).sum()) + priors
 
 
 def noise_of_pairs(
@@ -347,27 +322,3 @@ def noise_of_pairs(
         result[item.pair] = PairNoise(rotation, translation, (degrees_of_freedom, degrees_of_freedom))
         first += item.count
     return result
-
-
-def disagreement(task: Task, settled: Settled, sigma: dict[C, float], state: State) -> float:
-    """The largest difference of an estimate from the linear model's optimum, in its standard deviations."""
-    estimate, basis = settled.model.evaluate(sigma), settled.model.basis
-    if not basis.shape[1]:
-        return 0.0
-    away = np.linalg.lstsq(basis, change_between(task, settled.state, state), rcond=None)[0] - estimate.step
-    return float(np.abs(away / np.sqrt(np.diagonal(estimate.covariance))).max())
-
-
-def change_between(task: Task, before: State, after: State) -> Array:
-    """The change (d,) of the unknowns that ``settling.moved`` makes of one estimate the other."""
-    change = np.zeros(len(task.layout.unit))
-    poses, moved = before.X | before.Y, after.X | after.Y
-    for unknown, place in task.layout.slots.items():
-        owner = unknown.owner
-        if unknown.kind is UnknownKind.FRAME:
-            change[place] = gtsam.Pose3.Logmap(poses[owner].between(moved[owner]))
-        elif unknown.kind is UnknownKind.SCALE:
-            change[place] = before.scales[unknown] * np.log(after.scales[unknown] / before.scales[unknown])
-        else:
-            change[place] = after.offsets_s[owner] - before.offsets_s[owner]
-    return change

@@ -35,6 +35,13 @@ class Estimate:
     step: Array
     #: (p, p)
     covariance: Array
+    #: Of all factors, at that change.
+    cost: float = 0.0
+
+    @property
+    def farthest(self) -> float:
+        """The longest step of a direction, in its standard deviations."""
+        return float(np.abs(self.step / np.sqrt(np.diagonal(self.covariance))).max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,8 @@ class NoiseModel:
     drift: DriftPrior | None
     #: (N, k): f, which measurements of one instant share.
     features: Array
+    #: The priors' cost before that change.
+    prior_cost: float = 0.0
 
     def evaluate(self, sigma: dict[C, float]) -> Estimate:
         """The restricted likelihood at standard deviations, with the estimate and its covariance."""
@@ -108,8 +117,13 @@ class NoiseModel:
         covariance, more = self._orders[len(precision)].inverse(precision)
         mean = -covariance @ b
         mean -= covariance @ (precision @ mean + b)  # what rounding has left
-        value = log_det + more + float(gram[-1, -1] + b @ mean)
-        estimate = Estimate(value, mean[q:], np.ascontiguousarray(covariance[q:, q:]))
+        squares = float(gram[-1, -1] + b @ mean)
+        estimate = Estimate(
+            log_det + more + squares,
+            mean[q:],
+            np.ascontiguousarray(covariance[q:, q:]),
+            0.5 * squares + self.prior_cost,
+        )
         return estimate, Eliminated(measured, drift, covariance, mean, systematic, f, ff)
 
 

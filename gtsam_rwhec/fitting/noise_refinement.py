@@ -171,22 +171,23 @@ def agreeing(
     known = set(found.state.X) | set(found.state.Y)
     pairs = [pair for pair in whole.pairs if known.issuperset(pair)]
     judged = whole.with_measurements({pair: whole.measurements(*pair) for pair in pairs})
-    variables = Variables.of(judged, tuple(task.variables.offsets))
-    data = [
-        replace(item, covariance=np.where(inliers[item.pair][:, None, None], 1.0, 1.0 / WEIGHTLESS) * item.covariance)
-        for item in data_of(judged, variables, how)
-    ]
-    everything = replace(task, problem=judged, data=data, variables=variables, instants=Instants.of(data))
-    walk = None if found.model.drift is None else found.model.drift.walk
-    sigma = found.fit.sizes.values(found.fit.logs)
-    is_systematic = found.model.features.shape[1] > 0
-    state = found.state
-    for _ in range(STEPS):
-        there = everything.model(state, found.model.side, walk, systematic=is_systematic)
-        optimum, eliminated = there.eliminated(sigma)
-        if (np.abs(optimum.step) < SETTLED * np.sqrt(np.diagonal(optimum.covariance))).all():
-            break
-        state = moved(state, variables, task.layout, there.basis @ optimum.step)
+    sigma, there, state, data = found.fit.sizes.values(found.fit.logs), found.model, found.state, task.data
+    if not all(inliers[pair].all() for pair in whole.pairs):
+        variables = Variables.of(judged, tuple(task.variables.offsets))
+        data = [
+            replace(
+                item, covariance=np.where(inliers[item.pair][:, None, None], 1.0, 1.0 / WEIGHTLESS) * item.covariance
+            )
+            for item in data_of(judged, variables, how)
+        ]
+        everything = replace(task, problem=judged, data=data, variables=variables, instants=Instants.of(data))
+        for _ in range(STEPS):
+            there = everything.model_like(found.model, state)
+            step = there.evaluate(sigma)
+            if step.farthest < SETTLED:
+                break
+            state = moved(state, variables, task.layout, there.basis @ step.step)
+    _, eliminated = there.eliminated(sigma)
     rows = there.rows
     left = eliminated.left(eliminated.measured.of.columns)
     keep = np.concatenate([inliers[item.pair] for item in data])[rows.instants.order]

@@ -14,9 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -110,12 +107,18 @@ class Instants:
 def standstills(A: Array, stamps: np.ndarray) -> np.ndarray:
     """The standstill (N,) of each instant: poses (N, 12) that stay within ``STILL`` of its first have one error."""
     order = np.lexsort((A[:, 0], stamps))
+    poses, later = A[order], np.diff(stamps[order]) > 0
+    begins = np.ones(len(A), dtype=bool)
+    end = 0
+    for i in np.flatnonzero(later & (np.abs(np.diff(poses, axis=0)) < STILL).all(axis=1)).tolist():
+        if i < end:
+            continue
+        end = i + 1
+        while end < len(A) and later[end - 1] and (np.abs(poses[end] - poses[i]) < STILL).all():
+            begins[end] = False
+            end += 1
     place = np.empty(len(A), dtype=np.int64)
-    count, first, last = -1, np.full(12, np.inf), -1
-    for i in order.tolist():
-        if stamps[i] == last or not (np.abs(A[i] - first) < STILL).all():
-            count, first = count + 1, A[i]
-        place[i], last = count, stamps[i]
+    place[order] = np.cumsum(begins) - 1
     return place
 
 
@@ -138,6 +141,10 @@ def stations(A: Array) -> np.ndarray:
             return alone
         if (neighbours > 0).mean() < FEWEST_REVISITED:
             continue
+        from scipy.sparse import coo_array  # here, since few motions need them
+        from scipy.sparse.csgraph import connected_components
+        from scipy.spatial import cKDTree
+
         tree = tree or cKDTree(poses)
         links = tree.query_pairs(APART * near, output_type="ndarray")
         graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(A), len(A)))
@@ -350,11 +357,9 @@ def summed(values: Array, places: np.ndarray, shape: tuple[int, ...]) -> Array:
 
 def prior_terms(
     problem: Problem, variables: Variables, state: State, layout: JointCovariance, basis: Array
-) -> tuple[Array, Array]:
-    """Information (p, p) and gradient (p,) of 2 kappa_0 theta^2 + |t - t_0|^2 / sigma_0^2 over two, by the basis."""
-    size = len(layout.unit)
-    if not problem.priors:
-        return np.zeros((basis.shape[1], basis.shape[1])), np.zeros(basis.shape[1])
+) -> tuple[Array, Array, float]:
+    """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis."""
+    size, cost = len(layout.unit), 0.0
     information, gradient = np.zeros((size, size)), np.zeros(size)
     for name, priors in problem.priors.items():
         unknown = Unknown(UnknownKind.FRAME, name)
@@ -369,9 +374,11 @@ def prior_terms(
                 rows = slice(place.start, place.start + 3)
                 information[rows, rows] += 2.0 * prior.kappa * J.T @ J
                 gradient[rows] += 2.0 * prior.kappa * J.T @ omega[0]
+                cost += prior.kappa * float(omega[0] @ omega[0])
             if prior.sigma is not None:
                 R, away = pose[:3, :3], pose[:3, 3] - prior.transform[:3, 3]
                 rows = slice(place.start + 3, place.stop)
                 information[rows, rows] += np.eye(3) / prior.sigma**2
                 gradient[rows] += R.T @ away / prior.sigma**2
-    return basis.T @ information @ basis, basis.T @ gradient
+                cost += 0.5 * float(away @ away) / prior.sigma**2
+    return basis.T @ information @ basis, basis.T @ gradient, cost

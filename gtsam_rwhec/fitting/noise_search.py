@@ -94,8 +94,13 @@ class Task:
         rows = self._rows(state)
         drift = None if walk is None else DriftPrior.of(rows, walk)
         features = rows.features(side) if systematic else np.zeros((len(rows.residual), 0))
-        information, gradient = prior_terms(self.problem, self.variables, state, self.layout, self.basis)
-        return NoiseModel(rows, side, self.basis, information, gradient, drift, features)
+        information, gradient, cost = prior_terms(self.problem, self.variables, state, self.layout, self.basis)
+        return NoiseModel(rows, side, self.basis, information, gradient, drift, features, cost)
+
+    def model_like(self, model: NoiseModel, state: State) -> NoiseModel:
+        """A model of the same kind about another estimate."""
+        walk = None if model.drift is None else model.drift.walk
+        return self.model(state, model.side, walk, systematic=model.features.shape[1] > 0)
 
     def _rows(self, state: State) -> Rows:
         """The rows at an estimate; those at the last ones are kept, since several models begin where one ended."""
@@ -136,10 +141,12 @@ class Task:
             fit = fitted(thinned(model), sizes, logs)
             logs = fit.logs
             whole = model.evaluate(sizes.values(logs))
-            state = moved(state, self.variables, self.layout, model.basis @ whole.step)
-            if (np.abs(whole.step) < SETTLED * np.sqrt(np.diagonal(whole.covariance))).all():
+            if whole.farthest < SETTLED:
                 break
-        return Settled(state, self.model(state, side, walk, systematic=systematic), fit)
+            state = moved(state, self.variables, self.layout, model.basis @ whole.step)
+        else:
+            model = self.model(state, side, walk, systematic=systematic)
+        return Settled(state, model, fit)
 
 
 def start_at(sizes: Sizes, near: Fitted | None) -> Array:

@@ -1,27 +1,38 @@
 """The factor graph of a refinement."""
 
 from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
-
 import gtsam
 import numpy as np
 from rwhec_factors.batch import robot_world_hand_eye_batch_factor
-from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
-from rwhec_factors.measurement import pose_robot_world_hand_eye_factor, robot_world_hand_eye_factor
-from rwhec_factors.priors import position_prior_factor, rotation_prior_factor, shifted_pose_prior_factor
-
+from rwhec_factors.edge_summary import EdgeSummary
+from rwhec_factors.edge_summary import edge_summary_factor
+from rwhec_factors.edge_summary import hand_eye_summary_factor
+from rwhec_factors.measurement import pose_robot_world_hand_eye_factor
+from rwhec_factors.measurement import robot_world_hand_eye_factor
+from rwhec_factors.priors import position_prior_factor
+from rwhec_factors.priors import rotation_prior_factor
+from rwhec_factors.priors import shifted_pose_prior_factor
 from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.fitting.fit_options import ResidualKind, Robust
-from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, PoseComponent, measurement_covariance
-from gtsam_rwhec.fitting.unknowns import Variables, carrier_key, rows_of, slots_of
-from gtsam_rwhec.geometry.poses import Array, to_pose3
+from gtsam_rwhec.fitting.fit_options import ResidualKind
+from gtsam_rwhec.fitting.fit_options import Robust
+from gtsam_rwhec.fitting.pair_data import FactorsByPair
+from gtsam_rwhec.fitting.pair_data import PairData
+from gtsam_rwhec.fitting.pair_data import PoseComponent
+from gtsam_rwhec.fitting.pair_data import measurement_covariance
+from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.unknowns import carrier_key
+from gtsam_rwhec.fitting.unknowns import rows_of
+from gtsam_rwhec.fitting.unknowns import slots_of
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import VarianceFactors
 from gtsam_rwhec.solver.full_form import edge_forms
 from gtsam_rwhec.solver.parts import Part
+from collections.abc import Mapping
 
 #: GTSAM's losses and their tuning constants, with 95 % efficiency for Gaussian noise in six dimensions. (GTSAM weighs a
 #: factor by the length of its whitened residual. Its defaults have 95 % in one dimension, and 40 to 93 % in six.)
@@ -31,6 +42,12 @@ LOSSES: dict[str, tuple[Any, float]] = {
     "tukey": (gtsam.noiseModel.mEstimator.Tukey, 6.356),
     "geman_mcclure": (gtsam.noiseModel.mEstimator.GemanMcClure, 4.846),
 }
+
+
+#: A step that lowers the cost by less than this is the last: what is left is far below a thousandth of a deviation.
+LAST_STEP = 1e-9
+#: Steps of variables that are held have this standard deviation (rad, m, s).
+HELD = 10.0
 
 
 @dataclass(frozen=True)
@@ -264,15 +281,40 @@ class Optimum:
     iterations: int
 
 
-def optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, max_iterations: int) -> Optimum:
-    """Levenberg-Marquardt's optimum, to the last digits: the start is nearly optimal, and steps are cheap."""
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, max_iterations: int, held: Mapping[int, int] | None = None
+) -> Optimum:
+    """The optimum, to the last digits, by Gauss and Newton's steps; by Levenberg and Marquardt's where these fail.
+
+    The start is nearly optimal, and a call of a factor in Python costs the most: GTSAM's optimisers call more often.
+    Variables of ``held``, key and dimension, take no longer steps than ``HELD`` allows: where directions are free.
+    """
+    start, cost = values, graph.error(values)
+    for iteration in range(1, max_iterations + 1):
+        linear = graph.linearize(values)
+        for key, size in (held or {}).items():
+            noise = gtsam.noiseModel.Isotropic.Sigma(size, HELD)
+            linear.add(gtsam.JacobianFactor(key, np.eye(size), np.zeros(size), noise))
+        try:
+            step = linear.optimize()
+        except RuntimeError:  # GTSAM's IndeterminantLinearSystemException
+            break
+        gain = cost - linear.error(step)
+        moved = values.retract(step)
+        after = graph.error(moved)
+        if not after <= cost * (1.0 + 1e-12) + 1e-12:
+            break
+        values, cost = moved, after
+        if gain < LAST_STEP:
+            return Optimum(values, cost, iteration)
+    else:
+        return Optimum(values, cost, max_iterations)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(1e-12)
     parameters.setAbsoluteErrorTol(1e-12)
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-    optimum = optimiser.optimize()
-    return Optimum(optimum, optimiser.error(), optimiser.iterations())
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
+    return Optimum(optimiser.optimize(), optimiser.error(), optimiser.iterations())
 
 
 def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, variables: Variables) -> Array:

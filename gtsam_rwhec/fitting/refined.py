@@ -30,6 +30,8 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.free_directions import FreeDirection
 from gtsam_rwhec.solver.solution import Solution
+from collections.abc import Callable
+from typing import NamedTuple
 
 #: A function that a free direction moves by no more than this, in units, is not moved: the rest is rounding.
 NOT_MOVED = 1e-9
@@ -246,15 +248,20 @@ class RefinedPoses:
         return self.joint.selector((unknown,))
 
 
+class FactorGraph(NamedTuple):
+    """A GTSAM graph, its values at the optimum, and its variables' keys by name."""
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    keys: dict[str, int]
+
+
 @dataclass(frozen=True, repr=False)
 class Refined(RefinedPoses):
     """A refined calibration, with everything that `RefinedPoses` has, and the graph."""
 
-    #: The graph and its values at the optimum, for further factors.
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    #: The variables' keys by name: frames, "scale" ("scale:NAME" with scale="per_target"), "time_offset:SENSOR".
-    keys: dict[str, int]
+    #: Makes the graph, once it is asked for.
+    factor_graph: Callable[[], FactorGraph]
     #: (N,) each. The inliers with robust="gnc"; else empty.
     inliers: dict[Pair, np.ndarray]
     #: The certified solution that was refined; with robust="gnc" it is the inliers' solution.
@@ -262,6 +269,21 @@ class Refined(RefinedPoses):
     options: RefineOptions
     #: What was found of the noise of A and B, in time and over the configuration; empty where only B's was estimated.
     noise_sentences: tuple[str, ...] = ()
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """All factors, to go on with."""
+        return self.factor_graph().graph
+
+    @property
+    def values(self) -> gtsam.Values:
+        """The graph's values at the optimum."""
+        return self.factor_graph().values
+
+    @property
+    def keys(self) -> dict[str, int]:
+        """The variables' keys by name: frames, "scale" or "scale:NAME", "time_offset:SENSOR", and effects of noise."""
+        return self.factor_graph().keys
 
     def __repr__(self) -> str:
         return (
