@@ -13,26 +13,31 @@ Exits with 1 if a bar is missed up to 40 %.
 """
 
 from __future__ import annotations
-
 import sys
 import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row
+from bars import benchmark_parser
+from bars import print_rows
 from dataset import utias_folder
 from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse
-
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import OutlierError, RwhecWarning
-from gtsam_rwhec.fitting.truncated_least_squares import NoiseScale, graduated
+from gtsam_rwhec.errors import OutlierError
+from gtsam_rwhec.errors import RwhecWarning
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, general, perturb
+from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.simulate import Simulation
+from gtsam_rwhec.simulate import frame_distance
+from gtsam_rwhec.simulate import general
+from gtsam_rwhec.simulate import perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.fitting.robust_solution import NoiseScale
+from gtsam_rwhec.fitting.robust_solution import robust_solution
 
 Kind = Literal["random", "structured", "one pair"]
 Masks = dict[tuple[str, str], NDArray[np.bool_]]
@@ -133,11 +138,11 @@ def measured(case: Case, share: float, seeds: int) -> Result:
             warnings.simplefilter("ignore", RwhecWarning)
             clean.append(squared_errors(simulation, rw.solve(selected(problem, good))))
             try:
-                found = graduated(problem, noise_scale=case.noise_scale)
+                found = robust_solution(problem, noise_scale=case.noise_scale)
             except OutlierError:
                 ours.append(np.full(2, np.inf))
                 continue
-        whole = not found.left_out
+        whole = {*problem.targets, *problem.sensors} == {*found.solution.X, *found.solution.Y}
         ours.append(squared_errors(simulation, found.solution) if whole else np.full(2, np.inf))
         kept += sum(int((found.inliers[pair] & ~mask).sum()) for pair, mask in good.items())
         lost += sum(int((~found.inliers[pair] & mask).sum()) for pair, mask in good.items())
@@ -203,7 +208,7 @@ def real_dataset(share: float = 0.3, seeds: int = 5) -> list[Row]:
     problem = rw.read_csv(utias_folder())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)
-        clean = graduated(problem, noise_scale="estimate")
+        clean = robust_solution(problem, noise_scale="estimate")
     kept, seconds = 0, []
     to_rest, to_clean, to_plain = [], [], []
     plain = rw.solve(problem)
@@ -218,9 +223,9 @@ def real_dataset(share: float = 0.3, seeds: int = 5) -> list[Row]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)
             start = time.perf_counter()
-            found = graduated(spoilt, noise_scale="estimate")
+            found = robust_solution(spoilt, noise_scale="estimate")
             seconds.append(time.perf_counter() - start)
-            rest = graduated(selected(spoilt, good), noise_scale="estimate")
+            rest = robust_solution(selected(spoilt, good), noise_scale="estimate")
         kept += sum(int((found.inliers[pair] & ~mask).sum()) for pair, mask in good.items())
         to_rest.append(distances(found.solution, rest.solution))
         to_clean.append(distances(found.solution, clean.solution))

@@ -36,7 +36,6 @@ from gtsam_rwhec.fitting.pose_models import linearized
 from gtsam_rwhec.fitting.refined import Movement
 from gtsam_rwhec.fitting.refined import PairNoise
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.truncated_least_squares import graduated
 from gtsam_rwhec.fitting.unknowns import State
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.fitting.unknowns import UnknownKind
@@ -55,6 +54,10 @@ from gtsam_rwhec.solver.solution import contradicted_by
 from gtsam_rwhec.solver.solve_options import check_against_knowledge
 from functools import partial
 from gtsam_rwhec.fitting.refined import FactorGraph
+from itertools import count
+from gtsam_rwhec.fitting.robust_solution import Inliers
+from gtsam_rwhec.fitting.robust_solution import robust_solution
+from gtsam_rwhec.fitting.robust_solution import until_inliers_stay
 
 #: The inliers are chosen again under the full noise at most this many times; two or three are usual.
 MAX_CHOICES = 10
@@ -79,7 +82,7 @@ def refine(
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
     everything = Variables.of(problem, sensors_with_offset(problem, options))
     data = data_of(problem, everything, options)
-    inliers: dict[Pair, np.ndarray] = {}
+    inliers: Inliers = {}
     factors: FactorsByPair = {}
     start, whole, judged = solution, problem, problem
     if options.robust == "gnc":
@@ -92,7 +95,7 @@ def refine(
                 rough = fit(problem, first, everything, guess, options, estimates, tell)
                 guess = everything.state(rough.optimum.values)
             judged = under_worst_axis(problem, data, everything, guess)
-        found = graduated(
+        found = robust_solution(
             judged,
             confidence=options.inlier_confidence,
             noise_scale="estimate" if estimates else "given",
@@ -153,7 +156,7 @@ def _variables(whole: Problem, problem: Problem, options: RefineOptions) -> Vari
     return Variables.of(problem, offsets)
 
 
-def _kept(problem: Problem, data: list[PairData], inliers: dict[Pair, np.ndarray]) -> list[PairData]:
+def _kept(problem: Problem, data: list[PairData], inliers: Inliers) -> list[PairData]:
     return [item.selected(inliers[item.pair]) if inliers else item for item in data if item.pair in problem.pairs]
 
 
@@ -161,11 +164,11 @@ def _chosen_under_full_noise(
     whole: Problem,
     data: list[PairData],
     start: Solution,
-    inliers: dict[Pair, np.ndarray],
+    inliers: Inliers,
     options: RefineOptions,
     estimates: bool,
     tell: Progress,
-) -> tuple[Solution, dict[Pair, np.ndarray], FactorsByPair]:
+) -> tuple[Solution, Inliers, FactorsByPair]:
     """The inliers chosen again under the full noise until they stay, their certified solution, and the noise found.
 
     A's noise is propagated here: to judge single measurements needs no variable for each carrier pose, of which a log
@@ -174,29 +177,36 @@ def _chosen_under_full_noise(
     single = replace(options, carrier_model="propagated")
     threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
     factors: FactorsByPair = {}
-    for choice in range(1, MAX_CHOICES + 1):
-        tell(f"choosing the inliers under the full noise, step {choice} of at most {MAX_CHOICES}")
-        problem = selected(whole, inliers)
+    steps = count(1)
+
+    def fitted(chosen: Inliers) -> tuple[Solution, SettledFit, Variables]:
+        nonlocal factors
+        tell(f"choosing the inliers under the full noise, step {next(steps)} of at most {MAX_CHOICES}")
+        problem = selected(whole, chosen)
+        solution = start if chosen is inliers else solve(problem)
         variables = _variables(whole, problem, options)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)  # the last fit has its own
-            model = GeodesicModel.of(_kept(problem, data, inliers), variables, single)
-            settled = fit(problem, model, variables, variables.start(start), single, estimates, tell, factors)
-            factors = settled.factors
-            state = variables.state(settled.optimum.values)
-            again = inliers_of(data, variables, state, settled.factors, threshold)
-            if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
-                break
-            inliers = again
-            start = solve(selected(whole, inliers))
-    return start, inliers, factors
+        model = GeodesicModel.of(_kept(problem, data, chosen), variables, single)
+        settled = fit(problem, model, variables, variables.start(solution), single, estimates, tell, factors)
+        factors = settled.factors
+        return solution, settled, variables
+
+    def judged(answer: tuple[Solution, SettledFit, Variables]) -> Inliers:
+        _, settled, variables = answer
+        return inliers_of(data, variables, variables.state(settled.optimum.values), settled.factors, threshold)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)  # the last fit has its own
+        (solution, _, _), chosen = until_inliers_stay(fitted, judged, inliers, MAX_CHOICES)
+    return solution, chosen, factors
 
 
 def _any_inliers(problem: Problem, options: RefineOptions, tell: Progress) -> Solution:
     """A start from the measurements that agree under isotropic noise, whatever its size."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)  # the inliers are chosen again under the full noise
-        return graduated(problem, confidence=options.inlier_confidence, noise_scale="estimate", progress=tell).solution
+        return robust_solution(
+            problem, confidence=options.inlier_confidence, noise_scale="estimate", progress=tell
+        ).solution
 
 
 def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit, options: RefineOptions) -> None:
@@ -318,7 +328,7 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
 
 def inliers_of(
     data: list[PairData], variables: Variables, state: State, factors: FactorsByPair, threshold: float
-) -> dict[Pair, np.ndarray]:
+) -> Inliers:
     """By pair, (N,) booleans: r' C^-1 r is within the threshold. False where the estimate lacks a frame."""
     known = set(state.X) | set(state.Y)
     present = [item for item in data if known.issuperset(item.pair)]

@@ -2,7 +2,7 @@
 
 A certificate on the way would say nothing about the answer, and where the gap is open it takes a search of its own:
 outliers open it often. So a fit is the lowest end of two or three descents, from the last fit and from starts that know
-nothing of it. What is kept at the end is solved and certified once (``graduated``).
+nothing of it. What is kept at the end is solved and certified once (``robust_solution``).
 
 With a scale for each target the certified form is C X'_j = Y'_k A (design fact 7). There the noise of a measured
 rotation acts on a lever arm, so at that form's optimum the physical residuals are larger than sigma says. Outliers are
@@ -14,27 +14,35 @@ by GTSAM, from the same moments.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
-
 import gtsam
 import numpy as np
 from rwhec_factors import se3
-
 from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.pose_graph import optimise
-from gtsam_rwhec.fitting.unknowns import State, Variables
-from gtsam_rwhec.geometry.poses import Array, to_pose3
+from gtsam_rwhec.fitting.unknowns import State
+from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
-from gtsam_rwhec.solver.answers import Answer, answer_of, rotations_as_variables, scales_of
+from gtsam_rwhec.problem.selection import AS_STATED
+from gtsam_rwhec.problem.selection import VarianceFactors
+from gtsam_rwhec.solver.answers import Answer
+from gtsam_rwhec.solver.answers import answer_of
+from gtsam_rwhec.solver.answers import rotations_as_variables
+from gtsam_rwhec.solver.answers import scales_of
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.search import MIRROR_COST, Search
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.search import MIRROR_COST
+from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.starts import mirrored, spectral_start, unconstrained_start
+from gtsam_rwhec.solver.starts import mirrored
+from gtsam_rwhec.solver.starts import spectral_start
+from gtsam_rwhec.solver.starts import unconstrained_start
 
 #: So many Newton steps lead from a start to its optimum; three to ten are usual.
 MAX_DESCENT_STEPS = 50

@@ -1,35 +1,63 @@
-"""The minimisation of truncated squares by re-weighted fits: graduation, trimming, settling and voting.
+"""Outlier rejection without a good start: graduated truncated least squares around the certified solver.
 
-``graduated`` has the equation and the reasons. Every stage has a bound on its number of fits, so that no measurements
-make it run for ever: trimming and settling may go round in circles, and graduation would need ever more steps the
-larger the residuals are.
+    minimise  sum_i min(d_i^2, c^2),    d_i^2 = kappa |R_A R_X - R_Y R_B|_F^2 + |alpha (...) - R_Y t_B|^2 / sigma^2
+
+(Yang, Antonante, Tzoumas, Carlone: Graduated non-convexity for robust spatial perception, 2020, Section III. At the
+truth d^2 has a chi-square distribution with 6 degrees of freedom; c^2 is a quantile of it.) For given weights the
+problem is again a calibration problem, whose optimum comes from moments of the re-weighted measurements and from starts
+that know nothing of the last one. So the scheme does not depend on a start: the scale of the fit to all measurements
+may be negative. Fits on the way are not certified; what is kept at the end is solved once, with its certificate.
+
+If the noise is unknown, d^2 has no unit at first. Least trimmed squares, which keep the better half of each pair, give
+the first noise; the inliers give the next. If more than half of the measurements are outliers, they decide this noise,
+and the estimate is wrong without a sign of it. Graduation is a heuristic: afterwards the measurements of each frame
+with outliers vote on its pose. At the end all measurements are judged anew, each by a test that keeps all N good ones
+with 95 % (``admission``): where there are no outliers, nothing is left out.
+
+Every stage has a bound on its number of fits, so that no measurements make it run for ever.
 """
 
 from __future__ import annotations
-
 import contextlib
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
-
 import numpy as np
-from scipy.special import chdtr, chdtri
-
-from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, ScaleError, UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.fitting.admission import inlier_threshold, judged
-from gtsam_rwhec.fitting.weighted_fit import Measured, Squares, WeightedFit, by_vote, weighted_fit
+from scipy.special import chdtr
+from scipy.special import chdtri
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import OutlierError
+from gtsam_rwhec.errors import OutliersWarning
+from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.fitting.admission import inlier_threshold
+from gtsam_rwhec.fitting.admission import judged
+from gtsam_rwhec.fitting.weighted_fit import Measured
+from gtsam_rwhec.fitting.weighted_fit import Squares
+from gtsam_rwhec.fitting.weighted_fit import WeightedFit
+from gtsam_rwhec.fitting.weighted_fit import by_vote
+from gtsam_rwhec.fitting.weighted_fit import weighted_fit
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors, reweighted, selected
+from gtsam_rwhec.problem.selection import AS_STATED
+from gtsam_rwhec.problem.selection import VarianceFactors
+from gtsam_rwhec.problem.selection import reweighted
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.certified_solution import solve
 from gtsam_rwhec.solver.solution import Solution
+from typing import TypeVar
+from gtsam_rwhec.fitting.admission import DOF
 
 NoiseScale = Literal["given", "estimate"]
+#: By pair, (N,) booleans: which measurements count.
+Inliers = dict[Pair, np.ndarray]
+Answer = TypeVar("Answer")
 
 #: Mu grows by this factor in an iteration (the paper's value).
 GRADUATION = 1.4
@@ -41,8 +69,6 @@ VOTED = 0.9
 QUIETEST = 1e-8
 #: A vote is accepted when it decreases the truncated cost by more than this part.
 PAYS = 1e-6
-#: A measurement has these degrees of freedom: three of rotation, three of translation.
-DOF = 6
 #: Graduation takes at most this many steps: where residuals are so large that it would need more, mu grows faster.
 MAX_GRADUATIONS = 40
 #: Trimming and settling take at most this many fits each; five to ten are usual.
@@ -57,34 +83,152 @@ SPARE = 6
 PULLED = 0.02
 #: An estimated variance factor is settled when a fit changes it by no more than this part.
 SETTLED = 1e-4
+#: A warning names a frame or pair when the share of its measurements that agree is below this.
+SUSPECT = 0.5
+#: No sensor has a larger standard deviation about an axis, rad. A larger estimate comes from outliers.
+GROSS_RAD = 0.35
+#: A warning names at most this many frames and pairs.
+NAMED = 5
 
 
 @dataclass(frozen=True)
-class Iteration:
-    """One re-weighted fit."""
+class RobustSolution:
+    """The certified solution of the measurements that agree, which these are, and factors of the noise as given."""
 
-    #: "trimming", "graduating", "settling" or "admitting".
-    stage: str
-    #: The graduation's parameter; nan where weights are 0 or 1.
-    mu: float
-    #: 1/2 sum min(d^2, c^2) of all measurements.
-    truncated_cost: float
-    #: Number of measurements with d^2 <= c^2.
-    inliers: int
+    solution: Solution
+    inliers: Inliers
+    variance_factors: VarianceFactors
+
+
+def until_inliers_stay(
+    fit: Callable[[Inliers], Answer], judge: Callable[[Answer], Inliers], first: Inliers, most: int
+) -> tuple[Answer, Inliers]:
+    """Fit the inliers and judge all measurements by the fit, in turns, until the choice stays the same.
+
+    At most so many fits are made; the inliers that are returned are those of the last one.
+    """
+    inliers = first
+    for number in range(1, most + 1):
+        answer = fit(inliers)
+        again = judge(answer) if number < most else inliers
+        if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
+            break
+        inliers = again
+    return answer, inliers
+
+
+@one_blas_thread()
+def robust_solution(
+    problem: Problem, *, confidence: float = 0.997, noise_scale: NoiseScale = "given", progress: Progress | None = None
+) -> RobustSolution:
+    """Reject outliers and calibrate from the inliers.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem that kept its raw measurements.
+    confidence : float
+        Probability that a good measurement is kept during graduation: c^2 is this quantile of chi-square with 6
+        degrees of freedom. At the end each of N is kept with this probability or 1 - 0.05 / N, whichever is larger.
+    noise_scale : "given" or "estimate"
+        Take sigma and kappa (or covariances) as given; or multiply them by variance factors, one for rotations and one
+        for translations, which are estimated from the inliers.
+    progress : callable, optional
+        Is called with each stage, its step, and the number of measurements that agree.
+
+    Raises
+    ------
+    MeasurementsNotKeptError
+        If the problem was made with ``keep_measurements=False``.
+    OutlierError
+        If too few measurements agree with each other for an answer, or give a scale that is not positive.
+
+    Warns
+    -----
+    OutliersWarning
+        If less than half of a frame's measurements agree, or less than half of all measurements (then sigma and kappa
+        may be too small). One bad tag among many does not stop the calibration: its own pose rests on the measurements
+        that agree, and the other poses do not use the rejected ones.
+    """
+    tell = progress or silent
+    work = TruncatedLeastSquares(problem, confidence, tell)
+    try:
+        _, keep = work.run(noise_scale)
+        tell("certifying the inliers' solution")
+        inliers = work.measured.by_pair(keep)
+        weights = {pair: mask.astype(np.float64) for pair, mask in inliers.items()}
+        solution = solve(reweighted(problem, weights, work.factors), progress=tell)
+    except ScaleError as error:
+        raise OutlierError(
+            f"the {problem.number_of_measurements} measurements have no answer with a positive scale in which most of "
+            f"them agree ({error}). Check that A and B are not exchanged or inverted, and the names of targets"
+        ) from error
+    except (UnderdeterminedError, CountError) as error:
+        raise OutlierError(
+            f"too few of the {problem.number_of_measurements} measurements agree for an answer ({error}). With "
+            f"confidence={confidence} a measurement agrees if it is within {np.sqrt(work.threshold):.3g} standard "
+            "deviations. If sigma and kappa may be too small, take noise='estimate'; else check that B = "
+            "T_sensor_target, that A and B are of the same instant, and the names of targets"
+        ) from error
+    for words in _doubts(work, inliers, noise_scale):
+        warnings.warn(words, OutliersWarning, stacklevel=3)
+    return RobustSolution(solution, inliers, work.factors)
+
+
+def _doubts(work: TruncatedLeastSquares, inliers: Inliers, noise_scale: NoiseScale) -> list[str]:
+    """What a warning says: too few measurements, or too few of them that agree, of all or of some frames and pairs."""
+    problem, said = work.problem, []
+    if not work.searches:
+        said.append(
+            f"{problem.number_of_measurements} measurements are too few to tell outliers from noise that is not known: "
+            "all of them count. Measure more, or give sigma and kappa (noise='given')"
+        )
+    counts = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
+    suspect = {name: (good, total) for name, (good, total) in counts.items() if good < SUSPECT * total}
+    named = [
+        f"{name} ({good} of {total}{'' if good else ': left out'})"
+        for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
+    ]
+    named += [
+        f"{pair} ({mask.sum()} of {len(mask)})"
+        for pair, mask in inliers.items()
+        if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
+    ]
+    kept, total = sum(int(mask.sum()) for mask in inliers.values()), sum(map(len, inliers.values()))
+    if kept < SUSPECT * total:
+        check = "check the frame convention, the stamps, and the names of targets"
+        if noise_scale == "given":
+            check = "if sigma and kappa may be too small, take noise='estimate'; else check the names of frames"
+        said.append(
+            f"only {kept} of {total} measurements agree to within {np.sqrt(work.threshold):.3g} standard deviations; "
+            f"{check}"
+        )
+    elif named:
+        more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
+        said.append(
+            f"less than half of the measurements agree with the answer for {', '.join(named[:NAMED])}{more}. Check "
+            "whether the frame has moved, or has another frame's name. The poses rest on the measurements that agree"
+        )
+    rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
+    if noise_scale == "estimate" and work.searches and rotation_rad > GROSS_RAD:
+        said.append(
+            f"the estimated noise, {np.degrees(rotation_rad):.0f} degrees an axis, is too large for a sensor: more "
+            "than half of the measurements may be outliers. Give sigma and kappa and take noise='given', which "
+            "withstands more outliers"
+        )
+    return said
 
 
 @dataclass
 class TruncatedLeastSquares:
-    """The stages of the minimisation and their common state: ``factors`` and ``history`` change on the way."""
+    """The stages of the minimisation and their common state: ``factors`` and ``threshold`` (c^2) change on the way."""
 
     problem: Problem
     confidence: float
     tell: Progress
     factors: VarianceFactors = AS_STATED
-    history: list[Iteration] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        #: c^2; it grows when inliers are admitted at the end.
         self.threshold = float(chdtri(DOF, 1.0 - self.confidence))
         #: Whether there are measurements enough to tell an outlier.
         self.searches = True
@@ -97,15 +241,16 @@ class TruncatedLeastSquares:
     def run(self, noise_scale: NoiseScale) -> tuple[WeightedFit, np.ndarray]:
         """The best answer and its inliers (N,)."""
         self.tell("rejecting outliers: the fit to all measurements")
-        everything = self.fit(np.ones(len(self.measured.A)), None)
+        everyone = np.ones(len(self.measured.A), dtype=bool)
+        everything = self.fit(everyone, None)
         self.searches = noise_scale == "given" or self.spare_equations >= SPARE
-        if not self.searches or self.is_clean(everything, noise_scale):
-            return everything, self.everyone
+        if not self.searches or self.is_clean(everything, everyone, noise_scale):
+            return everything, everyone
         if not everything.has_positive_scales and self.problem.scale == "per_target":
             everything = with_scales_of_targets_alone(self.problem, self.confidence, noise_scale, self.tell)
         if noise_scale == "given":
             fit, _ = self.best([lambda: self.graduate(everything)])
-            self.threshold = inlier_threshold(self.confidence, len(self.measured.A))
+            self.threshold = inlier_threshold(self.confidence, len(everyone))
             return self.settle(fit)
         halves = self.trim(everything)
         fit, _ = self.settle(halves, estimates=True)
@@ -113,37 +258,32 @@ class TruncatedLeastSquares:
         return self.admit(*self.settle(fit, estimates=True))
 
     @property
-    def everyone(self) -> np.ndarray:
-        """The mask (N,) of all measurements."""
-        return np.ones(len(self.measured.A), dtype=bool)
+    def free_frames(self) -> list[str]:
+        """Frames whose pose is not known."""
+        return [name for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed]
 
     @property
     def spare_equations(self) -> int:
         """Equations less unknowns when one measurement is left out."""
-        unknowns = sum(6 for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed)
-        if self.problem.scale == "shared":
-            unknowns += 1
-        elif self.problem.scale == "per_target":
-            owners = {pair.target for pair in self.problem.pairs}
-            unknowns += len(owners - self.problem.fixed_scales.keys())
-        return DOF * (len(self.measured.A) - 1) - unknowns
+        owners = {pair.target for pair in self.problem.pairs} - self.problem.fixed_scales.keys()
+        scales = {"known": 0, "shared": 1, "per_target": len(owners)}[self.problem.scale]
+        return DOF * (len(self.measured.A) - 1) - 6 * len(self.free_frames) - scales
 
-    def is_clean(self, everything: WeightedFit, noise_scale: NoiseScale) -> bool:
+    def is_clean(self, everything: WeightedFit, everyone: np.ndarray, noise_scale: NoiseScale) -> bool:
         """Whether the fit to all measurements shows no outlier, so that there is nothing to do.
 
         If the noise is not known, an outlier may hide in the fit that it has pulled, unless there are many measurements
         for each unknown: then it cannot pull.
         """
-        count = len(self.measured.A)
+        count = len(everyone)
         if noise_scale == "given":
             return bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
         unknowns = DOF * (count - 1) - self.spare_equations
         if unknowns > PULLED * DOF * count:
             return False
-        found = judged(self.problem, self.measured, everything, self.everyone, self.confidence, robust=True)
-        if not found.agrees.all():
+        if not judged(self.problem, self.measured, everything, everyone, self.confidence, robust=True).agrees.all():
             return False
-        self.factors = self._from_inliers(self.measured.squares(everything), self.everyone)
+        self.factors = self._from_inliers(self.measured.squares(everything), everyone)
         self.threshold = inlier_threshold(self.confidence, count)
         return True
 
@@ -156,15 +296,15 @@ class TruncatedLeastSquares:
         first = keep
         self.threshold = inlier_threshold(self.confidence, len(keep))
         for step in range(1, MAX_ADMISSIONS + 1):
-            found = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first).agrees
-            if (found == keep).all():
+            agrees = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first).agrees
+            if (agrees == keep).all():
                 break
             try:
-                fit = self.complete(self.fit(found.astype(np.float64), fit))
+                fit = self.complete(self.fit(agrees, fit))
             except (UnderdeterminedError, CountError):
                 break
-            keep = found
-            self.record("admitting", step, MAX_ADMISSIONS, np.nan, self.distances(fit))
+            keep = agrees
+            self.say("admitting", step, MAX_ADMISSIONS, self.distances(fit))
         self.factors = self._from_inliers(self.measured.squares(fit), keep)
         return fit, keep
 
@@ -190,9 +330,9 @@ class TruncatedLeastSquares:
             least = self.truncated(self.distances(fit))
             moved, saved = fit, 0.0
             inliers = self.measured.by_pair(keep)
-            for name in self.problem.targets + self.problem.sensors:
+            for name in self.free_frames:
                 good, total = inlier_count(name, inliers)
-                if good >= VOTED * total or name in self.problem.fixed:
+                if good >= VOTED * total:
                     continue
                 self.tell(f"rejecting outliers: the measurements of {name} vote, {good} of {total} agree")
                 moved, less = by_vote(name, self.measured, moved, self.factors, self.threshold)
@@ -209,14 +349,15 @@ class TruncatedLeastSquares:
 
     def complete(self, fit: WeightedFit) -> WeightedFit:
         """The fit with poses by vote for frames that lost all their measurements, so that they may come back."""
-        for name in self.problem.targets + self.problem.sensors:
-            if name not in fit.poses and name not in self.problem.fixed:
+        for name in self.free_frames:
+            if name not in fit.poses:
                 fit, _ = by_vote(name, self.measured, fit, self.factors, self.threshold)
         return fit
 
-    def fit(self, weights: Array, previous: WeightedFit | None) -> WeightedFit:
-        """The certified optimum of weighted measurements."""
-        return weighted_fit(reweighted(self.problem, self.measured.by_pair(weights), self.factors), previous)
+    def fit(self, weights: np.ndarray, previous: WeightedFit | None) -> WeightedFit:
+        """The optimum of weighted measurements."""
+        by_pair = self.measured.by_pair(weights.astype(np.float64))
+        return weighted_fit(reweighted(self.problem, by_pair, self.factors), previous)
 
     def distances(self, fit: WeightedFit) -> Array:
         """d^2 (N,)."""
@@ -226,10 +367,9 @@ class TruncatedLeastSquares:
         """sum min(d^2, c^2)."""
         return float(np.minimum(distances, self.threshold).sum())
 
-    def record(self, stage: str, step: int, most: int, mu: float, distances: Array) -> None:
-        """Add an iteration to the history, and tell it."""
+    def say(self, stage: str, step: int, most: int, distances: Array) -> None:
+        """Tell of a fit: its stage, its step, and how many measurements agree."""
         inliers = int((distances <= self.threshold).sum())
-        self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers))
         self.tell(f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree")
 
     def graduate(self, fit: WeightedFit) -> WeightedFit:
@@ -247,7 +387,7 @@ class TruncatedLeastSquares:
                 break
             fit = self.fit(w / w.max(), fit)  # all are small at first, and priors would dominate
             d = self.distances(fit)
-            self.record("graduating", step, MAX_GRADUATIONS, mu, d)
+            self.say("graduating", step, MAX_GRADUATIONS, d)
             mu *= growth
             if mu > LAST_MU * growth or not ((w > 0.0) & (w < 1.0)).any():
                 break
@@ -268,8 +408,8 @@ class TruncatedLeastSquares:
             if (half == keep).all():
                 break
             keep = half
-            fit = self.fit(keep.astype(np.float64), fit)
-            self.record("trimming", step, MAX_FITS, np.nan, self.distances(fit))
+            fit = self.fit(keep, fit)
+            self.say("trimming", step, MAX_FITS, self.distances(fit))
         return fit
 
     def settle(self, fit: WeightedFit, *, estimates: bool = False) -> tuple[WeightedFit, np.ndarray]:
@@ -288,36 +428,31 @@ class TruncatedLeastSquares:
             if (inliers == keep).all() and change < SETTLED:
                 break
             keep = inliers
-            fit = self.complete(self.fit(keep.astype(np.float64), fit))
-            self.record("settling", step, MAX_FITS, np.nan, self.distances(fit))
+            fit = self.complete(self.fit(keep, fit))
+            self.say("settling", step, MAX_FITS, self.distances(fit))
         return fit, keep
 
     def _from_median(self, squares: Squares) -> VarianceFactors:
         median = float(chdtri(DOF // 2, 0.5))
-        return self._factors(
-            float(np.median(squares.rotation)) / median, float(np.median(squares.translation)) / median
-        )
+        return self._factors(*(float(np.median(each)) / median for each in (squares.rotation, squares.translation)))
 
     def _from_inliers(self, squares: Squares, inliers: np.ndarray) -> VarianceFactors:
         """The inliers' mean squares over the share of its variance that a truncated chi-square keeps.
 
         E[chi^2_k; chi^2_k <= c^2] = k F_(k+2)(c^2), with the distribution function F.
         """
-        kept = float(chdtr(DOF + 2, self.threshold) / chdtr(DOF, self.threshold))
         number = int(inliers.sum())
-        unknowns = sum(6.0 for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed)
-        degrees_of_freedom = kept * max(3.0 * number - 0.5 * unknowns, 1.0)
         if number == 0:
             return self.factors
+        kept = float(chdtr(DOF + 2, self.threshold) / chdtr(DOF, self.threshold))
+        freedom = kept * max(3.0 * (number - len(self.free_frames)), 1.0)
         return self._factors(
-            float(squares.rotation[inliers].sum()) / degrees_of_freedom,
-            float(squares.translation[inliers].sum()) / degrees_of_freedom,
+            *(float(each[inliers].sum()) / freedom for each in (squares.rotation, squares.translation))
         )
 
     def _factors(self, rotation: float, translation: float) -> VarianceFactors:
-        return VarianceFactors(
-            max(rotation, self.smallest_factors.rotation), max(translation, self.smallest_factors.translation)
-        )
+        least = self.smallest_factors
+        return VarianceFactors(max(rotation, least.rotation), max(translation, least.translation))
 
 
 def with_scales_of_targets_alone(
@@ -355,168 +490,7 @@ def truncated_weights(d2: Array, mu: float, c2: float) -> Array:
     return np.clip(w, 0.0, 1.0)
 
 
-def inlier_count(name: str, inliers: dict[Pair, np.ndarray]) -> tuple[int, int]:
+def inlier_count(name: str, inliers: Inliers) -> tuple[int, int]:
     """The number of a frame's measurements that agree, and of all its measurements."""
     masks = [mask for pair, mask in inliers.items() if name in pair]
     return sum(int(mask.sum()) for mask in masks), sum(len(mask) for mask in masks)
-
-
-#: A warning names a frame or pair when the share of its measurements that agree is below this.
-SUSPECT = 0.5
-#: No sensor has a larger standard deviation about an axis, rad. A larger estimate comes from outliers.
-GROSS_RAD = 0.35
-#: A warning names at most this many frames and pairs.
-NAMED = 5
-
-
-@dataclass(frozen=True)
-class Graduated:
-    """A calibration from the measurements that agree with it."""
-
-    #: The certified solution of the inliers, under the variance factors.
-    solution: Solution
-    #: In the order of ``problem.measurements``.
-    inliers: dict[Pair, np.ndarray]
-    #: Factors of the noise as given; 1 unless estimated.
-    variance_factors: VarianceFactors
-    #: c^2 at the end, a quantile of chi-square: the largest squared residual of an inlier where noise is given.
-    threshold: float
-    #: 1/2 sum min(d^2, c^2).
-    truncated_cost: float
-    #: Frames of which no measurement agrees; the solution lacks them.
-    left_out: tuple[str, ...]
-    #: Frames of which less than half of the measurements agree: the number that agrees, and the number of all.
-    suspect: dict[str, tuple[int, int]]
-    #: The same for pairs of which neither frame is suspect as a whole.
-    suspect_pairs: dict[Pair, tuple[int, int]]
-    #: The re-weighted fits, of all starts together; empty where the first fit shows that there is no outlier.
-    history: tuple[Iteration, ...]
-    #: Whether outliers were looked for. With noise that is not known, a few measurements cannot tell them from noise:
-    #: then all count as inliers.
-    searched: bool = True
-
-
-@one_blas_thread()
-def graduated(
-    problem: Problem, *, confidence: float = 0.997, noise_scale: NoiseScale = "given", progress: Progress | None = None
-) -> Graduated:
-    """Reject outliers and calibrate from the inliers.
-
-    Parameters
-    ----------
-    problem : Problem
-        A problem that kept its raw measurements.
-    confidence : float
-        Probability that a good measurement is kept during graduation: c^2 is this quantile of chi-square with 6
-        degrees of freedom. At the end each of N is kept with this probability or 1 - 0.05 / N, whichever is larger.
-    noise_scale : "given" or "estimate"
-        Take sigma and kappa (or covariances) as given; or multiply them by variance factors, one for rotations and one
-        for translations, which are estimated from the inliers.
-    progress : callable, optional
-        Is called with each stage, its step, and the number of measurements that agree.
-
-    Raises
-    ------
-    MeasurementsNotKeptError
-        If the problem was made with ``keep_measurements=False``.
-    OutlierError
-        If too few measurements agree with each other for an answer, or give a scale that is not positive.
-
-    Warns
-    -----
-    OutliersWarning
-        If less than half of a frame's measurements agree, or less than half of all measurements (then sigma and kappa
-        may be too small). One bad tag among many does not stop the calibration: its own pose rests on the measurements
-        that agree, and the other poses do not use the rejected ones.
-    """
-    tell = progress or silent
-    work = TruncatedLeastSquares(problem, confidence, tell)
-    try:
-        fit, keep = work.run(noise_scale)
-        tell("certifying the inliers' solution")
-        weights = work.measured.by_pair(keep.astype(np.float64))
-        solution = solve(reweighted(problem, weights, work.factors), progress=tell)
-    except ScaleError as error:
-        raise OutlierError(
-            f"the {problem.number_of_measurements} measurements have no answer with a positive scale in which most of "
-            f"them agree ({error}). Check that A and B are not exchanged or inverted, and the names of targets"
-        ) from error
-    except (UnderdeterminedError, CountError) as error:
-        raise OutlierError(
-            f"too few of the {problem.number_of_measurements} measurements agree for an answer ({error}). With "
-            f"confidence={confidence} a measurement agrees if it is within {np.sqrt(work.threshold):.3g} standard "
-            "deviations. If sigma and kappa may be too small, take noise='estimate'; else check that B = "
-            "T_sensor_target, that A and B are of the same instant, and the names of targets"
-        ) from error
-    inliers = work.measured.by_pair(keep)
-    counts = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
-    left_out = tuple(name for name, (good, _) in counts.items() if good == 0)
-    suspect = {name: (good, total) for name, (good, total) in counts.items() if good < SUSPECT * total}
-    suspect_pairs = {
-        pair: (int(mask.sum()), len(mask))
-        for pair, mask in inliers.items()
-        if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
-    }
-    if not work.searches:
-        warnings.warn(
-            f"{problem.number_of_measurements} measurements are too few to tell outliers from noise that is not known: "
-            "all of them count. Measure more, or give sigma and kappa (noise='given')",
-            OutliersWarning,
-            stacklevel=2,
-        )
-    _warn(keep, suspect, suspect_pairs, left_out, work.threshold, noise_scale)
-    rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
-    if noise_scale == "estimate" and work.searches and rotation_rad > GROSS_RAD:
-        warnings.warn(
-            f"the estimated noise, {np.degrees(rotation_rad):.0f} degrees an axis, is too large for a sensor: more "
-            "than half of the measurements may be outliers. Give sigma and kappa and take noise='given', which "
-            "withstands more outliers",
-            OutliersWarning,
-            stacklevel=3,
-        )
-    return Graduated(
-        solution=solution,
-        inliers=inliers,
-        variance_factors=work.factors,
-        threshold=work.threshold,
-        truncated_cost=0.5 * work.truncated(work.distances(fit)),
-        left_out=left_out,
-        suspect=suspect,
-        suspect_pairs=suspect_pairs,
-        history=tuple(work.history),
-        searched=work.searches,
-    )
-
-
-def _warn(
-    keep: np.ndarray,
-    suspect: dict[str, tuple[int, int]],
-    suspect_pairs: dict[Pair, tuple[int, int]],
-    left_out: tuple[str, ...],
-    threshold: float,
-    noise_scale: NoiseScale,
-) -> None:
-    """Warn if less than half of the measurements agree: of all, or of some frames and pairs."""
-    named = [
-        f"{name} ({good} of {total}{': left out' if name in left_out else ''})"
-        for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
-    ]
-    named += [f"{pair} ({good} of {total})" for pair, (good, total) in suspect_pairs.items()]
-    if keep.sum() < SUSPECT * len(keep):
-        message = (
-            f"only {int(keep.sum())} of {len(keep)} measurements agree to within {np.sqrt(threshold):.3g} standard "
-            "deviations; "
-        )
-        if noise_scale == "given":
-            message += "if sigma and kappa may be too small, take noise='estimate'; else check the names of frames"
-        else:
-            message += "check the frame convention, the stamps, and the names of targets"
-    elif named:
-        more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
-        message = (
-            f"less than half of the measurements agree with the answer for {', '.join(named[:NAMED])}{more}. Check "
-            "whether the frame has moved, or has another frame's name. The poses rest on the measurements that agree"
-        )
-    else:
-        return
-    warnings.warn(message, OutliersWarning, stacklevel=4)
