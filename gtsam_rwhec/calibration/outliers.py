@@ -19,7 +19,7 @@ from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.truncated_least_squares import graduated
+from gtsam_rwhec.fitting.robust_solution import robust_solution
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -376,7 +376,7 @@ def _agreeing_under(
     has_more = problem.has_covariances or options.carrier_noise is not None or bool(offsets)
     if first is not None and has_more:
         return _inliers_under_the_full_noise(run, first, offsets, noise)
-    found = graduated(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=run.tell)
+    found = robust_solution(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=run.tell)
     return found.solution, found.inliers
 
 

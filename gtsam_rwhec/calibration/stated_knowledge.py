@@ -37,7 +37,7 @@ from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.truncated_least_squares import graduated
+from gtsam_rwhec.fitting.robust_solution import robust_solution
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS, Prior
 from gtsam_rwhec.problem.measurements import Pair
@@ -168,7 +168,7 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
 
     def answer(without: Problem) -> Refined | None:
         try:
-            agree = graduated(without, noise_scale="estimate").inliers if with_outliers else {}
+            agree = robust_solution(without, noise_scale="estimate").inliers if with_outliers else {}
             kept = selected(without, agree) if agree else without
             return estimated(without, solve(kept, options=options.solve), agree, options, silent)[0]
         except (RwhecError, np.linalg.LinAlgError):
