@@ -13,31 +13,26 @@ Exits with 1 if a bar is missed up to 40 %.
 """
 
 from __future__ import annotations
+
 import sys
 import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import OutlierError
-from gtsam_rwhec.errors import RwhecWarning
+from gtsam_rwhec.errors import OutlierError, RwhecWarning
+from gtsam_rwhec.fitting.robust_solution import NoiseScale, robust_solution
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import frame_distance
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
+from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, general, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
-from gtsam_rwhec.fitting.robust_solution import NoiseScale
-from gtsam_rwhec.fitting.robust_solution import robust_solution
 
 Kind = Literal["random", "structured", "one pair"]
 Masks = dict[tuple[str, str], NDArray[np.bool_]]

@@ -1,12 +1,15 @@
 """Fixtures that several tests share."""
 
 from __future__ import annotations
+
 import os
 from collections.abc import Iterator
 from pathlib import Path
+
 import cv2
 import pytest
 from places import REPOSITORY
+
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/detect/test_other_opencv.py brings OpenCV 4.

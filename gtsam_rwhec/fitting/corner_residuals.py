@@ -8,14 +8,15 @@ the carriers' velocity at the instant.
 """
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import replace
+
+from dataclasses import dataclass, replace
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_of
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives, pixels_of
 from gtsam_rwhec.geometry.poses import Array
 
 #: The shape of a board: s (a share), w_x and w_y (metres).

@@ -1,25 +1,24 @@
 """."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
+
 import gtsam
 import numpy as np
-from scipy.special import chdtri
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corner_model import Point
 from gtsam_rwhec.fitting.corner_noise import Noise
-from gtsam_rwhec.fitting.stated_intrinsics import Innovation
-from gtsam_rwhec.fitting.stated_intrinsics import held_by_prior
+from gtsam_rwhec.fitting.stated_intrinsics import Innovation, held_by_prior
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
+
 
 @dataclass(frozen=True, eq=False)
 class RefinedIntrinsics:

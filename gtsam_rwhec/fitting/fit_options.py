@@ -1,22 +1,18 @@
 """The options of a refinement, and the noise of carrier poses."""
 
 from __future__ import annotations
+
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal
-from typing import NamedTuple
-from typing import get_args
+from typing import Literal, NamedTuple, get_args
+
 import numpy as np
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import OptionError
+
+from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE
-from gtsam_rwhec.geometry.real_numbers import is_one_of
-from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.geometry.real_numbers import is_whole
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import ByPair
 

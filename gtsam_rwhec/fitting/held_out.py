@@ -6,26 +6,23 @@ to a tenth of a pixel, whatever is wrong with the arm: its residuals prove nothi
 """
 
 from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import gtsam
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.errors import CountError, OptionError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
-from gtsam_rwhec.fitting.corner_residuals import Stack
-from gtsam_rwhec.fitting.corner_residuals import stacks_of
+from gtsam_rwhec.fitting.corner_residuals import Stack, stacks_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import CornerOptions
-from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.observations import Views
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
+from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_whole

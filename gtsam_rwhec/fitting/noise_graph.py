@@ -11,43 +11,34 @@ With the effects eliminated the graph's information is that of ``NoiseModel`` at
 """
 
 from __future__ import annotations
+
 import warnings
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
+
 import gtsam
 import numpy as np
 from rwhec_factors.batch import robot_world_hand_eye_effects_factors
+
 from gtsam_rwhec.errors import NotConvergedWarning
-from gtsam_rwhec.fitting.drift import TRACK
-from gtsam_rwhec.fitting.drift import DriftPrior
-from gtsam_rwhec.fitting.drift import drift_columns
+from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_components import C
-from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
-from gtsam_rwhec.fitting.noise_search import Settled
-from gtsam_rwhec.fitting.noise_search import Task
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pair_data import square_root_information
-from gtsam_rwhec.fitting.pose_graph import add_fixed
-from gtsam_rwhec.fitting.pose_graph import add_priors
-from gtsam_rwhec.fitting.pose_graph import optimise
-from gtsam_rwhec.fitting.refined import PairNoise
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refinement_from_poses import movements
-from gtsam_rwhec.fitting.refinement_from_poses import scale_of
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.noise_likelihood import Estimate, NoiseModel
+from gtsam_rwhec.fitting.noise_rows import prior_terms
+from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
+from gtsam_rwhec.fitting.pair_data import PairData, square_root_information
+from gtsam_rwhec.fitting.pose_graph import add_fixed, add_priors, optimise
+from gtsam_rwhec.fitting.pose_models import linearized
+from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
+from gtsam_rwhec.fitting.refinement_from_poses import movements, scale_of
+from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
-from functools import cache
-from gtsam_rwhec.fitting.noise_likelihood import Estimate
-from gtsam_rwhec.fitting.noise_rows import prior_terms
-from gtsam_rwhec.fitting.noise_search import moved
-from gtsam_rwhec.fitting.pose_models import linearized
-from gtsam_rwhec.fitting.refined import FactorGraph
 
 #: A factor has at most about this many numbers of effects that belong to single instants: 10 instants of one track.
 COLUMNS = 70

@@ -1,16 +1,13 @@
 """What the data say of their noise, as a record that says so in words."""
 
 from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import Component
-from gtsam_rwhec.fitting.fit_options import DriftFrame
-from gtsam_rwhec.fitting.noise_components import CARRIER
-from gtsam_rwhec.fitting.noise_components import DRIFT
-from gtsam_rwhec.fitting.noise_components import SYSTEMATIC
+from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, Component, DriftFrame
+from gtsam_rwhec.fitting.noise_components import CARRIER, DRIFT, SYSTEMATIC
 
 C = Component
 #: A kind of noise is found where it raises twice the log likelihood by more than this, a parameter.

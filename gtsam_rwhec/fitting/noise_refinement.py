@@ -1,36 +1,28 @@
 """``refine_under_noise``: from the certified solution to the answer under the noise that the data have."""
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import replace
+
+from dataclasses import dataclass, replace
+
 import numpy as np
 from scipy.special import fdtri
+
 from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.component_posterior import FEWEST
 from gtsam_rwhec.fitting.drift import drift_columns
-from gtsam_rwhec.fitting.fit_options import NoiseOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.free_space import free_space_of
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_components import C
 from gtsam_rwhec.fitting.noise_graph import refined_of
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_rows import Instants
-from gtsam_rwhec.fitting.noise_search import SETTLED
-from gtsam_rwhec.fitting.noise_search import Settled
-from gtsam_rwhec.fitting.noise_search import Task
-from gtsam_rwhec.fitting.noise_search import moved
-from gtsam_rwhec.fitting.noise_summary import mixed
-from gtsam_rwhec.fitting.noise_summary import noise_in
-from gtsam_rwhec.fitting.noise_summary import settled
+from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
+from gtsam_rwhec.fitting.noise_summary import mixed, noise_in, settled
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.refinement_from_poses import check_inputs
-from gtsam_rwhec.fitting.refinement_from_poses import data_of
-from gtsam_rwhec.fitting.refinement_from_poses import sensors_with_offset
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
+from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem

@@ -1,40 +1,24 @@
 """A model of the noise settled: components and unknowns in turn, until both stay the same."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import field
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import get_args
+
 import gtsam
 import numpy as np
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.fitting.component_posterior import ENOUGH
-from gtsam_rwhec.fitting.component_posterior import Fitted
-from gtsam_rwhec.fitting.component_posterior import fitted
+
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.component_posterior import ENOUGH, Fitted, fitted
 from gtsam_rwhec.fitting.drift import DriftPrior
-from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.fitting.fit_options import Component
-from gtsam_rwhec.fitting.fit_options import Drift
-from gtsam_rwhec.fitting.fit_options import DriftFrame
-from gtsam_rwhec.fitting.fit_options import NoiseOptions
-from gtsam_rwhec.fitting.fit_options import Walk
+from gtsam_rwhec.fitting.fit_options import About, Component, Drift, DriftFrame, NoiseOptions, Walk
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.noise_components import CARRIER
-from gtsam_rwhec.fitting.noise_components import DRIFT
-from gtsam_rwhec.fitting.noise_components import SYSTEMATIC
-from gtsam_rwhec.fitting.noise_components import WHITE
-from gtsam_rwhec.fitting.noise_components import C
-from gtsam_rwhec.fitting.noise_components import Sizes
+from gtsam_rwhec.fitting.noise_components import CARRIER, DRIFT, SYSTEMATIC, WHITE, C, Sizes
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
-from gtsam_rwhec.fitting.noise_rows import Instants
-from gtsam_rwhec.fitting.noise_rows import Rows
-from gtsam_rwhec.fitting.noise_rows import prior_terms
+from gtsam_rwhec.fitting.noise_rows import Instants, Rows, prior_terms
 from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.unknowns import State, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.free_directions import FreeDirection

@@ -1,32 +1,30 @@
 """What cameras saw: corners of targets in pixels, with the carriers' pose of each image."""
 
 from __future__ import annotations
-from collections.abc import Callable
-from collections.abc import Mapping
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike
 from rwhec_factors import se3
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.unknown_intrinsics import Lens
-from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.cameras.unknown_intrinsics import Lens, estimated_intrinsics
+from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, OptionError, TargetError
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.pair_data import local_paths
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.geometry.poses import PosesLike
-from gtsam_rwhec.geometry.poses import as_transforms
-from gtsam_rwhec.geometry.poses import checked_rows
-from gtsam_rwhec.geometry.poses import one_transform
-from gtsam_rwhec.geometry.poses import rows_to_transforms
+from gtsam_rwhec.geometry.poses import (
+    Array,
+    PoseLike,
+    PosesLike,
+    as_transforms,
+    checked_rows,
+    one_transform,
+    rows_to_transforms,
+)
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.corners import check_in_image
 from gtsam_rwhec.problem.measurements import Pair

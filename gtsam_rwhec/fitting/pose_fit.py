@@ -1,27 +1,22 @@
 """Optimisation in rounds, where the weights depend on the answer or on the residuals, until the weights settle."""
 
 from __future__ import annotations
+
 import warnings
 from dataclasses import dataclass
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.errors import NotConvergedWarning
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.pair_data import FactorsByPair
-from gtsam_rwhec.fitting.pair_data import Group
-from gtsam_rwhec.fitting.pair_data import group_label
-from gtsam_rwhec.fitting.pair_data import largest_change
-from gtsam_rwhec.fitting.pose_graph import Optimum
-from gtsam_rwhec.fitting.pose_graph import information_of
-from gtsam_rwhec.fitting.pose_graph import optimise
-from gtsam_rwhec.fitting.pose_models import ChordalModel
-from gtsam_rwhec.fitting.pose_models import GeodesicModel
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.pair_data import FactorsByPair, Group, group_label, largest_change
+from gtsam_rwhec.fitting.pose_graph import Optimum, information_of, optimise
+from gtsam_rwhec.fitting.pose_models import ChordalModel, GeodesicModel
+from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import AS_STATED

@@ -1,38 +1,28 @@
 """The factor graph of a refinement."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
 import gtsam
 import numpy as np
 from rwhec_factors.batch import robot_world_hand_eye_batch_factor
-from rwhec_factors.edge_summary import EdgeSummary
-from rwhec_factors.edge_summary import edge_summary_factor
-from rwhec_factors.edge_summary import hand_eye_summary_factor
-from rwhec_factors.measurement import pose_robot_world_hand_eye_factor
-from rwhec_factors.measurement import robot_world_hand_eye_factor
-from rwhec_factors.priors import position_prior_factor
-from rwhec_factors.priors import rotation_prior_factor
-from rwhec_factors.priors import shifted_pose_prior_factor
+from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
+from rwhec_factors.measurement import pose_robot_world_hand_eye_factor, robot_world_hand_eye_factor
+from rwhec_factors.priors import position_prior_factor, rotation_prior_factor, shifted_pose_prior_factor
+
 from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.fitting.fit_options import ResidualKind
-from gtsam_rwhec.fitting.fit_options import Robust
-from gtsam_rwhec.fitting.pair_data import FactorsByPair
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pair_data import PoseComponent
-from gtsam_rwhec.fitting.pair_data import measurement_covariance
-from gtsam_rwhec.fitting.unknowns import Variables
-from gtsam_rwhec.fitting.unknowns import carrier_key
-from gtsam_rwhec.fitting.unknowns import rows_of
-from gtsam_rwhec.fitting.unknowns import slots_of
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import to_pose3
+from gtsam_rwhec.fitting.fit_options import ResidualKind, Robust
+from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, PoseComponent, measurement_covariance
+from gtsam_rwhec.fitting.unknowns import Variables, carrier_key, rows_of, slots_of
+from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import VarianceFactors
 from gtsam_rwhec.solver.full_form import edge_forms
 from gtsam_rwhec.solver.parts import Part
-from collections.abc import Mapping
 
 #: GTSAM's losses and their tuning constants, with 95 % efficiency for Gaussian noise in six dimensions. (GTSAM weighs a
 #: factor by the length of its whitened residual. Its defaults have 95 % in one dimension, and 40 to 93 % in six.)

@@ -1,46 +1,38 @@
 """Refinement with the geodesic residual: any covariance of B, noise in A, robust losses, time offsets."""
 
 from __future__ import annotations
+
 import warnings
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import gtsam
 import numpy as np
 from rwhec_factors.batch import Linearization
-from scipy.special import chdtr
-from scipy.special import chdtri
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import WeightsWarning
+from scipy.special import chdtr, chdtri
+
+from gtsam_rwhec.errors import NoiseError, WeightsWarning
 from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.admission import inlier_threshold
-from gtsam_rwhec.fitting.fit_options import NoiseGroups
-from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.fit_options import Robust
+from gtsam_rwhec.fitting.fit_options import NoiseGroups, RefineOptions, Robust
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.pair_data import COMPONENTS
-from gtsam_rwhec.fitting.pair_data import FactorsByPair
-from gtsam_rwhec.fitting.pair_data import Group
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pair_data import check_carriers
-from gtsam_rwhec.fitting.pair_data import group_of
-from gtsam_rwhec.fitting.pair_data import residual_covariance
-from gtsam_rwhec.fitting.pair_data import square_root_information
-from gtsam_rwhec.fitting.pose_graph import add_summary
-from gtsam_rwhec.fitting.pose_graph import information_of
-from gtsam_rwhec.fitting.pose_graph import summary_of
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Variables
-from gtsam_rwhec.fitting.unknowns import carrier_key
-from gtsam_rwhec.fitting.variance_components import SMALLEST
-from gtsam_rwhec.fitting.variance_components import VarianceComponents
-from gtsam_rwhec.fitting.variance_components import from_measurements
-from gtsam_rwhec.fitting.variance_components import from_moments
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import to_pose3
+from gtsam_rwhec.fitting.pair_data import (
+    COMPONENTS,
+    FactorsByPair,
+    Group,
+    PairData,
+    check_carriers,
+    group_of,
+    residual_covariance,
+    square_root_information,
+)
+from gtsam_rwhec.fitting.pose_graph import add_summary, information_of, summary_of
+from gtsam_rwhec.fitting.unknowns import State, Variables, carrier_key
+from gtsam_rwhec.fitting.variance_components import SMALLEST, VarianceComponents, from_measurements, from_moments
+from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.problem.selection import AS_STATED
-from gtsam_rwhec.problem.selection import VarianceFactors
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
 from gtsam_rwhec.solver.parts import Part
+
 
 @dataclass(frozen=True)
 class GeodesicModel:

@@ -1,37 +1,29 @@
 """The refined calibration: poses, covariances, noise, and the GTSAM graph."""
 
 from __future__ import annotations
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
+
 import gtsam
 import numpy as np
-from scipy.special import chdtri
-from scipy.special import fdtri
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import OptionError
+from scipy.special import chdtri, fdtri
+
+from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.reprojection_record import Intrinsics
-from gtsam_rwhec.fitting.reprojection_record import Reprojection
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.geometry.pose_covariances import error_of
-from gtsam_rwhec.geometry.pose_covariances import relative_jacobian
-from gtsam_rwhec.geometry.pose_covariances import standard_deviations
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.geometry.real_numbers import is_whole
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
+from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.free_directions import FreeDirection
 from gtsam_rwhec.solver.solution import Solution
-from collections.abc import Callable
-from typing import NamedTuple
 
 #: A function that a free direction moves by no more than this, in units, is not moved: the rest is rounding.
 NOT_MOVED = 1e-9

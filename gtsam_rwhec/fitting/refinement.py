@@ -1,36 +1,34 @@
 """``refine``: from poses, or on from there by the corners that a problem holds."""
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
+
 import gtsam
 import numpy as np
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+
+from gtsam_rwhec.errors import OptionError, RwhecWarning
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
-from gtsam_rwhec.fitting.corners_as_refined import as_refined
-from gtsam_rwhec.fitting.corners_as_refined import intrinsics_of
-from gtsam_rwhec.fitting.corners_as_refined import numbers_of
+from gtsam_rwhec.fitting.corners_as_refined import as_refined, intrinsics_of, numbers_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.fit_options import CornerOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.fit_options import CornerOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
-from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.observations import check_corners_can_hold
-from gtsam_rwhec.fitting.observations import check_corners_everywhere
-from gtsam_rwhec.fitting.observations import observations_of
+from gtsam_rwhec.fitting.observations import (
+    Observations,
+    check_corners_can_hold,
+    check_corners_everywhere,
+    observations_of,
+)
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs
 from gtsam_rwhec.fitting.refinement_from_poses import refine as refine_poses
-from gtsam_rwhec.fitting.reprojection_record import SIZE
-from gtsam_rwhec.fitting.reprojection_record import BoardShape
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.fitting.reprojection_record import SIZE, BoardShape
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory

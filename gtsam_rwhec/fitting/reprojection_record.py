@@ -1,10 +1,13 @@
 """What a refinement from corners found besides poses: intrinsics, boards, and errors in pixels; as files keep it."""
 
 from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Literal
+
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import rounded

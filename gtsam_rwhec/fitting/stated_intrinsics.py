@@ -9,14 +9,15 @@ deviations are so small that no number of corners tells anything of them.
 """
 
 from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
+
 import numpy as np
-from scipy.special import chdtrc
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.distortion import coefficient_jacobian
-from gtsam_rwhec.cameras.distortion import distorted
+from gtsam_rwhec.cameras.distortion import coefficient_jacobian, distorted
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.geometry.poses import Array
 

@@ -1,21 +1,25 @@
 """The stage that refines from corners: which model is chosen, and what is said."""
 
 from __future__ import annotations
+
 import sys
 from pathlib import Path
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
+from simulated_cells import Cell, cell
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.from_corners import MEASUREMENTS
-from gtsam_rwhec.calibration.from_corners import chosen_model
-from gtsam_rwhec.calibration.from_corners import corners_found
-from gtsam_rwhec.calibration.from_corners import growth_by_intrinsics
-from gtsam_rwhec.calibration.from_corners import in_words
-from gtsam_rwhec.calibration.from_corners import thinned
+from gtsam_rwhec.calibration.from_corners import (
+    MEASUREMENTS,
+    chosen_model,
+    corners_found,
+    growth_by_intrinsics,
+    in_words,
+    thinned,
+)
 from gtsam_rwhec.calibration.verdict import Ground
-from simulated_cells import Cell
-from simulated_cells import cell
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fitting"))
 

@@ -1,39 +1,41 @@
 """Outlier rejection around the certified solver, for every scale mode and noise, and any order of samples."""
 
 from __future__ import annotations
+
 import re
 import warnings
 from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from outlier_problems import Pair
-from outlier_problems import corrupted
+from outlier_problems import Pair, corrupted
+
 import gtsam_rwhec as rw
-import gtsam_rwhec.solver.search as search_module
-from gtsam_rwhec.errors import MeasurementsNotKeptError
-from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import OutlierError
-from gtsam_rwhec.errors import OutliersWarning
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate import general
-from gtsam_rwhec.simulate import perturb
-from gtsam_rwhec.simulate.simulated_noise import random_poses
 import gtsam_rwhec.fitting.robust_solution as robust_module
-from gtsam_rwhec.fitting.robust_solution import MAX_ADMISSIONS
-from gtsam_rwhec.fitting.robust_solution import MAX_FITS
-from gtsam_rwhec.fitting.robust_solution import MAX_GRADUATIONS
-from gtsam_rwhec.fitting.robust_solution import MAX_VOTES
-from gtsam_rwhec.fitting.robust_solution import RobustSolution
-from gtsam_rwhec.fitting.robust_solution import robust_solution
-from gtsam_rwhec.fitting.robust_solution import truncated_weights
+import gtsam_rwhec.solver.search as search_module
+from gtsam_rwhec.errors import (
+    MeasurementsNotKeptError,
+    NotUniqueWarning,
+    OptionError,
+    OutlierError,
+    OutliersWarning,
+    RwhecWarning,
+    ScaleError,
+)
+from gtsam_rwhec.fitting.robust_solution import (
+    MAX_ADMISSIONS,
+    MAX_FITS,
+    MAX_GRADUATIONS,
+    MAX_VOTES,
+    RobustSolution,
+    robust_solution,
+    truncated_weights,
+)
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)
 
