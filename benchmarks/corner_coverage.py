@@ -2,7 +2,7 @@
 
     python benchmarks/corner_coverage.py [--runs 2000] [--workers 2] [--kinds WORD ...] [--seed 0]
 
-Simulated cells (`tests/reprojection/simulated_cells.py`): two fixed cameras, a board of 7 x 5 corners on the hand, 30
+Simulated cells (`tests/fitting/simulated_cells.py`): two fixed cameras, a board of 7 x 5 corners on the hand, 30
 instants, corners with 0.1 pixels of noise. Intrinsics are known; or drawn from the prior of a calibration, or of
 nominal intrinsics; or unknown, and started by homographies. A is exact, or noisy by 1 mrad and 0.5 mm, which is
 estimated; or the board is warped too. Each run has its own cell. Shares have their 99 % intervals. The ratio is the

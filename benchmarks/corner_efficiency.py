@@ -2,7 +2,7 @@
 
     python benchmarks/corner_efficiency.py [--runs 2000] [--workers 1] [--only WORDS]
 
-Simulated cells (`tests/reprojection/simulated_cells.py`) of several geometries: the board near or far, few or many
+Simulated cells (`tests/fitting/simulated_cells.py`) of several geometries: the board near or far, few or many
 images, small or large tilts, A exact or noisy (1 mrad, 0.5 mm), intrinsics exact or drawn from a calibration's or the
 nominal prior. Errors e of each unknown are squared with the inverse of its block of the Cramer-Rao bound: e' C^-1 e / d
 is 1 in the mean where the estimate is efficient. C^-1 is the information at the truth under the true noise, with the

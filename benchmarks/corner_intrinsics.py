@@ -2,7 +2,7 @@
 
     python benchmarks/corner_intrinsics.py [--runs 200] [--workers 1] [--only WORDS]
 
-One fixed camera and a board on the hand (`tests/reprojection/simulated_cells.py`): 20 images, or few of them with small
+One fixed camera and a board on the hand (`tests/fitting/simulated_cells.py`): 20 images, or few of them with small
 tilts. Stated intrinsics are drawn from the nominal prior. Ours starts at them, and knows A, or estimates its noise (1
 mrad and 0.5 mm; or 30 mrad and 30 mm, of which nothing is to be had), with the nominal prior or with none ("unknown").
 OpenCV's has a pose of its own for each image, the same four coefficients, and the better of two starts.

@@ -2,7 +2,7 @@
 
     python benchmarks/corner_undetermined.py [--runs 60] [--workers 2] [--kinds WORD ...] [--seed 0]
 
-Simulated cells (`tests/reprojection/placements.py`): boards that face their camera almost straight, at one depth, or in
+Simulated cells (`tests/fitting/placements.py`): boards that face their camera almost straight, at one depth, or in
 a corner of the image only; stated intrinsics are drawn from the prior of a calibration, or of nominal ones. Parameters
 that the images do not tell must be named as held by the prior (or as doubted, with a prior that was widened), and
 ellipsoids must hold the truth. Boards that face

@@ -2,7 +2,7 @@
 
     python benchmarks/corner_wrong_intrinsics.py [--runs 400] [--workers 2] [--kinds WORD ...] [--seed 0]
 
-Simulated cells (`tests/reprojection/simulated_cells.py`): two fixed cameras, a board on the hand, corners with 0.1
+Simulated cells (`tests/fitting/simulated_cells.py`): two fixed cameras, a board on the hand, corners with 0.1
 pixels of noise. Strong geometry is a board of 7 x 5 corners, 1.5 m away, tilted by 20 degrees and more, in 30 images;
 weak geometry a board of 4 x 3 corners, 2 m away, tilted by 6 degrees, at the middle of 40 images. The stated centre
 is off by 0, 10 or 30 pixels in a random direction, the focal length by 0 or 2 % either way, or the lens's distortion

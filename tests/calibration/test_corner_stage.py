@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rwhec_factors import se3
-from simulated_cells import Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.from_corners import (
@@ -22,6 +21,7 @@ from gtsam_rwhec.calibration.from_corners import (
 from gtsam_rwhec.calibration.verdict import Ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fitting"))
+from simulated_cells import Cell, cell  # isort: skip
 
 
 def silent(_: str) -> None:
