@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
+from scipy.sparse import csr_array
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import UNIT
@@ -19,6 +20,8 @@ from gtsam_rwhec.solver.elimination import Elimination, Group
 
 #: So many numbers are worked on at once: 8 MB.
 AT_ONCE = 1_000_000
+#: So few numbers are summed one by one.
+FEW_NUMBERS = 4096
 #: The same where frames have the same neighbours: what stays in the processor's cache.
 ALIKE_AT_ONCE = 100_000
 
@@ -42,8 +45,7 @@ class BlockMatrix:
     @property
     def diagonal(self) -> Array:
         """(n m + q,)."""
-        result: Array = np.r_[np.einsum("nii->ni", self.frames).ravel(), np.diagonal(self.tail)]
-        return result
+        return np.append(np.einsum("nii->ni", self.frames), np.diagonal(self.tail))
 
     @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
@@ -313,18 +315,14 @@ def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.
     Rows may be named more than once.
     """
     k = len(index)
-    if k == 0 or values.size == 0:
+    if values.size <= FEW_NUMBERS:
+        np.add.at(result, index, factor * values if factor != 1.0 else values)
         return
     order = np.argsort(index, kind="stable")
     sorted_index = index[order]
-    begin = np.flatnonzero(np.r_[True, sorted_index[1:] != sorted_index[:-1]])
+    begin = np.flatnonzero(np.append(True, sorted_index[1:] != sorted_index[:-1]))
     rows = sorted_index[begin]
-    if len(rows) == k:
-        result[index] += factor * values if factor != 1.0 else values
-        return
-    from scipy.sparse import csr_array  # slow to import
-
-    sums = csr_array((np.full(k, factor), order, np.r_[begin, k]), shape=(len(rows), k)) @ values.reshape(k, -1)
+    sums = csr_array((np.full(k, factor), order, np.append(begin, k)), shape=(len(rows), k)) @ values.reshape(k, -1)
     result[rows] += sums.reshape(len(rows), *values.shape[1:])
 
 
@@ -336,8 +334,7 @@ def cholesky_allowance(matrix: BlockMatrix, diagonal: Array) -> Array:
     """A bound on the rounding in the factorisation of a matrix with this graph and diagonal, as a diagonal matrix."""
     _, m, q = matrix.tails.shape
     of_frames, of_tail = matrix.order.spread(m, q)
-    allowance: Array = np.r_[np.repeat(of_frames, m), np.full(q, of_tail)] * np.abs(diagonal) + _TINY
-    return allowance
+    return np.append(np.repeat(of_frames, m), np.full(q, of_tail)) * np.abs(diagonal) + _TINY
 
 
 def proof_that_it_exceeds(matrix: BlockMatrix, margin: Array | float = 0.0) -> BlockFactor | None:

@@ -128,8 +128,11 @@ def loss_along(nulls: NullVectors, root: float, of_nulls: Array, width: Array) -
     return loss * (1.0 + 1e-9)
 
 
-def root_of_loss(room: Room, h: Array, h_error: Array, held: np.ndarray) -> float:
-    """The root of an upper bound on -min 2 h'z + z'Z z, over z whose ``held`` entries are zero."""
+def root_of_loss(room: Room, h: Array, h_error: Array, held: np.ndarray) -> tuple[float, float]:
+    """The root of an upper bound on -min 2 h'z + z'Z z, over z whose ``held`` entries are zero.
+
+    With the error of h, and without.
+    """
     h, h_error = h.copy(), h_error.copy()
     h[held], h_error[held] = 0.0, 0.0
     v = room.solved(h, held)
@@ -140,8 +143,8 @@ def root_of_loss(room: Room, h: Array, h_error: Array, held: np.ndarray) -> floa
     taken += float(error @ np.abs(v))
     rho = np.abs(rest) * (1.0 + 4.0 * UNIT) + error
     square = max(taken, 0.0) + float((rho**2 / room.margin).sum())
-    root = np.sqrt(square) + np.sqrt(float((h_error**2 / room.margin).sum()))
-    return float(root) * (1.0 + 1e-9)
+    root, of_error = np.sqrt(square), np.sqrt(float((h_error**2 / room.margin).sum()))
+    return float(root + of_error) * (1.0 + 1e-9), float(root) * (1.0 + 1e-9)
 
 
 #: Each entry of R'R - I of an answer in floating point, and of what the other constraints ask, is at most this.
@@ -248,9 +251,8 @@ class _Lagrangian:
         room = self._room(self.Z)
         if room is None:
             return None
-        none = NullVectors.none(self.Z.size)
-        lower = self._lower(none, room, None)
-        return Bound(lower, self._value(none, room, None), True, True, float(room.margin.min()), None, None)
+        lower, value = self._lower(NullVectors.none(self.Z.size), room, None)
+        return Bound(lower, value, True, True, float(room.margin.min()), None, None)
 
     def _definite_but_for_the_point(self) -> Bound | None:
         """The better of two bounds: from the multipliers, and from those that make the gradient vanish along x."""
@@ -263,10 +265,8 @@ class _Lagrangian:
             room = None if of_each is None else each._room(each.Z.with_held(of_each.held))
             if of_each is None or room is None:
                 continue
-            lower = each._lower(of_each, room, None)
-            bounds.append(
-                Bound(lower, each._value(of_each, room, None), True, True, float(room.margin.min()), None, None)
-            )
+            lower, value = each._lower(of_each, room, None)
+            bounds.append(Bound(lower, value, True, True, float(room.margin.min()), None, None))
             if self.value - lower <= NEGLIGIBLE * abs(self.value):
                 break
         return max(bounds, key=lambda bound: bound.lower_bound, default=None)
@@ -290,8 +290,7 @@ class _Lagrangian:
             room = better._room(better.Z.with_held(nulls.held))
             if room is None:
                 continue
-            lower, region = better._over_region(nulls, room, enough)
-            value = better._value(nulls, room, region)
+            lower, value, region = better._over_region(nulls, room, enough)
             step = self._step_along(nulls, enough)
             bounds.append(Bound(lower, value, False, True, -float(room.margin.min()), None, region, step))
             if self.value - lower <= OPEN * abs(self.value) + enough:
@@ -337,7 +336,7 @@ class _Lagrangian:
                 room = relaxed._room(relaxed.Z.with_held(nulls.held))
         if room is None:
             return None
-        lower, region = relaxed._over_region(nulls, room, enough)
+        lower, _, region = relaxed._over_region(nulls, room, enough)
         return Bound(lower, self.value, False, False, -slack, direction, region)
 
     def _with(self, multipliers: Array) -> _Lagrangian:
@@ -350,40 +349,32 @@ class _Lagrangian:
         """A margin by which Z is proven to be definite; None where it is not proven."""
         return Room.largest(Z, np.abs(self.form.curvature.diagonal), self.value)
 
-    def _over_region(self, nulls: NullVectors, room: Room, enough: float) -> tuple[float, Region | None]:
-        """The bound over the largest region that costs little, or over all of space where no region is needed."""
+    def _over_region(self, nulls: NullVectors, room: Room, enough: float) -> tuple[float, float, Region | None]:
+        """`_lower` over the largest region that costs little, or over all of space where no region is needed."""
         if self.Z.is_rotation[nulls.held].all():
-            return self._lower(nulls, room, None), None
+            return *self._lower(nulls, room, None), None
         smallest = smallest_region(self.form.part, self.evaluation.point, self.contains)
         best = self._lower(nulls, room, smallest)
         for times in LARGER:
             region = smallest.larger(times)
-            lower = self._lower(nulls, room, region)
-            if best - lower <= enough:
-                return lower, region
-        return best, smallest
+            larger = self._lower(nulls, room, region)
+            if best[0] - larger[0] <= enough:
+                return *larger, region
+        return *best, smallest
 
-    def _lower(self, nulls: NullVectors, room: Room, region: Region | None) -> float:
-        """The lower bound, rounded down."""
-        lower = self._value_less_loss(nulls, room, region)
+    def _lower(self, nulls: NullVectors, room: Room, region: Region | None) -> tuple[float, float]:
+        """The lower bound, rounded down; and the same without any allowance for rounding: that of exact arithmetic."""
+        width = half_widths(self.form.part, self.evaluation.point, region or Region(0.0, 0.0))[nulls.held]
+        roots = np.array(root_of_loss(room, self.g, self.g_error, nulls.held))
+        each = [root_of_loss(room, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held) for k in range(len(nulls.held))]
+        of_nulls = np.array(each).reshape(-1, 2).T
+        loss = [
+            root * root + loss_along(own, root, of_own, width)
+            for root, of_own, own in zip(roots, of_nulls, (nulls, nulls.without_errors()), strict=True)
+        ]
+        lower, value = self.value - np.array([self.value_error, 0.0]) - np.array(loss) * (1.0 + 1e-9)
         lower = max(lower - self._slack_by_multipliers(), self._less_rounding_of_rotations(lower))
-        return float(np.nextafter(lower, -np.inf))
-
-    def _value_less_loss(self, nulls: NullVectors, room: Room, region: Region | None) -> float:
-        """The smallest value of L, less the errors of what it is made of."""
-        point = self.evaluation.point
-        width = half_widths(self.form.part, point, region or Region(0.0, 0.0))[nulls.held]
-        root = root_of_loss(room, self.g, self.g_error, nulls.held)
-        of_nulls = np.array(
-            [root_of_loss(room, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held) for k in range(len(width))]
-        )
-        loss = root * root + loss_along(nulls, root, of_nulls, width)
-        return self.value - self.value_error - loss * (1.0 + 1e-9)
-
-    def _value(self, nulls: NullVectors, room: Room, region: Region | None) -> float:
-        """The bound without any allowance for rounding: an estimate of what exact arithmetic gives."""
-        exact = replace(self, value_error=0.0, g_error=np.zeros_like(self.g))
-        return exact._value_less_loss(nulls.without_errors(), room, region)
+        return float(np.nextafter(lower, -np.inf)), float(value)
 
     def _step_along(self, nulls: NullVectors, enough: float) -> Array | None:
         """The step along free translations and scales to the lowest value, where the cost surely rises along them.

@@ -19,10 +19,9 @@ from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_d
 from gtsam_rwhec.solver.information import (
     IS_ROTATION,
     PairInformation,
-    information,
-    order_of,
+    PartInformation,
+    by_parameters,
     pair_information,
-    prior_information,
 )
 from gtsam_rwhec.solver.noise_bounds import (
     PairNoise,
@@ -304,10 +303,11 @@ def identify_with_basis(
     """
     pairs = pair_information(part, poses)
     in_target, in_sensor, singular_values = common_axes(part)
-    factors = variance_factors(part, pairs, J_t, J_R)
+    told = PartInformation.of(part, pairs, order)
+    factors = variance_factors(part, told, J_t, J_R)
     noise = pair_noise(part, poses, pairs, factors, in_target, in_sensor)
     alone = PairsAlone.of(part, pairs, noise, singular_values, J_R)
-    weak = _weakest_of_part(part, pairs, noise, order or order_of(part))
+    weak = _weakest_of_part(part, told, noise)
     basis = sparse_basis(weak.directions[:, weak.free], alone.length)
     free = free_directions_of(part.free, basis, alone.length, alone.reasons_of_frames() if basis.shape[1] else {})
     known = Identifiability(
@@ -321,7 +321,7 @@ def identify_with_basis(
     return known, basis
 
 
-def _weakest_of_part(part: Part, pairs: PairInformation, noise: PairNoise, order: Elimination) -> Weak:
+def _weakest_of_part(part: Part, told: PartInformation, noise: PairNoise) -> Weak:
     """Test rotations; then, if all are determined, the rest at those rotations, and else everything together."""
     n, count = len(part.free), part.moments.count
     is_free = part.ends < n
@@ -329,30 +329,15 @@ def _weakest_of_part(part: Part, pairs: PairInformation, noise: PairNoise, order
     of_each = 2.0 * count / np.maximum(is_free.sum(axis=1), 1)
     sums = [np.bincount(part.ends[has, side], of_each[has], minlength=n) for side, has in enumerate(is_free.T)]
     ends = np.append(sums[0] + sums[1], float(part.number_of_measurements))
-    rotation_prior, translation_prior = prior_information(part)
-    rotations = pairs.used & IS_ROTATION
-    turning = information(part, order, [pairs.rotation], noise.rotation, rotations, rotation_prior)
-    spare = float(noise.spare.min())
-    tests = [weakest(turning, ends, spare, few=noise.few)]
-    del turning
+    of_rotations, of_translations = (by_parameters(part, each) for each in (noise.rotation, noise.translation))
+    spare, few, turns = float(noise.spare.min()), noise.few, told.used & told.is_rotation
+    tests = [weakest(told.rotation, of_rotations, turns, ends, spare, few=few)]
     if tests[0].free.any():
-        everything = information(
-            part,
-            order,
-            [pairs.rotation, pairs.translation],
-            noise.rotation + noise.translation,
-            pairs.used,
-            rotation_prior + translation_prior,
-        )
-        tests = [weakest(everything, ends, min(spare, noise.spare_translation), few=noise.few)]
+        of_all = of_rotations + of_translations
+        spare = min(spare, noise.spare_translation)
+        tests = [weakest(told.together, of_all, told.used, ends, spare, few=few)]
     else:
-        rest = pairs.used & ~IS_ROTATION
-        moving = information(part, order, [pairs.translation], noise.translation, rest, translation_prior)
-        tests.append(weakest(moving, ends, _spare_of_rest(part, noise), few=noise.few))
+        # Only A's noise, where sizes are known, tells of what is not a rotation.
+        spare = spare if part.scale == "known" else min(spare, noise.spare_translation)
+        tests.append(weakest(told.translation, of_translations, told.used & ~turns, ends, spare, few=few))
     return min(tests, key=lambda test: test.ratio)
-
-
-def _spare_of_rest(part: Part, noise: PairNoise) -> float:
-    """The equations to spare that tell the noise of what is not a rotation: only A's noise, where sizes are known."""
-    of_carrier = float(noise.spare.min())
-    return of_carrier if part.scale == "known" else min(of_carrier, noise.spare_translation)

@@ -12,7 +12,7 @@ c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carri
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,9 @@ OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7
 #: The information of so many pairs is made at once: some megabytes.
 PAIRS_AT_ONCE = 512
 
+BLOCKS = "frames", "couplings", "tails", "tail"
+#: The parameters of the target and of the sensor.
+SIDES = slice(0, 7), slice(7, 14)
 #: Which of them are rotations.
 IS_ROTATION = np.isin(np.arange(15), (0, 1, 2, 7, 8, 9))
 
@@ -152,18 +155,6 @@ def pair_information(part: Part, poses: PairPoses) -> PairInformation:
     )
 
 
-@dataclass(frozen=True)
-class Information:
-    """The information of all frames, seven parameters each, and of the logarithm of the shared scale, the tail.
-
-    ``noise`` and ``used`` have one entry for each parameter, (7 n + 1,).
-    """
-
-    matrix: BlockMatrix
-    noise: Array
-    used: np.ndarray
-
-
 def order_of(part: Part) -> Elimination:
     """In which order the frames of a part are eliminated: the couplings are its pairs of two free frames."""
     ends = np.sort(part.ends[_coupled(part)], axis=1)
@@ -177,47 +168,42 @@ def _coupled(part: Part) -> np.ndarray:
 
 
 def information(
-    part: Part,
-    order: Elimination,
-    by_pairs: Sequence[Callable[[slice], Array]],
-    noise: Array,
-    used: np.ndarray,
-    priors: Array,
-) -> Information:
-    """Add up pairs' information and noise (E, 15), and the priors' (n, 7) diagonal, along the graph.
+    part: Part, order: Elimination, of_pairs: Callable[[slice], Array], priors: Array | None = None
+) -> BlockMatrix:
+    """The information of all frames, seven parameters each, and of the logarithm of the shared scale, the tail.
 
-    ``by_pairs`` give the information of some pairs (k, 15, 15), as `PairInformation` does; it is summed.
+    ``of_pairs`` gives that of some pairs (k, 15, 15), as `PairInformation` does; ``priors`` (n, 7) is a diagonal.
     """
     n, E = len(part.free), len(part.pairs)
     coupled = _coupled(part)
     place = np.cumsum(coupled) - 1
     frames, tails, tail = np.zeros((n, 7, 7)), np.zeros((n, 7, 1)), np.zeros((1, 1))
-    frame_noise, frame_used = np.zeros((n, 7)), np.zeros((n, 7))
     couplings = np.zeros((int(coupled.sum()), 7, 7))
-    sides = slice(0, 7), slice(7, 14)
     for begin in range(0, E, PAIRS_AT_ONCE):
         at = slice(begin, begin + PAIRS_AT_ONCE)
-        by_pair = by_pairs[0](at)
-        for more in by_pairs[1:]:
-            by_pair = by_pair + more(at)
-        ends = part.ends[at]
-        for side, of in enumerate(sides):
-            has = np.flatnonzero(ends[:, side] < n)
-            index = ends[has, side]
-            sum_into(frames, index, by_pair[has, of, of])
-            sum_into(tails, index, by_pair[has, of, 14:])
-            sum_into(frame_noise, index, noise[at][has, of])
-            sum_into(frame_used, index, used[at][has, of].astype(float))
-        tail += by_pair[:, 14, 14].sum()
-        both = np.flatnonzero(coupled[at])
-        blocks = by_pair[both, :7, 7:14]
+        of_each, ends = of_pairs(at), part.ends[at]
+        for index, own in zip(ends.T, SIDES, strict=True):
+            has = index < n
+            sum_into(frames, index[has], of_each[has, own, own])
+            sum_into(tails, index[has], of_each[has, own, 14:])
+        tail += of_each[:, 14, 14].sum()
+        both = coupled[at]
+        blocks = of_each[both, :7, 7:14]
         swapped = ends[both, 0] > ends[both, 1]
         blocks[swapped] = blocks[swapped].transpose(0, 2, 1)
         couplings[place[at][both]] = blocks
-    np.einsum("nii->ni", frames)[...] += priors
-    matrix = BlockMatrix(order, frames, couplings, tails, tail)
-    all_noise = np.r_[frame_noise.ravel(), noise[:, 14].sum()]
-    return Information(matrix, all_noise, np.r_[frame_used.ravel() > 0.0, used[:, 14].any()])
+    if priors is not None:
+        np.einsum("nii->ni", frames)[...] += priors
+    return BlockMatrix(order, frames, couplings, tails, tail)
+
+
+def by_parameters(part: Part, of_pairs: Array) -> Array:
+    """Sum numbers of the pairs' parameters (E, 15) over the pairs: (7 n + 1,)."""
+    n = len(part.free)
+    frames = np.zeros((n + len(part.fixed), 7))
+    for index, own in zip(part.ends.T, SIDES, strict=True):
+        np.add.at(frames, index, of_pairs[:, own])
+    return np.append(frames[:n], of_pairs[:, 14].sum())
 
 
 def prior_information(part: Part) -> tuple[Array, Array]:
@@ -230,3 +216,34 @@ def prior_information(part: Part) -> tuple[Array, Array]:
             if prior.sigma is not None:
                 translation[i, 3:6] += 1.0 / prior.sigma**2
     return rotation, translation
+
+
+@dataclass(frozen=True)
+class PartInformation:
+    """What rotation residuals and translation residuals tell of all frames; which parameters there are (7 n + 1,)."""
+
+    rotation: BlockMatrix
+    translation: BlockMatrix
+    used: np.ndarray
+
+    @staticmethod
+    def of(part: Part, pairs: PairInformation, order: Elimination | None = None) -> PartInformation:
+        """The sums over a part's pairs, and the priors."""
+        of_rotations, of_translations = prior_information(part)
+        order = order or order_of(part)
+        return PartInformation(
+            information(part, order, pairs.rotation, of_rotations),
+            information(part, order, pairs.translation, of_translations),
+            by_parameters(part, pairs.used.astype(float)) > 0.0,
+        )
+
+    @property
+    def is_rotation(self) -> np.ndarray:
+        """(7 n + 1,): which parameters are rotations."""
+        return np.append(np.tile(np.arange(7) < 3, len(self.used) // 7), False)
+
+    @property
+    def together(self) -> BlockMatrix:
+        """What all residuals tell."""
+        sums = (getattr(self.rotation, name) + getattr(self.translation, name) for name in BLOCKS)
+        return BlockMatrix(self.rotation.order, *sums)

@@ -10,18 +10,7 @@ from scipy.special import chdtri, fdtri
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import ONE, R_A, T_B
 from gtsam_rwhec.solver.answers import PairPoses
-from gtsam_rwhec.solver.information import (
-    OMEGA_X,
-    OMEGA_Y,
-    OWN_X,
-    SHARED,
-    V_X,
-    V_Y,
-    PairInformation,
-    information,
-    order_of,
-    prior_information,
-)
+from gtsam_rwhec.solver.information import OMEGA_X, OMEGA_Y, OWN_X, SHARED, V_X, V_Y, PairInformation, PartInformation
 from gtsam_rwhec.solver.parts import Part
 
 #: The probability that a free direction counts as determined.
@@ -74,7 +63,7 @@ class PartVarianceFactors:
     spare_on_arm: float
 
 
-def variance_factors(part: Part, pairs: PairInformation, J_t: Array, J_R: Array) -> PartVarianceFactors:
+def variance_factors(part: Part, told: PartInformation, J_t: Array, J_R: Array) -> PartVarianceFactors:
     """Variance factors from the costs J_t, J_R (E,) of the pairs at the optimum, in the physical model.
 
     A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2), and J_R
@@ -85,7 +74,7 @@ def variance_factors(part: Part, pairs: PairInformation, J_t: Array, J_R: Array)
     if part.number_of_unknowns >= 6 * N:  # the noise cannot be estimated: use the weights
         ones = np.ones(len(counts))
         return PartVarianceFactors(ones, ones, ones, 0.0, 0.0, 0.0)
-    spare_on_arm, spare_rotation = equations_to_spare(part, pairs)
+    spare_on_arm, spare_rotation = equations_to_spare(part, told)
     spare_translation = float(max(3 * N - part.number_of_unknowns + 3 * len(part.free), 0))
     lengths = part.moments.squares(T_B)
     floor_t = (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts  # t_B counts as 1 cm at least
@@ -106,7 +95,7 @@ def variance_factors(part: Part, pairs: PairInformation, J_t: Array, J_R: Array)
     )
 
 
-def equations_to_spare(part: Part, pairs: PairInformation) -> tuple[float, float]:
+def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]:
     """How many equations of translations and of rotations the fit has left.
 
     In the worst case all unknowns were fitted to the translations, and all rotations to the rotations.
@@ -115,19 +104,10 @@ def equations_to_spare(part: Part, pairs: PairInformation) -> tuple[float, float
     worst = float(3 * N - part.number_of_unknowns), float(3 * N - rotations)
     if worst[0] >= PLENTY:
         return worst
-    priors = prior_information(part)
-    unweighed = np.zeros((len(part.pairs), 15))
-    if rotations > DENSE_PARAMETERS:
-        return max(worst[0], 0.0), max(worst[1], 0.0)
-    order = order_of(part)
-    of_R, of_t = (
-        information(part, order, [by_pair], unweighed, pairs.used, prior)
-        for by_pair, prior in zip((pairs.rotation, pairs.translation), priors, strict=True)
-    )
-    used = of_R.used
+    used = told.used
     if used.sum() > DENSE_PARAMETERS:
         return max(worst[0], 0.0), max(worst[1], 0.0)
-    I_R, I_t = (each.matrix.dense()[used][:, used] for each in (of_R, of_t))
+    I_R, I_t = (each.dense()[used][:, used] for each in (told.rotation, told.translation))
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(I_R) + np.diagonal(I_t), 1e-300))
     I_R, I_t = I_R * unit[:, None] * unit, I_t * unit[:, None] * unit
     if not np.isfinite(I_R + I_t).all():  # lengths or scales whose squares overflow

@@ -15,7 +15,6 @@ import numpy as np
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
-from gtsam_rwhec.solver.information import Information
 from gtsam_rwhec.solver.noise_bounds import DENSE_PARAMETERS, free_threshold
 
 #: Information below this part of the largest is rounding error.
@@ -29,8 +28,6 @@ FIRST, PRECISION = 6, 1e-8
 MOST_DENSE = 4000
 #: In larger problems so many free directions are told at most, the weakest ones.
 MOST_FREE = 768
-#: So many couplings are scaled at once.
-AT_ONCE = 4096
 #: What an unused parameter has in the place of its information.
 _FAR = 1e30
 
@@ -61,17 +58,14 @@ def unit_of(noise: Array, used: np.ndarray) -> Array:
     return result
 
 
-def weakest(info: Information, ends: Array, spare: float, *, few: bool) -> Weak:
+def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Array, spare: float, *, few: bool) -> Weak:
     """The directions with the smallest information in units of noise; all free directions are among them.
 
-    The information is changed: it is in units of noise afterwards.
-
-    ``ends`` (n + 1,): how many ends of measurements each frame has, and how many measurements the shared scale.
+    ``noise`` and ``used`` (7 n + 1,) say what noise alone would create, and which parameters are tested; ``ends``
+    (n + 1,) how many ends of measurements each frame has, and how many measurements the shared scale.
     """
-    used = info.used
-    unit = unit_of(info.noise, used)
-    matrix = info.matrix
-    _scale(matrix, unit)
+    unit = unit_of(noise, used)
+    matrix = information.scaled(unit)
     if not all(np.isfinite(each).all() for each in (matrix.frames, matrix.couplings, matrix.tails, matrix.tail)):
         raise UnderdeterminedError(
             "what the measurements tell of the poses overflows: the translations of A and of B, or a scale, are "
@@ -96,22 +90,6 @@ def weakest(info: Information, ends: Array, spare: float, *, few: bool) -> Weak:
     thresholds = free_threshold(squares, tilted * squares, spare)
     order = np.argsort(values / thresholds)
     return Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
-
-
-def _scale(matrix: BlockMatrix, unit: Array) -> None:
-    """Bring a matrix to diag(unit) A diag(unit) in its place: a copy of large ones takes much memory."""
-    n = len(matrix.frames)
-    of_frames, of_tail = unit[: 7 * n].reshape(n, 7), unit[7 * n :]
-    first, second = matrix.ends
-    for begin in range(0, len(first), AT_ONCE):
-        at = slice(begin, begin + AT_ONCE)
-        matrix.couplings[at] *= of_frames[first[at], :, None]
-        matrix.couplings[at] *= of_frames[second[at], None, :]
-    for blocks in (matrix.frames, matrix.tails):
-        blocks *= of_frames[:, :, None]
-    matrix.frames[...] *= of_frames[:, None, :]
-    matrix.tails[...] *= of_tail
-    matrix.tail[...] *= of_tail[:, None] * of_tail
 
 
 def _all_of(matrix: BlockMatrix, used: np.ndarray) -> tuple[Array, Array]:

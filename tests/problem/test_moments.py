@@ -167,22 +167,7 @@ def order_of_variables(part: Part) -> dict[str, int]:
 
 def dense_form(part: Part) -> np.ndarray:
     """The library's Q over [t, s, vec R of each free frame; alpha, h], from its blocks."""
-    full = PartForm.of(part).full
-    L, P = full.leaves, full.centers
-    size = 13 * (L + P) + 2
-    Q = np.zeros((size, size))
-    tail = slice(size - 2, size)
-    for i in range(L + P):
-        at = slice(13 * i, 13 * i + 13)
-        Q[at, at] = full.leaf[i] if i < L else full.center[i - L]
-        Q[at, tail] = full.leaf_tail[i] if i < L else full.center_tail[i - L]
-        Q[tail, at] = Q[at, tail].T
-        for p in range(P if i < L else 0):
-            other = slice(13 * (L + p), 13 * (L + p) + 13)
-            Q[at, other] = full.leaf_center[i, p]
-            Q[other, at] = full.leaf_center[i, p].T
-    Q[tail, tail] = full.tail
-    return Q
+    return PartForm.of(part).full.dense()
 
 
 def naive_form(problem: rw.Problem, part: Part) -> np.ndarray:

@@ -13,7 +13,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver.answers import Answer, PairPoses, costs_of_pairs
-from gtsam_rwhec.solver.information import information, order_of, pair_information, prior_information
+from gtsam_rwhec.solver.information import PartInformation, pair_information, prior_information
 from gtsam_rwhec.solver.parts import Part, parts_of
 
 NOISE = Noise(0.02, 300.0)
@@ -101,17 +101,9 @@ def numeric_information(problem: rw.Problem, part: Part, poses: dict[str, np.nda
 
 def our_information(part: Part, answer: Answer) -> np.ndarray:
     pairs = pair_information(part, PairPoses.of(part, answer))
-    rotation_prior, translation_prior = prior_information(part)
-    info = information(
-        part,
-        order_of(part),
-        [pairs.rotation, pairs.translation],
-        np.zeros_like(pairs.used, dtype=float),
-        pairs.used,
-        rotation_prior + translation_prior,
-    )
-    full = info.matrix.dense()
-    return np.where(info.used[:, None] & info.used, full, 0.0)
+    told = PartInformation.of(part, pairs)
+    full = told.together.dense()
+    return np.where(told.used[:, None] & told.used, full, 0.0)
 
 
 @pytest.mark.parametrize("case", CASES)

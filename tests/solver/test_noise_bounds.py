@@ -11,7 +11,7 @@ from rwhec_factors.se3 import inverse, pose
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.solver.answers import Answer, PairPoses, costs_of_pairs
-from gtsam_rwhec.solver.information import pair_information
+from gtsam_rwhec.solver.information import PartInformation, pair_information
 from gtsam_rwhec.solver.noise_bounds import FLOOR, PartVarianceFactors, common_axes, pair_noise, variance_factors
 from gtsam_rwhec.solver.parts import parts_of
 
@@ -34,7 +34,7 @@ def level_of(problem: rw.Problem) -> PartVarianceFactors:
         stacked[:, :3, :3], stacked[:, :3, 3] - shift, np.array(own), scale if isinstance(scale, float) else 1.0
     )
     at = PairPoses.of(part, answer)
-    return variance_factors(part, pair_information(part, at), *costs_of_pairs(part, at))
+    return variance_factors(part, PartInformation.of(part, pair_information(part, at)), *costs_of_pairs(part, at))
 
 
 @pytest.mark.parametrize(("scale", "count"), [("known", 6), ("known", 30), ("shared", 30)])
@@ -92,7 +92,7 @@ def test_the_bound_on_the_carriers_noise_holds(turned_at: str, A_noise: Noise) -
         shift = np.array([part.frame_shift(name) for name in part.free])
         poses = PairPoses.of(part, Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.full(2, np.nan), 1.0))
         pairs = pair_information(part, poses)
-        level = variance_factors(part, pairs, *costs_of_pairs(part, poses))
+        level = variance_factors(part, PartInformation.of(part, pairs), *costs_of_pairs(part, poses))
         bound = pair_noise(part, poses, pairs, level, *common_axes(part)[:2]).carrier[0]
         assert bound > 0.8 / (2.0 * A_noise.kappa)
 
@@ -169,7 +169,7 @@ def test_with_few_equations_an_arm_along_the_common_axis_does_not_count() -> Non
         t = T[:, :3, 3] - shift + np.array([0.0, 0.0, far_m])  # both frames, along the axis of planar motion
         poses = PairPoses.of(part, Answer(T[:, :3, :3], t, np.full(2, np.nan), 1.0))
         pairs = pair_information(part, poses)
-        level = variance_factors(part, pairs, *costs_of_pairs(part, poses))
+        level = variance_factors(part, PartInformation.of(part, pairs), *costs_of_pairs(part, poses))
         bounds.append(pair_noise(part, poses, pairs, level, *common_axes(part)[:2]).carrier[0])
     assert bounds[1] == pytest.approx(bounds[0], rel=1e-4)
 
