@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.many_measurements import Sorted
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.problem.moment_stack import MomentStack, PackedMoments
+from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 
 #: Up to this number of measurements the gauge moves and all moments are summed again, as one measurement does not tell
@@ -43,13 +44,8 @@ class Batch:
 class Row:
     """One pair of moments that were made for many pairs at once."""
 
-    many: PackedMoments
+    many: MomentStack
     index: int
-
-    @property
-    def moments(self) -> Moments:
-        """The moments of the pair."""
-        return self.many.one(self.index)
 
 
 class Accumulator:
@@ -63,7 +59,7 @@ class Accumulator:
     def moments(self, pair: Pair) -> Moments:
         """The moments of a pair."""
         held = self._held[pair]
-        return held.moments if isinstance(held, Row) else held
+        return held.many.one(held.index) if isinstance(held, Row) else held
 
     def count(self, pair: Pair) -> int:
         """The number of measurements of a pair."""
@@ -77,30 +73,17 @@ class Accumulator:
 
     def stack(self, pairs: Sequence[Pair]) -> MomentStack:
         """The moments of some pairs in their order; a view where they are the pairs of one call, in its order."""
-        runs: list[PackedMoments] = []
-        alone: list[Moments] = []
-        held = [self._held[pair] for pair in pairs]
-        e = 0
-        while e < len(held):
-            of_pair = held[e]
-            if isinstance(of_pair, Moments):
-                alone.append(of_pair)
-                e += 1
+        stacks: list[MomentStack] = []
+        of_pairs = zip(pairs, (self._held[pair] for pair in pairs), strict=True)
+        for many, group in groupby(of_pairs, lambda each: each[1].many if isinstance(each[1], Row) else None):
+            if many is None:
+                alone = [(held, pair.is_motion) for pair, held in group if isinstance(held, Moments)]
+                stacks.append(MomentStack.of(*zip(*alone, strict=True)))
                 continue
-            if alone:
-                runs.append(PackedMoments.of(alone))
-                alone = []
-            many = of_pair.many
-            index: list[int] = []
-            while e < len(held) and isinstance(other := held[e], Row) and other.many is many:
-                index.append(other.index)
-                e += 1
-            rows = np.array(index)
+            rows = np.array([held.index for _, held in group if isinstance(held, Row)])
             is_run = bool((np.diff(rows) == 1).all())
-            runs.append(many.rows(slice(rows[0], rows[-1] + 1) if is_run else rows))
-        if alone or not runs:
-            runs.append(PackedMoments.of(alone))
-        return MomentStack(PackedMoments.joined(runs), np.array([pair.is_motion for pair in pairs], dtype=bool))
+            stacks.append(many.rows(slice(rows[0], rows[-1] + 1) if is_run else rows))
+        return MomentStack.joined(stacks)
 
     def added(self, batch: Batch) -> tuple[Accumulator, int]:
         """The accumulator with a batch added, and how many of the batch's rotations were projected to SO(3).
@@ -155,7 +138,7 @@ class Accumulator:
         projected = int(fresh.projected.sum())
         known = np.flatnonzero([pair in before._held for pair in batch.pairs])
         if len(known):
-            fresh.add_to(known, before.stack([batch.pairs[i] for i in known]).packed)
+            fresh.add_to(known, before.stack([batch.pairs[i] for i in known]))
         rows = {pair: Row(fresh, i) for i, pair in enumerate(batch.pairs)}
         return Accumulator(gauge, {**before._held, **rows}), projected
 

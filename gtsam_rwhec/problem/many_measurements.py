@@ -14,7 +14,7 @@ from gtsam_rwhec.geometry.poses import ROTATION_ROUNDING, Array, checked_rows, o
 from gtsam_rwhec.geometry.rounding import UNIT
 from gtsam_rwhec.problem.knowledge import check_name
 from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pair
-from gtsam_rwhec.problem.moment_stack import BACK_ENTRIES, FRONT, FRONT_ENTRIES, PackedMoments
+from gtsam_rwhec.problem.moment_stack import BACK_ENTRIES, FRONT, FRONT_ENTRIES, MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, Gauge, Moments
 
 #: So many measurements are summed at once, some megabytes.
@@ -23,22 +23,6 @@ SUMMED_AT_ONCE = 4096
 FULL = 0.6
 #: Where the features without B's rotation have the entries of their triangle.
 _OF_FRONT = np.searchsorted(FRONT, FRONT_ENTRIES[0]), np.searchsorted(FRONT, FRONT_ENTRIES[1])
-
-
-@dataclass(frozen=True)
-class _Table:
-    """What `PackedMoments` has, to be filled group by group."""
-
-    count: np.ndarray
-    kappa: Array
-    front: Array
-    back: Array | None
-    rotation: Array
-    magnitude: Array
-    feature_error: Array
-    operations: np.ndarray
-    deviation: Array
-    projected: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -102,35 +86,22 @@ class Sorted:
             yield order[begin:end]
             begin = end
 
-    def moments(self, gauge: Gauge, *, with_R_B: bool) -> PackedMoments:
+    def moments(self, gauge: Gauge, *, with_R_B: bool) -> MomentStack:
         """The moments of every pair; a PoseError names the first pose of a block that is not valid."""
-        P = len(self.pairs)
-        result = _Table(
-            count=self.counts,
-            kappa=np.empty(P),
-            front=np.empty((P, len(FRONT_ENTRIES[0]))),
-            back=np.empty((P, len(BACK_ENTRIES[0]))) if with_R_B else None,
-            rotation=np.empty((P, 81)),
-            magnitude=np.empty((P, 25)),
-            feature_error=np.empty((P, 3)),
-            operations=np.empty(P, dtype=int),
-            deviation=np.empty(P),
-            projected=np.zeros(P, dtype=int),
-        )
-        motion = self.motion
-        for group in self.groups(np.arange(P)):
+        result = MomentStack.empty(self.motion, self.counts, with_R_B=with_R_B)
+        for group in self.groups(np.arange(len(self.pairs))):
             if len(group) == 1 and self.counts[group[0]] > BLOCK:
                 self._long(int(group[0]), gauge, result)
             else:
-                self._sum(group, gauge, motion[group], result)
-        return PackedMoments(**vars(result))
+                self._sum(group, gauge, result)
+        return result
 
     def _weights(self, at: np.ndarray) -> tuple[Array, Array]:
         """1 / sigma^2 and kappa of measurements."""
         sigma, kappa = (each if each.ndim == 0 else each[at] for each in (self.sigma, self.kappa))
         return np.broadcast_to(1.0 / sigma**2, at.shape), np.broadcast_to(kappa, at.shape)
 
-    def _long(self, pair: int, gauge: Gauge, result: _Table) -> None:
+    def _long(self, pair: int, gauge: Gauge, result: MomentStack) -> None:
         own = np.arange(self.first[pair], self.first[pair + 1])
         weight, kappa = self._weights(own)
         try:
@@ -140,12 +111,9 @@ class Sorted:
         except PoseError:
             self._name(own)
             raise
-        table = vars(result)
-        for name, value in vars(PackedMoments.of([moments])).items():
-            if table[name] is not None and name != "count":
-                table[name][pair] = value[0]
+        result.fill(pair, moments)
 
-    def _sum(self, group: np.ndarray, gauge: Gauge, motion: np.ndarray, result: _Table) -> None:
+    def _sum(self, group: np.ndarray, gauge: Gauge, result: MomentStack) -> None:
         places, valid = self.padded(group)
         p, k = places.shape
         flat, features = places.ravel(), np.empty((25, p * k))
@@ -161,7 +129,7 @@ class Sorted:
             result.projected[group] = (np.sum(off, axis=0).reshape(p, k) * valid).sum(axis=1)
         reach = np.abs(f[T_A]).max(axis=2)  # (3, p)
         a = gauge.sensor_carrier[:, None]
-        c = np.where(motion, a, gauge.target_carrier[:, None])  # (3, p)
+        c = np.where(result.motion[group], a, gauge.target_carrier[:, None])  # (3, p)
         f[T_A] += c[0, :, None] * f[0:3] + c[1, :, None] * f[3:6] + c[2, :, None] * f[6:9] - a[:, :, None]
         f[ONE] = 1.0
         weight, kappa = self._weights(places)
@@ -184,11 +152,11 @@ class Sorted:
         turned = np.matmul((f[R_A] * kappa).transpose(1, 0, 2), f[R_B].transpose(1, 2, 0))
         result.rotation[group] = turned.reshape(p, 81)
         result.kappa[group] = kappa.sum(axis=1)
-        result.magnitude[group] = np.sqrt(diagonal) * (1.0 + 1e-9)
+        result.magnitude_as_summed[group] = np.sqrt(diagonal) * (1.0 + 1e-9)
         centring = 8.0 * UNIT * (reach + np.abs(c).sum(axis=0) + np.abs(a))
-        result.feature_error[group] = (centring * np.sqrt(total)).T
+        result.error_as_summed[group] = (centring * np.sqrt(total)).T
         # The weight and its products take up to six operations; then a pair's measurements are summed.
-        result.operations[group] = self.counts[group] + 7
+        result.operations_as_summed[group] = self.counts[group] + 7
         # What the test of R'R itself rounds comes on top.
         result.deviation[group] = max(of_A.deviation, of_B.deviation) + 8.0 * UNIT
 

@@ -1,9 +1,13 @@
-"""The moments of a part's pairs as the solver reads them: matrices are made for few pairs at a time."""
+"""Moments of many pairs in little memory: one triangle of each matrix, and matrices for few pairs at a time.
+
+80,000 matrices of 25 x 25 doubles are 400 MB. They are symmetric, and where the lengths in B are known nothing reads
+the entries of B's rotations (only the inverse equation does, design fact 7). So a pair takes 2 kB here, in place of 6.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,228 +30,171 @@ BACK_ENTRIES = _ROWS[_BACK], _COLUMNS[_BACK]
 _UPPER = np.zeros((16, 16), dtype=int)
 _UPPER[np.triu_indices(16)] = np.arange(136)
 _FULL: np.ndarray = np.maximum(_UPPER, _UPPER.T).ravel()
-#: Fields with one entry, or one short row, for each pair; and those with a long one.
-_SHORT = ("count", "kappa", "operations", "deviation", "projected")
-_LONG = ("front", "rotation", "magnitude", "feature_error")
-
-
-@dataclass(frozen=True)
-class Rows:
-    """The rows of several arrays (e, n), one after the other, without a copy: ``rows[first:last]``, ``rows[index]``."""
-
-    arrays: tuple[Array, ...]
-
-    @staticmethod
-    def of(several: Sequence[Array | Rows]) -> Rows:
-        """The rows of all."""
-        return Rows(tuple(array for each in several for array in (each.arrays if isinstance(each, Rows) else (each,))))
-
-    def __getitem__(self, index: np.ndarray | slice) -> Array:
-        ends = np.cumsum([len(array) for array in self.arrays])
-        wanted = np.arange(ends[-1])[index]
-        where = np.searchsorted(ends, wanted, side="right")
-        result = np.empty((len(wanted), self.arrays[0].shape[1]))
-        for i in np.unique(where):
-            own = where == i
-            result[own] = self.arrays[i][wanted[own] - (ends[i - 1] if i else 0)]
-        return result
-
-    def columns(self, at: np.ndarray) -> Array:
-        """Some entries of each row."""
-        return np.concatenate([array[:, at] for array in self.arrays])
-
-
-@dataclass(frozen=True)
-class PackedMoments:
-    """Moments of E pairs, as in `Moments`, with the upper triangles of ``translation`` as rows.
-
-    count, kappa, operations, deviation, projected (E,); front (E, 136) without the entries of R_B, and back (E, 189)
-    with R_B, or None where they are not kept; rotation (E, 81); magnitude (E, 25); feature_error (E, 3), of t_A.
-    """
-
-    count: np.ndarray
-    kappa: Array
-    front: Array | Rows
-    back: Array | Rows | None
-    rotation: Array | Rows
-    magnitude: Array | Rows
-    feature_error: Array | Rows
-    operations: np.ndarray
-    deviation: Array
-    projected: np.ndarray
-
-    @staticmethod
-    def of(moments: Sequence[Moments]) -> PackedMoments:
-        """The moments of several pairs; all of their matrices are kept."""
-        translation = np.array([of_pair.translation for of_pair in moments]).reshape(-1, 25, 25)
-        back = translation[:, BACK_ENTRIES[0], BACK_ENTRIES[1]]
-        return PackedMoments(
-            count=np.array([of_pair.count for of_pair in moments], dtype=int),
-            kappa=np.array([of_pair.kappa for of_pair in moments], dtype=float),
-            front=translation[:, FRONT_ENTRIES[0], FRONT_ENTRIES[1]],
-            back=None if np.isnan(back).all() else back,
-            rotation=np.array([of_pair.rotation for of_pair in moments]).reshape(-1, 81),
-            magnitude=np.array([of_pair.magnitude for of_pair in moments]).reshape(-1, 25),
-            feature_error=np.array([of_pair.feature_error[T_A] for of_pair in moments]).reshape(-1, 3),
-            operations=np.array([of_pair.operations for of_pair in moments], dtype=int),
-            deviation=np.array([of_pair.deviation for of_pair in moments], dtype=float),
-            projected=np.array([of_pair.projected for of_pair in moments], dtype=int),
-        )
-
-    @staticmethod
-    def joined(several: Sequence[PackedMoments]) -> PackedMoments:
-        """All pairs of several, one after the other; long rows stay where they are."""
-        if len(several) == 1:
-            return several[0]
-        fields: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in several]) for name in _SHORT}
-        fields |= {name: Rows.of([getattr(each, name) for each in several]) for name in _LONG}
-        back: Rows | None = None
-        if any(each.back is not None for each in several):
-            n = len(BACK_ENTRIES[0])
-            back = Rows.of([np.full((len(each), n), np.nan) if each.back is None else each.back for each in several])
-        return PackedMoments(back=back, **fields)
-
-    @property
-    def weight(self) -> Array:
-        """(E,) sums of 1 / sigma^2, the last entry of each triangle."""
-        return self.entries(np.array([ONE]), np.array([ONE]))[:, 0]
-
-    def __len__(self) -> int:
-        return len(self.count)
-
-    def rows(self, index: np.ndarray | slice) -> PackedMoments:
-        """Some of the pairs."""
-        back = None if self.back is None else self.back[index]
-        return PackedMoments(back=back, **{name: getattr(self, name)[index] for name in _SHORT + _LONG})
-
-    def matrices(self, index: np.ndarray | slice) -> Array:
-        """``translation`` of some pairs, (e, 25, 25); nan in the entries of R_B where these are not kept."""
-        fronts = self.fronts(index)
-        result = np.full((len(fronts), 25, 25), np.nan) if self.back is None else np.empty((len(fronts), 25, 25))
-        result[:, FRONT[:, None], FRONT] = fronts
-        if self.back is not None:
-            (rows, columns), values = BACK_ENTRIES, self.back[index]
-            result[:, rows, columns] = values
-            result[:, columns, rows] = values
-        return result
-
-    def fronts(self, index: np.ndarray | slice) -> Array:
-        """The entries of ``translation`` without R_B, of some pairs, (e, 16, 16) in the order of `FRONT`."""
-        result: Array = np.take(self.front[index], _FULL, axis=1)
-        return result.reshape(-1, 16, 16)
-
-    def entries(self, rows: np.ndarray, columns: np.ndarray) -> Array:
-        """Some entries of ``translation``, none of them of R_B, of all pairs, (E, k)."""
-        chosen = _FULL.reshape(16, 16)[np.searchsorted(FRONT, rows), np.searchsorted(FRONT, columns)]
-        return self.front.columns(chosen) if isinstance(self.front, Rows) else self.front[:, chosen]
-
-    def one(self, index: int) -> Moments:
-        """The moments of one pair."""
-        error = np.zeros(25)
-        error[T_A] = self.feature_error[index : index + 1][0]
-        return Moments(
-            int(self.count[index]),
-            float(self.kappa[index]),
-            self.matrices(slice(index, index + 1))[0],
-            self.rotation[index : index + 1].reshape(9, 9),
-            self.magnitude[index : index + 1][0],
-            error,
-            int(self.operations[index]),
-            float(self.deviation[index]),
-            int(self.projected[index]),
-        )
-
-    def add_to(self, index: np.ndarray, other: PackedMoments) -> None:
-        """Add the pairs of another to some rows of this one, in place, as ``Moments`` are added."""
-        for name in ("count", "kappa", "front", "rotation", "projected"):
-            getattr(self, name)[index] += getattr(other, name)[:]
-        if isinstance(self.back, np.ndarray):
-            self.back[index] += np.nan if other.back is None else other.back[:]
-        for name in ("magnitude", "feature_error"):
-            getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name)[:])
-        self.operations[index] = np.maximum(self.operations[index], other.operations) + 1
-        self.deviation[index] = np.maximum(self.deviation[index], other.deviation)
-
-
-I3 = np.eye(3)
+_I3 = np.eye(3)
 
 
 @dataclass(frozen=True)
 class MomentStack:
-    """Moments of E pairs, about a gauge that is moved by ``a`` and ``c`` from that of the packed ones.
+    """Moments of E pairs, as in `Moments`, in the order of the pairs.
 
-    ``motion`` (E,): whether both ends of a pair are the sensor's carrier. ``count``, ``kappa``, ``weight``,
-    ``operations``, ``deviation`` (E,), ``magnitude`` and ``feature_error`` (E, 25) are as in `Moments`. Matrices of
-    some pairs are made where they are asked for: all at once are 5 kB a pair.
+    They were summed about one gauge, and are read about a gauge that is moved from it by ``a`` and ``c``. Matrices of
+    some pairs are made where they are asked for.
     """
 
-    packed: PackedMoments
-    motion: np.ndarray
+    motion: np.ndarray  #: (E,): whether both ends of a pair are the sensor's carrier
+    count: np.ndarray  #: (E,)
+    kappa: Array  #: (E,)
+    front: Array  #: (E, 136): the upper triangle of ``translation`` without the entries of R_B
+    back: Array | None  #: (E, 189): those with R_B; None where they are not kept
+    rotation: Array  #: (E, 81)
+    magnitude_as_summed: Array  #: (E, 25)
+    error_as_summed: Array  #: (E, 3): the feature error of t_A
+    operations_as_summed: np.ndarray  #: (E,)
+    deviation: Array  #: (E,)
+    projected: np.ndarray  #: (E,)
     a: Array | None = None
     c: Array | None = None
 
     @staticmethod
+    def empty(motion: np.ndarray, count: np.ndarray, *, with_R_B: bool) -> MomentStack:
+        """Room for the sums of pairs with so many measurements."""
+        E = len(count)
+        return MomentStack(
+            motion=motion,
+            count=count,
+            kappa=np.empty(E),
+            front=np.empty((E, len(FRONT_ENTRIES[0]))),
+            back=np.empty((E, len(BACK_ENTRIES[0]))) if with_R_B else None,
+            rotation=np.empty((E, 81)),
+            magnitude_as_summed=np.empty((E, 25)),
+            error_as_summed=np.empty((E, 3)),
+            operations_as_summed=np.empty(E, dtype=int),
+            deviation=np.empty(E),
+            projected=np.zeros(E, dtype=int),
+        )
+
+    @staticmethod
     def of(moments: Sequence[Moments], motion: Sequence[bool]) -> MomentStack:
-        """Stack the moments of several pairs."""
-        return MomentStack(PackedMoments.of(moments), np.array(motion, dtype=bool))
+        """The moments of several pairs; all of their matrices are kept."""
+        stack = MomentStack.empty(np.array(motion, dtype=bool), np.zeros(len(moments), dtype=int), with_R_B=True)
+        for e, of_pair in enumerate(moments):
+            stack.fill(e, of_pair)
+        is_lacking = stack.back is not None and np.isnan(stack.back).all()
+        return replace(stack, back=None) if is_lacking and len(moments) else stack
 
-    @property
-    def count(self) -> np.ndarray:
-        """(E,) numbers of measurements."""
-        return self.packed.count
+    def fill(self, e: int, moments: Moments) -> None:
+        """Write the moments of a pair."""
+        self.count[e], self.kappa[e], self.projected[e] = moments.count, moments.kappa, moments.projected
+        self.front[e] = moments.translation[FRONT_ENTRIES]
+        if self.back is not None:
+            self.back[e] = moments.translation[BACK_ENTRIES]
+        self.rotation[e], self.magnitude_as_summed[e] = moments.rotation.ravel(), moments.magnitude
+        self.error_as_summed[e], self.operations_as_summed[e] = moments.feature_error[T_A], moments.operations
+        self.deviation[e] = moments.deviation
 
-    @property
-    def kappa(self) -> Array:
-        """(E,) sums of kappa."""
-        return self.packed.kappa
+    @staticmethod
+    def joined(several: Sequence[MomentStack]) -> MomentStack:
+        """All pairs of several stacks, one after the other."""
+        if len(several) == 1:
+            return several[0]
+        with_R_B = any(stack.back is not None for stack in several)
+        n = len(BACK_ENTRIES[0])
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(stack, name) for stack in several]) for name in _ARRAYS if name != "back"
+        }
+        back = [np.full((len(stack), n), np.nan) if stack.back is None else stack.back for stack in several]
+        return MomentStack(back=np.concatenate(back) if with_R_B else None, **arrays)
 
-    @property
-    def deviation(self) -> Array:
-        """(E,), of R'R from the identity."""
-        return self.packed.deviation
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def rows(self, index: np.ndarray | slice) -> MomentStack:
+        """Some of the pairs."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        return replace(self, **{name: array[index] for name, array in arrays.items() if array is not None})
+
+    def add_to(self, index: np.ndarray, other: MomentStack) -> None:
+        """Add the pairs of another stack to some rows of this one, in place, as `Moments` are added."""
+        for name in ("count", "kappa", "front", "rotation", "projected"):
+            getattr(self, name)[index] += getattr(other, name)
+        if self.back is not None:
+            self.back[index] += np.nan if other.back is None else other.back
+        for name in ("magnitude_as_summed", "error_as_summed"):
+            getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name))
+        self.operations_as_summed[index] = np.maximum(self.operations_as_summed[index], other.operations_as_summed) + 1
+        self.deviation[index] = np.maximum(self.deviation[index], other.deviation)
+
+    def one(self, e: int) -> Moments:
+        """The moments of one pair, as they were summed; nan in the entries of R_B where these are not kept."""
+        error = np.zeros(25)
+        error[T_A] = self.error_as_summed[e]
+        return Moments(
+            int(self.count[e]),
+            float(self.kappa[e]),
+            self._matrices(slice(e, e + 1))[0],
+            self.rotation[e].reshape(9, 9),
+            self.magnitude_as_summed[e],
+            error,
+            int(self.operations_as_summed[e]),
+            float(self.deviation[e]),
+            int(self.projected[e]),
+        )
+
+    @cached_property
+    def weight(self) -> Array:
+        """(E,) sums of 1 / sigma^2, the last entry of each triangle."""
+        return self.front[:, -1]
 
     @property
     def operations(self) -> np.ndarray:
         """(E,) rounded operations of an entry."""
-        return self.packed.operations + (0 if self.a is None else SHIFT_OPERATIONS)
-
-    @cached_property
-    def weight(self) -> Array:
-        """(E,) sums of 1 / sigma^2."""
-        return self.packed.weight
+        return self.operations_as_summed + (0 if self.a is None else SHIFT_OPERATIONS)
 
     @cached_property
     def magnitude(self) -> Array:
         """(E, 25), which bound the rounding."""
-        return self._by_shift(self.packed.magnitude[:])
+        return self._by_shift(self.magnitude_as_summed)
 
     @cached_property
     def feature_error(self) -> Array:
         """(E, 25), which bound the rounding."""
-        error = np.zeros((len(self.packed), 25))
-        error[:, T_A] = self.packed.feature_error[:]
+        error = np.zeros((len(self), 25))
+        error[:, T_A] = self.error_as_summed
         return self._by_shift(error)
 
     def rotations(self, index: np.ndarray | slice) -> Array:
         """``rotation`` of some pairs (e, 9, 9)."""
-        return self.packed.rotation[index].reshape(-1, 9, 9)
+        return self.rotation[index].reshape(-1, 9, 9)
 
     def translations(self, index: np.ndarray | slice) -> Array:
-        """``translation`` of some pairs (e, 25, 25): t_A becomes t_A + R_A c - a, in rows and then in columns."""
-        return self._moved(self.packed.matrices(index), index, ONE)
+        """``translation`` of some pairs (e, 25, 25)."""
+        return self._moved(self._matrices(index), index, ONE)
 
     def fronts(self, index: np.ndarray | slice) -> Array:
         """The entries of `translations` without R_B, (e, 16, 16), in the order of `FRONT`."""
-        return self._moved(self.packed.fronts(index), index, 15)
+        return self._moved(self._fronts(index), index, 15)
 
     def entries(self, rows: np.ndarray | slice, columns: np.ndarray | slice) -> Array:
         """Entries (rows[k], columns[k]) of all pairs, (E, k), of features that the gauge does not move (not t_A)."""
-        features = np.arange(25)
-        of_rows, of_columns = np.broadcast_arrays(features[rows], features[columns])
-        return self.packed.entries(of_rows, of_columns)
+        place = np.searchsorted(FRONT, np.arange(25))
+        of_rows, of_columns = np.broadcast_arrays(place[rows], place[columns])
+        return self.front[:, _FULL.reshape(16, 16)[of_rows, of_columns]]
+
+    def _matrices(self, index: np.ndarray | slice) -> Array:
+        fronts = self._fronts(index)
+        result = np.full((len(fronts), 25, 25), np.nan)
+        result[:, FRONT[:, None], FRONT] = fronts
+        if self.back is not None:
+            rows, columns = BACK_ENTRIES
+            result[:, rows, columns] = result[:, columns, rows] = self.back[index]
+        return result
+
+    def _fronts(self, index: np.ndarray | slice) -> Array:
+        result: Array = np.take(self.front[index], _FULL, axis=1)
+        return result.reshape(-1, 16, 16)
 
     def _moved(self, G: Array, index: np.ndarray | slice, one: int) -> Array:
-        """Sums with R_A in 0:9, t_A in 9:12 and 1 in ``one``, about the gauge."""
+        """Sums with R_A in 0:9, t_A in 9:12 and 1 in ``one``, about the gauge: t_A becomes t_A + R_A c - a."""
         if self.a is None or self.c is None:
             return G
         a = np.broadcast_to(self.a, (len(G), 3))
@@ -260,14 +207,23 @@ class MomentStack:
         G[:, :, T_A] += columns - G[:, :, one, None] * a[:, None, :]
         return G
 
+    def _by_shift(self, of_features: Array) -> Array:
+        """|shift| times vectors (E, 25)."""
+        if self.a is None or self.c is None:
+            return of_features
+        moved: Array = of_features @ np.abs(shift_of(self.a, self.c)).T
+        if self.motion.any():
+            moved[self.motion] = of_features[self.motion] @ np.abs(shift_of(self.a, self.a)).T
+        return moved
+
     def blocks(self) -> Iterator[slice]:
         """The pairs, some at a time."""
-        for first in range(0, len(self.packed), PAIRS_AT_ONCE):
-            yield slice(first, min(first + PAIRS_AT_ONCE, len(self.packed)))
+        for first in range(0, len(self), PAIRS_AT_ONCE):
+            yield slice(first, min(first + PAIRS_AT_ONCE, len(self)))
 
     def is_finite(self) -> np.ndarray:
         """(E,): whether the sums of a pair are numbers that did not overflow."""
-        return np.concatenate([np.isfinite(self.packed.front[at]).all(axis=1) for at in self.blocks()])
+        return np.isfinite(self.front).all(axis=1)
 
     def squares(self, features: slice) -> Array:
         """(E,): the sum of the weighted squares of t_A or t_B."""
@@ -289,12 +245,12 @@ class MomentStack:
                 total[1] += each[motion].sum(axis=0)
         (Rt_still, turned), (Rt_t_still, Rt_t_moving), (t_still, t_moving) = of_two
         normal, right = np.zeros((6, 6)), np.zeros(6)
-        normal[:3, :3] = normal[3:, 3:] = self.weight[~self.motion].sum() * I3
+        normal[:3, :3] = normal[3:, 3:] = self.weight[~self.motion].sum() * _I3
         normal[3:, :3] = -Rt_still
         normal[:3, 3:] = normal[3:, :3].T
         right[:3], right[3:] = t_still, -Rt_t_still
         if self.motion.any():  # c = a: residual t_A - (I - R_A) a
-            normal[:3, :3] += 2.0 * self.weight[self.motion].sum() * I3 - turned - turned.T
+            normal[:3, :3] += 2.0 * self.weight[self.motion].sum() * _I3 - turned - turned.T
             right[:3] += t_moving - Rt_t_moving
         solution: Array = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
         return solution[:3], solution[3:]
@@ -307,14 +263,7 @@ class MomentStack:
 
     def spread(self) -> float:
         """Root mean square of t_A about the gauge, in metres."""
-        square = float(self.squares(T_A).sum())
-        return float(np.sqrt(max(square, 0.0) / self.weight.sum()))
+        return float(np.sqrt(max(float(self.squares(T_A).sum()), 0.0) / self.weight.sum()))
 
-    def _by_shift(self, of_features: Array) -> Array:
-        """|shift| times vectors (E, 25)."""
-        if self.a is None or self.c is None:
-            return of_features
-        moved: Array = of_features @ np.abs(shift_of(self.a, self.c)).T
-        if self.motion.any():
-            moved[self.motion] = of_features[self.motion] @ np.abs(shift_of(self.a, self.a)).T
-        return moved
+
+_ARRAYS = tuple(field.name for field in fields(MomentStack) if field.name not in ("a", "c"))
