@@ -74,8 +74,8 @@ class Found:
 
 
 @dataclass(frozen=True)
-class SearchedPart:
-    """A part that is searched: its cost, and the times of the stages.
+class Search:
+    """The search of one part: its cost, and the times of the stages.
 
     A bound that holds in a region only has the answer ``contains``, if there is one, in its region.
     """
@@ -85,6 +85,97 @@ class SearchedPart:
     stages: Stages
     whole: PartForm
     contains: Answer | None = None
+
+    @staticmethod
+    def of(
+        part: Part, options: SolveOptions, progress: Progress | None = None, *, contains: Answer | None = None
+    ) -> Search:
+        """Build the forms; the search calls ``progress`` with the name of each stage as the stage begins."""
+        stages = Stages(progress)
+        with stages.of("quadratic form"):
+            whole = PartForm.of(part)
+            _ = whole.form
+        return Search(part, options, stages, whole, contains)
+
+    def run(self, method: Method, initial: Array | None) -> Found:
+        """Search with a method; ``initial`` (n, 3, 3) is the start of "local" (and of ``certify``)."""
+        if method == "sdp":
+            relaxation = self._relax()
+            return Attempt(self, round_to_rotations(relaxation), relaxation.solver).after_relaxation(relaxation)
+        if initial is not None:
+            attempt = Attempt(self, [initial], Start.GIVEN)
+        else:
+            with self.stages.of("spectral start"):
+                starts = spectral_start(self.part, self.whole.rotation)
+            attempt = Attempt(self, starts, Start.SPECTRAL)
+        if method == "auto" and self.is_large:
+            return attempt.run_locally()
+        if attempt.certify() or method == "local" or attempt.is_closed_but_for_rounding:
+            return attempt.found()
+        if attempt.look_elsewhere() and attempt.certify():
+            return attempt.found()
+        relaxation = self._relax()
+        attempt.descend(round_to_rotations(relaxation), relaxation.solver)
+        return attempt.after_relaxation(relaxation)
+
+    def with_positive_scale(self, found: Found) -> Found:
+        """The answer as found, or its mirror image where only the image has positive scales and costs as little.
+
+        Planar motion leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a little, and
+        the image may cost more than the bound allows: then the image is returned with this gap.
+        """
+        if self._has_positive_scales(found.R):
+            return found
+        with self.stages.of("descent"):
+            end = descend(self.form, mirrored(self.part, found.R), self.options.max_descent_iterations)
+        likely = end.cost - found.cost <= max(self.tolerance(found.cost), self.rounding, MIRROR_COST * found.cost)
+        if not (likely and self._has_positive_scales(end.R)):
+            return found
+        attempt = Attempt(self, [end.R], found.path.start)
+        attempt.certify()
+        image = attempt.found(Cause.MIRROR_IMAGE, mirror_cost=found.cost)
+        image = replace(image, path=replace(image.path, is_mirrored=True))
+        if not image.is_closed and found.bound.region is None:  # found's bound holds for all answers
+            image = replace(image, bound=found.bound.at_most(attempt.lowest))
+        if image.is_closed:
+            cause = image.cause if image.cause is not Cause.MIRROR_IMAGE else found.cause
+            proven = cause if found.is_closed else Cause.PROVEN_AFTER_LOCAL_MINIMUM
+            return replace(image, cause=proven, figures={})
+        if image.cost > found.cost + self.tolerance(found.cost):
+            return replace(image, cause=Cause.MIRROR_IMAGE, figures={"mirror_cost": found.cost})
+        return replace(image, cause=Cause.ROUNDING, figures={})
+
+    def ended(self, found: Found) -> Searched:
+        """What was found, without the forms where nothing more is searched: in large parts no twin is."""
+        keeps = found.is_closed and not found.bound.definite and not self.is_large
+        return Searched(self.part, found, self.whole.full.order, self.stages, self if keeps else None)
+
+    def has_twin(self, found: Found) -> bool:
+        """Whether descents from random starts find another answer of the same cost.
+
+        The information matrix shows only the neighbourhood of the answer. If there is a twin far away, Z is not
+        positive definite: only then is this function called.
+        """
+        with self.stages.of("twins"):
+            for start in self.random_starts(2 * self.options.random_starts):
+                end = descend(self.form, start, self.options.max_descent_iterations)
+                elsewhere = float(np.abs(end.R - found.R).max(initial=0.0)) > TWIN_DISTANCE
+                if elsewhere and end.cost <= found.cost + max(self.tolerance(found.cost), self.rounding):
+                    return self._has_positive_scales(end.R)
+        return False
+
+    def _has_positive_scales(self, R: Array) -> bool:
+        return answer_of(self.part, self.form, R).has_positive_scales
+
+    def _relax(self) -> Relaxation:
+        options = self.options
+        with self.stages.of("semidefinite relaxation"):
+            return solve_relaxation(
+                self.whole.reduced.Q,
+                options.relaxation_tolerance,
+                options.max_relaxation_iterations,
+                self.stages.progress,
+            )
 
     @property
     def form(self) -> SearchForm:
@@ -145,7 +236,7 @@ STEPS_ALONG_FREE_DIRECTIONS = 3
 class Attempt:
     """The best point that the descents of a search have reached, its start, and the best bound at this point."""
 
-    def __init__(self, search: SearchedPart, starts: list[Array], start: Start) -> None:
+    def __init__(self, search: Search, starts: list[Array], start: Start) -> None:
         self.search, self.form, self.stages = search, search.form, search.stages
         self.best = Descent(starts[0], np.inf, 0, converged=False)
         self.start, self.multipliers, self.bound = start, Multipliers.KKT, NOTHING_YET
@@ -375,98 +466,3 @@ class Searched:
     def has_twin(self) -> bool:
         """Whether another answer costs the same."""
         return self.search is not None and self.search.has_twin(self.found)
-
-
-class Search(SearchedPart):
-    """The search of one part."""
-
-    @staticmethod
-    def of(
-        part: Part, options: SolveOptions, progress: Progress | None = None, *, contains: Answer | None = None
-    ) -> Search:
-        """Build the forms; the search calls ``progress`` with the name of each stage as the stage begins."""
-        stages = Stages(progress)
-        with stages.of("quadratic form"):
-            whole = PartForm.of(part)
-            _ = whole.form
-        return Search(part, options, stages, whole, contains)
-
-    def run(self, method: Method, initial: Array | None) -> Found:
-        """Search with a method; ``initial`` (n, 3, 3) is the start of "local" (and of ``certify``)."""
-        if method == "sdp":
-            relaxation = self._relax()
-            return Attempt(self, round_to_rotations(relaxation), relaxation.solver).after_relaxation(relaxation)
-        if initial is not None:
-            attempt = Attempt(self, [initial], Start.GIVEN)
-        else:
-            with self.stages.of("spectral start"):
-                starts = spectral_start(self.part, self.whole.rotation)
-            attempt = Attempt(self, starts, Start.SPECTRAL)
-        if method == "auto" and self.is_large:
-            return attempt.run_locally()
-        if attempt.certify() or method == "local" or attempt.is_closed_but_for_rounding:
-            return attempt.found()
-        if attempt.look_elsewhere() and attempt.certify():
-            return attempt.found()
-        relaxation = self._relax()
-        attempt.descend(round_to_rotations(relaxation), relaxation.solver)
-        return attempt.after_relaxation(relaxation)
-
-    def with_positive_scale(self, found: Found) -> Found:
-        """The answer as found, or its mirror image where only the image has positive scales and costs as little.
-
-        Planar motion leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a little, and
-        the image may cost more than the bound allows: then the image is returned with this gap.
-        """
-        if self._has_positive_scales(found.R):
-            return found
-        with self.stages.of("descent"):
-            end = descend(self.form, mirrored(self.part, found.R), self.options.max_descent_iterations)
-        likely = end.cost - found.cost <= max(self.tolerance(found.cost), self.rounding, MIRROR_COST * found.cost)
-        if not (likely and self._has_positive_scales(end.R)):
-            return found
-        attempt = Attempt(self, [end.R], found.path.start)
-        attempt.certify()
-        image = attempt.found(Cause.MIRROR_IMAGE, mirror_cost=found.cost)
-        image = replace(image, path=replace(image.path, is_mirrored=True))
-        if not image.is_closed and found.bound.region is None:  # found's bound holds for all answers
-            image = replace(image, bound=found.bound.at_most(attempt.lowest))
-        if image.is_closed:
-            cause = image.cause if image.cause is not Cause.MIRROR_IMAGE else found.cause
-            proven = cause if found.is_closed else Cause.PROVEN_AFTER_LOCAL_MINIMUM
-            return replace(image, cause=proven, figures={})
-        if image.cost > found.cost + self.tolerance(found.cost):
-            return replace(image, cause=Cause.MIRROR_IMAGE, figures={"mirror_cost": found.cost})
-        return replace(image, cause=Cause.ROUNDING, figures={})
-
-    def ended(self, found: Found) -> Searched:
-        """What was found, without the forms where nothing more is searched: in large parts no twin is."""
-        keeps = found.is_closed and not found.bound.definite and not self.is_large
-        return Searched(self.part, found, self.whole.full.order, self.stages, self if keeps else None)
-
-    def has_twin(self, found: Found) -> bool:
-        """Whether descents from random starts find another answer of the same cost.
-
-        The information matrix shows only the neighbourhood of the answer. If there is a twin far away, Z is not
-        positive definite: only then is this function called.
-        """
-        with self.stages.of("twins"):
-            for start in self.random_starts(2 * self.options.random_starts):
-                end = descend(self.form, start, self.options.max_descent_iterations)
-                elsewhere = float(np.abs(end.R - found.R).max(initial=0.0)) > TWIN_DISTANCE
-                if elsewhere and end.cost <= found.cost + max(self.tolerance(found.cost), self.rounding):
-                    return self._has_positive_scales(end.R)
-        return False
-
-    def _has_positive_scales(self, R: Array) -> bool:
-        return answer_of(self.part, self.form, R).has_positive_scales
-
-    def _relax(self) -> Relaxation:
-        options = self.options
-        with self.stages.of("semidefinite relaxation"):
-            return solve_relaxation(
-                self.whole.reduced.Q,
-                options.relaxation_tolerance,
-                options.max_relaxation_iterations,
-                self.stages.progress,
-            )
