@@ -22,9 +22,8 @@ from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.pair_data import PairData, local_paths
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.geometry.carrier_motion import WINDOW_S, LocalPaths
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.geometry.trajectory import WINDOW_S, LocalPaths, Trajectory
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected

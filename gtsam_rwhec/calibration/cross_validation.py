@@ -21,14 +21,13 @@ from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.carrier_motion import LocalPaths
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
+from gtsam_rwhec.geometry.trajectory import LocalPaths
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.certified_solution import solve
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
 Split = Literal["time", "pair", "sensor"]

@@ -21,8 +21,7 @@ from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.certified_solution import solve
-from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by
+from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by, solve
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.certified_solution import solve
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
 SIZE_SIGMAS = 5.0

@@ -32,9 +32,8 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.certified_solution import solve
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Standard deviations about the axis with the second most turning: below this the carriers turned too little.
 LITTLE_RAD = float(np.radians(2.0))

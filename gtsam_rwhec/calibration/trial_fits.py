@@ -25,11 +25,10 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.answers import answer_of, scales_of
-from gtsam_rwhec.solver.descent import descend
+from gtsam_rwhec.solver.descent import descend, spectral_start, unconstrained_start
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.starts import spectral_start, unconstrained_start
 
 #: The median length of a Gaussian vector in three dimensions, in its standard deviations about one axis.
 MEDIAN_OF_CHI = 1.5382

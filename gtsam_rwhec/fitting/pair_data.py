@@ -11,9 +11,8 @@ from rwhec_factors.batch import BatchResiduals, Linearization
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, NoiseGroups, RefineOptions
-from gtsam_rwhec.geometry.carrier_motion import SAME_POSE, LocalPaths
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.geometry.trajectory import SAME_POSE, LocalPaths, Trajectory
 from gtsam_rwhec.problem.measurements import Pair, checked_covariances
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import VarianceFactors

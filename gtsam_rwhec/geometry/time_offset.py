@@ -19,9 +19,8 @@ from scipy.ndimage import median_filter
 from scipy.special import stdtrit
 
 from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.geometry.carrier_motion import SmoothPath
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.geometry.trajectory import SmoothPath, Trajectory
 
 #: Shares of the variance that fade, and time constants (s), which are compared by likelihood. The last ones are random
 #: walks over seconds to minutes.

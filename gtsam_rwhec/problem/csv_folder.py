@@ -27,8 +27,7 @@ from gtsam_rwhec.errors import FileFormatError, RwhecWarning
 from gtsam_rwhec.files.terminal_text import brief, natural_key, shown
 from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
-from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
+from gtsam_rwhec.problem.measurements import GivenMeasurements, LongTranslations, Pair, warn_of_millimetres
 from gtsam_rwhec.problem.problem import Problem
 
 COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")

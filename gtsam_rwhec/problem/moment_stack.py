@@ -33,7 +33,7 @@ _FULL: np.ndarray = np.maximum(_UPPER, _UPPER.T).ravel()
 _I3 = np.eye(3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MomentStack:
     """Moments of E pairs, as in `Moments`, in the order of the pairs.
 
@@ -223,7 +223,8 @@ class MomentStack:
 
     def is_finite(self) -> np.ndarray:
         """(E,): whether the sums of a pair are numbers that did not overflow."""
-        return np.isfinite(self.front).all(axis=1)
+        finite: np.ndarray = np.isfinite(self.front).all(axis=1)
+        return finite
 
     def squares(self, features: slice) -> Array:
         """(E,): the sum of the weighted squares of t_A or t_B."""

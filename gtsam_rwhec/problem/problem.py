@@ -23,9 +23,14 @@ from gtsam_rwhec.problem.corners import (
     seen_corners,
 )
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
-from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
 from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section
-from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pair
+from gtsam_rwhec.problem.measurements import (
+    GivenMeasurements,
+    LongTranslations,
+    Measurements,
+    Pair,
+    warn_of_millimetres,
+)
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 

@@ -32,8 +32,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.certified_solution import solve
 from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.solution import solve
 
 #: A measurement that is farther off than this many times the median, as seen from either end, is a gross error.
 GROSS = 10.0

@@ -28,7 +28,7 @@ from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.log_findings import is_of_the_poses
 from gtsam_rwhec.runs.settled_poses import SettledPoses, settled_poses
 from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
-from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.solution import solve
 
 
 @dataclass(frozen=True, eq=False)

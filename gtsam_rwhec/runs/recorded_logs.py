@@ -41,7 +41,7 @@ from gtsam_rwhec.logs.records import Array, DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA, image_key
-from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.solution import solve
 
 #: Images that were taken at rest have stamps this far apart, nanoseconds: further than poses are interpolated.
 APART_NS = 10**9

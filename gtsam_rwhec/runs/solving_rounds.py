@@ -29,7 +29,7 @@ from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, problem_of
-from gtsam_rwhec.solver.certified_solution import solve
+from gtsam_rwhec.solver.solution import solve
 
 Pairs = dict[Pair, MeasuredPairs]
 #: A solution serves to find outliers, to estimate time offsets, as the answer, or for plots of what was misread.

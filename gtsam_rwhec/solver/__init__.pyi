@@ -9,8 +9,8 @@ from .certificate import Objective as Objective
 from .solve_options import SolveOptions as SolveOptions
 from .region import Region as Region
 from .answers import Residual as Residual
-from .certified_solution import certify as certify
-from .certified_solution import solve as solve
+from .solution import certify as certify
+from .solution import solve as solve
 from .solution import Solution as Solution
 from .solution import SolvedPart as SolvedPart
 from .free_directions import FreeDirection as FreeDirection

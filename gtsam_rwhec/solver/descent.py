@@ -11,9 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import ONE, R_A
+from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
 from gtsam_rwhec.solver.graph_form import GraphForm
+from gtsam_rwhec.solver.parts import Part, connected_components
 from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.rotations import retract, tangent_basis, vec
+from gtsam_rwhec.solver.rotations import project, retract, tangent_basis, unvec, vec
 
 #: What a search looks for answers in: Q' as a matrix, or as a product that follows the graph.
 SearchForm = ReducedForm | GraphForm
@@ -75,3 +78,102 @@ def descend(form: SearchForm, R: Array, max_iterations: int) -> Descent:
         if (length < 1e-9 or decrease < 1e-2 * rounding) and damping <= floor:
             return Descent(R, cost, iteration + 1, converged=True)
     return Descent(R, cost, max_iterations, converged=False)
+
+
+#: This part of the diagonal is added to it: exact data make the form singular.
+SHIFT = 1e-9
+#: Inverse iterations at most, and the change of a unit vector at which they end: the start need not be exact.
+ITERATIONS, SMALL = 40, 1e-3
+#: Inverse iterations with Q' as a whole.
+FEW_ITERATIONS = 8
+
+
+def spectral_start(part: Part, rotation: BlockMatrix) -> list[Array]:
+    """Rotations that minimise the rotation residuals over all matrices, projected to SO(3); (n, 3, 3) each.
+
+    ``rotation`` is the form of these residuals, 9 numbers a frame and the tail [alpha, h]. With exact data the
+    minimisers are a line through the truth (Corollary 2), so the smallest eigenvector, with each frame in units of its
+    own diagonal, is the truth up to its sign. Known frames and priors add terms with h; then both signs are returned,
+    and the cost decides.
+    """
+    n, of_h = len(rotation.frames), rotation.tails[:, :, 1:]
+    is_anchored = bool(of_h.any())
+    tail = rotation.tail[1:, 1:] if is_anchored else np.ones((1, 1))
+    matrix = BlockMatrix(rotation.order, rotation.frames, rotation.couplings, of_h, tail)
+    weights = np.maximum(np.einsum("nii->n", rotation.frames) / 9.0, 1e-290)
+    weight = np.append(np.repeat(weights, 9), max(float(tail[0, 0]), 1e-290))
+    factor = matrix.plus(SHIFT * weight).factor()
+    if factor is None:
+        return [np.tile(np.eye(3), (n, 1, 1))]
+    if is_anchored:
+        r = _smallest(factor, weight, np.ones(matrix.size))
+        return [project(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
+    # Components that only the shared scale joins each have an eigenvector and a sign.
+    r = np.zeros(9 * n)
+    place = {name: i for i, name in enumerate(part.free)}
+    for names in connected_components(part.pairs) if part.scale == "shared" else [list(part.free)]:
+        members = np.array([place[name] for name in names if name in place], dtype=int)
+        begin = np.zeros((n, 9))
+        begin[members] = np.random.default_rng(0).standard_normal((len(members), 9))
+        v = _smallest(factor, weight, np.append(begin.ravel(), 0.0))[:-1]
+        r += v * _handedness(v)
+    return [project(unvec(r))]
+
+
+def unconstrained_start(form: SearchForm) -> list[Array]:
+    """Minimisers of x'Q'x over all matrices: with h = 1 where Q' has linear terms, and the smallest eigenvector.
+
+    Q' has the translation residuals too, so these starts can be better where rotations alone are poorly excited.
+    """
+    solved = form.solver(1e-12 * form.magnitude)
+    if solved is None:
+        return []
+    linear = form.apply(np.append(np.zeros(form.size - 1), 1.0))[:-1]
+    candidates = [solved(-linear)] if linear.any() else []
+    v: Array = np.ones(form.size - 1)
+    for _ in range(FEW_ITERATIONS):
+        v = solved(v)
+        v /= np.linalg.norm(v)
+    candidates.append(v * _handedness(v))
+    return [project(unvec(r)) for r in candidates]
+
+
+def mirrored(part: Part, R: Array) -> Array:
+    """Rotations (n, 3, 3) of the form's variables after a half turn of all frames about the motions' main axis.
+
+    The mirror image costs the same when the motion is planar and the scale unknown. Let every A turn about one axis
+    (u_s in the sensor carrier, u_t in the target carrier, A u_t = u_s) and translate at right angles to it. Then each
+    residual is a component along the axis plus an independent one at right angles to it. A half turn of all frames
+    about the axis changes the sign of the second one, and so does a negative scale: (H R, -alpha) and (R, alpha) cost
+    the same. Both have det R = 1, but only one of them has a positive scale.
+    """
+    sums = part.moments.entries(R_A, np.array([ONE])).reshape(-1, 3, 3).transpose(0, 2, 1)
+    still = ~part.moments.motion
+    if still.any():
+        U, _, Vt = np.linalg.svd(sums[still].sum(axis=0))
+        of_sensor, of_target = U[:, 0], Vt[0]
+    else:  # both ends of a motion are the sensor's carrier
+        turned = sums.sum(axis=0)
+        of_sensor = of_target = np.linalg.eigh(turned + turned.T)[1][:, -1]
+    axes = np.array([of_target if name in part.targets else of_sensor for name in part.free])
+    half_turns = 2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
+    result: Array = half_turns @ R if part.kind == "direct" else R @ half_turns
+    return result
+
+
+def _smallest(factor: BlockFactor, weight: Array, v: Array) -> Array:
+    """The smallest eigenvector, beside the diagonal ``weight``, that ``v`` has a part of: by inverse iteration."""
+    v = v / np.sqrt(float(weight @ v**2))
+    for _ in range(ITERATIONS):
+        after = factor.solve_vector(weight * v)
+        after /= np.sqrt(float(weight @ after**2))
+        change = np.sqrt(float(weight @ (after - v) ** 2))
+        v = after
+        if change < SMALL:
+            break
+    return v
+
+
+def _handedness(r: Array) -> float:
+    """+1 or -1, so that the blocks of r are right-handed (design fact 5)."""
+    return 1.0 if float(np.sign(np.linalg.det(unvec(r))).sum()) >= 0.0 else -1.0

@@ -218,9 +218,8 @@ class PairsAlone:
         by_rotations = settled[:, 0] & (of_rotations * limit < weakest * of_turning)
         weakest[by_rotations], limit[by_rotations] = of_rotations[by_rotations], of_turning[by_rotations]
         begin = at.indices(len(self.pairs))[0]
-        found = {
-            e: self._free_directions(begin + e, directions[e][:, free[e]]) for e in np.flatnonzero(free.any(axis=1))
-        }
+        some = np.flatnonzero(free.any(axis=1)).tolist()
+        found = {e: self._free_directions(begin + e, directions[e][:, free[e]]) for e in some}
         each = zip(self.pairs[at], axes.tolist(), counts.tolist(), weakest.tolist(), limit.tolist(), strict=True)
         return {
             pair: PairIdentifiability(e not in found, found.get(e, ()), turned, count, least, up_to)

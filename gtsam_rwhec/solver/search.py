@@ -14,7 +14,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.answers import Answer, Evaluation, answer_of
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.certificate import Cause, Multipliers, SearchPath, Start
-from gtsam_rwhec.solver.descent import Descent, SearchForm, descend
+from gtsam_rwhec.solver.descent import Descent, SearchForm, descend, mirrored, spectral_start, unconstrained_start
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.local_dual import LocalDual, improve_locally, relax_locally
 from gtsam_rwhec.solver.part_form import PartForm
@@ -23,7 +23,6 @@ from gtsam_rwhec.solver.relaxation import Relaxation, round_to_rotations, solve_
 from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec
 from gtsam_rwhec.solver.small_dual import improve, stationary_multipliers
 from gtsam_rwhec.solver.solve_options import Method, SolveOptions
-from gtsam_rwhec.solver.starts import mirrored, spectral_start, unconstrained_start
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import gtsam
+import numpy as np
 from scipy.special import chdtr, chdtrc
 
+from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError, WeightsWarning
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.solver.answers import Residual
-from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.identification import Identifiability
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.answers import (
+    Answer,
+    PairPoses,
+    Residual,
+    as_point,
+    costs_of_pairs,
+    given_answer,
+    given_translations,
+    residuals_of_pairs,
+    rotations_as_variables,
+    scales_of,
+)
+from gtsam_rwhec.solver.certificate import Basis, Cause, Certificate, Objective
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.solver.identification import Identifiability, identify
+from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale
+from gtsam_rwhec.solver.parts import Part, connected_components, parts_of
+from gtsam_rwhec.solver.region import scale_ratio
+from gtsam_rwhec.solver.search import Search, Searched
+from gtsam_rwhec.solver.solve_options import (
+    Method,
+    Poses,
+    Scale,
+    SolveOptions,
+    check_against_knowledge,
+    check_method,
+    check_types,
+)
 
 
 @dataclass(frozen=True)
@@ -103,3 +135,320 @@ def overstated_by(cost: float, degrees_of_freedom: int) -> float | None:
         return None
     ratio = cost / (0.5 * degrees_of_freedom)
     return ratio if ratio < FAR_SMALLER and chdtr(degrees_of_freedom, 2.0 * cost) < CHANCE else None
+
+
+TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)
+
+
+@dataclass(frozen=True)
+class PartSolution:
+    """One solved part; ``residual_cost`` is the cost of its measurements alone, in the physical model."""
+
+    part: Part
+    answer: Answer
+    certificate: Certificate
+    identifiability: Identifiability
+    residuals: dict[Pair, Residual]
+    residual_cost: float
+
+    @staticmethod
+    def of(searched: Searched) -> PartSolution:
+        """Complete what a search found; a ``ScaleError`` for a scale that is not positive."""
+        part, found = searched.part, searched.found
+        with searched.stages.of("identifiability"):
+            answer = found.answer
+            _check_scale(part, answer, found.is_closed)
+            poses = PairPoses.of(part, answer)
+            J_t, J_R = costs_of_pairs(part, poses)
+            known = identify(part, poses, J_t, J_R, searched.order)
+        bound = found.bound
+        if not (np.isfinite(bound.lower_bound) and np.isfinite(found.cost)):
+            found = replace(found, cause=Cause.NO_BOUND, figures={})
+        elif found.is_closed and not known.is_unique:
+            number = float(len(known.free_directions))
+            found = replace(found, cause=Cause.FREE_DIRECTIONS, figures={"free_directions": number})
+        elif found.is_closed and not bound.definite and searched.has_twin:
+            found = replace(found, cause=Cause.TWIN, figures={})
+            known = replace(known, is_unique=False, free_directions=(TWIN,))
+        certificate = Certificate(
+            status=found.cause.status,
+            cause=found.cause,
+            objective=Objective.of(part),
+            basis=Basis.MOMENTS if part.given is None else Basis.MEASUREMENTS,
+            region=bound.region,
+            path=found.path,
+            cost=found.cost,
+            lower_bound=bound.lower_bound,
+            float_bound=bound.value if bound.definite else bound.lower_bound,
+            min_eigenvalue=-max(found.cost - bound.lower_bound, 0.0) if bound.definite else bound.eigenvalue,
+            tolerance=found.tolerance,
+            is_relative=part.is_relative,
+            seconds=dict(searched.stages.seconds),
+            figures=found.figures,
+        )
+        residuals = residuals_of_pairs(part, poses, J_t, J_R)
+        return PartSolution(part, answer, certificate, known, residuals, float(J_t.sum() + J_R.sum()))
+
+
+def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
+    of_frame = scales_of(part, answer)
+    scales = {"the scale": answer.scale} if part.scale == "shared" else {}
+    scales |= {f"the scale of {name}": of_frame[name] for name in part.free if name in part.scale_owners}
+    for what, value in scales.items():
+        if not (np.isfinite(value) and value > 0.0):
+            raise ScaleError(
+                f"{what} is {value:.6g} at the {'optimum' if proven else 'best point found'}, which no real target "
+                "has. Either the poses contradict the frame convention (is B = T_sensor_target? is A inverted?), or "
+                "the motion was planar, where a mirror image fits too (turn about a second axis), or the "
+                "noise is too large to find the scale (SolveOptions(nonnegative_scale=True) constrains a shared one)"
+            )
+
+
+#: Images contradict A where their poses are farther off than any arm or tracker is: rad, m.
+ARM_RAD, ARM_M = np.radians(1.0), 0.01
+
+
+def solve(
+    problem: Problem,
+    method: Method = "auto",
+    *,
+    initial: tuple[Poses, Poses, Scale] | None = None,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+) -> Solution:
+    """Find the globally optimal poses and scale, with a proof (RWHEC paper, Algorithm 1).
+
+    Parameters
+    ----------
+    problem : Problem
+    method : "auto", "sdp" or "local"
+        "auto" descends from a spectral start, certifies by duality, and searches further only if this does not prove
+        the answer. "sdp" always solves the semidefinite relaxation. "local" descends from ``initial``.
+    initial : (X, Y, scale), optional
+        Poses by name, for "local".
+    options : SolveOptions, optional
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Returns
+    -------
+    Solution
+        A warning says when the measurements leave a direction free (``NotUniqueWarning``), when the answer is not
+        proven optimal (``NotCertifiedWarning``), or when the residuals contradict the weights (``WeightsWarning``).
+
+    Raises
+    ------
+    CountError, FrameError, PriorError, UnderdeterminedError
+        For a problem that cannot be solved.
+    ScaleError
+        When a scale is not positive at the optimum.
+    """
+    check_method(method)
+    check_types(problem, options, progress)
+    options = options or SolveOptions()
+    if method == "local" and initial is None:
+        raise OptionError("method='local' needs initial=(X, Y, scale): poses by name to descend from")
+    if method != "local" and initial is not None:
+        raise OptionError(f"initial= is for method='local'; method={method!r} makes its own start")
+    if options.nonnegative_scale and problem.scale != "shared":
+        raise OptionError(f"nonnegative_scale constrains a shared scale; this problem has scale={problem.scale!r}")
+    if initial is not None:
+        if not (isinstance(initial, tuple) and len(initial) == 3):
+            raise OptionError(
+                "initial is (X, Y, scale): poses of targets and of sensors by name, and a scale (1.0 if known)"
+            )
+        check_against_knowledge(problem, *initial)
+    with one_blas_thread(), np.errstate(all="ignore"):
+        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem)]
+    return _merge(problem, results)
+
+
+def _solved(
+    part: Part,
+    method: Method,
+    initial: tuple[Poses, Poses, Scale] | None,
+    options: SolveOptions,
+    progress: Progress | None,
+) -> PartSolution:
+    """The solution of one part. The search ends, and leaves its forms, before the rest begins."""
+    return PartSolution.of(_searched(part, method, initial, options, progress))
+
+
+def _searched(
+    part: Part,
+    method: Method,
+    initial: tuple[Poses, Poses, Scale] | None,
+    options: SolveOptions,
+    progress: Progress | None,
+) -> Searched:
+    """What the search of one part finds."""
+    search = Search.of(part, options, progress)
+    if options.nonnegative_scale:
+        found = run_with_nonnegative_scale(search)
+    elif initial is not None:
+        given = given_answer(part, *initial)
+        found = search.run(method, rotations_as_variables(part, given.R))
+    else:
+        found = search.with_positive_scale(search.run(method, None))
+    return search.ended(found)
+
+
+@one_blas_thread()
+@np.errstate(all="ignore")
+def certify(
+    problem: Problem,
+    X: Poses,
+    Y: Poses,
+    scale: Scale = 1.0,
+    *,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+) -> Certificate:
+    """Certify a given answer: compare its cost with a rigorous lower bound on the cost of every answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    X, Y : dict of str to pose
+        T_targetcarrier_target and T_sensorcarrier_sensor.
+    scale : float or dict of str to float
+        One number, or one for each target with scale="per_target".
+    options : SolveOptions, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Certificate
+        It is about the answer as given. ``Cause.BETTER_ANSWER`` means that the search found a better answer.
+        ``Cause.NO_BOUND`` means that it found no finite lower bound, whether it found a better answer or not.
+
+    Raises
+    ------
+    FrameError, PoseError, ScaleError
+        For an answer that lacks a frame, or has an invalid pose or scale.
+    PriorError, ScaleError
+        For an answer that contradicts a fixed frame or a known scale.
+    """
+    check_types(problem, options, progress)
+    options = options or SolveOptions()
+    parts = parts_of(problem)
+    check_against_knowledge(problem, X, Y, scale)
+    certificates = []
+    for part in parts:
+        given = given_answer(part, X, Y, scale)
+        search = Search.of(part, options, progress, contains=given)
+        found = search.run("auto", rotations_as_variables(part, given.R))
+        evaluation = search.whole.evaluated(given, given_translations(part, X, Y))
+        cost = evaluation.upper
+        if not np.isfinite(cost):
+            raise ScaleError("the cost of the answer overflows; are its translations in metres, and its scale right?")
+        tolerance = search.tolerance(cost)
+        best = PartSolution.of(search.ended(found)).certificate
+        gap = cost - found.bound.lower_bound
+        cause, figures = best.cause, best.figures
+        if best.cause is not Cause.NO_BOUND and (
+            cost - found.cost > tolerance or (gap > tolerance and best.is_optimal)
+        ):
+            cause, figures = Cause.BETTER_ANSWER, {"better_cost": found.cost}
+        lower, floating = min(best.lower_bound, cost), min(best.float_bound, cost)
+        region = best.region and best.region.around(*_distance(part, found.answer, given))
+        best = replace(best, cost=cost, lower_bound=lower, float_bound=floating, tolerance=tolerance, region=region)
+        certificates.append(replace(best, status=cause.status, cause=cause, figures=figures))
+    return Certificate.merged(certificates)
+
+
+def _distance(part: Part, first: Answer, second: Answer) -> tuple[float, float]:
+    """How far apart the translations of two answers are at most, in metres, and the largest ratio of their scales."""
+    distance = float(np.linalg.norm(first.t - second.t, axis=1).max(initial=0.0))
+    return distance * (1.0 + 1e-9), scale_ratio(as_point(part, first), as_point(part, second))
+
+
+def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
+    """One solution of all parts, with the warnings."""
+    poses = {name: to_pose3(T[:3, :3], T[:3, 3]) for name, T in problem.fixed.items()}
+    scales: dict[str, float] = {}
+    residuals: dict[Pair, Residual] = {}
+    for result in results:
+        part, answer = result.part, result.answer
+        for name, R, t in zip(part.free, answer.R, answer.t, strict=True):
+            poses[name] = to_pose3(R, t + part.frame_shift(name))
+        scales |= scales_of(part, answer)
+        residuals |= result.residuals
+    certificate = Certificate.merged([result.certificate for result in results])
+    _warn_of_weights(problem, results)
+    # Only a scale that all share makes one part of what no measurement connects.
+    components = tuple(result.part.names for result in results)
+    if problem.scale == "shared":
+        components = tuple(tuple(component) for component in connected_components(problem.pairs))
+    known = Identifiability.merged([result.identifiability for result in results], components)
+    if not known.is_unique:
+        warnings.warn(
+            "the measurements do not determine the answer: " + "; ".join(map(str, known.free_directions)),
+            NotUniqueWarning,
+            stacklevel=3,
+        )
+    if not certificate.is_optimal:
+        warnings.warn(f"not proven optimal: {certificate.reason}", NotCertifiedWarning, stacklevel=3)
+    scale: float | dict[str, float] = 1.0
+    if problem.scale == "per_target":
+        scale = {name: scales[name] for name in dict.fromkeys(t for t, _ in problem.pairs)}
+    elif problem.scale == "shared":
+        scale = results[0].answer.scale
+    return Solution(
+        X={name: poses[name] for name in problem.targets},
+        Y={name: poses[name] for name in problem.sensors},
+        scale=scale,
+        scale_mode=problem.scale,
+        cost=certificate.cost,
+        is_relative=problem.is_relative,
+        certificate=certificate,
+        identifiability=known,
+        residuals={pair: residuals[pair] for pair in problem.pairs},
+        parts=tuple(SolvedPart(result.part.names, result.certificate) for result in results),
+    )
+
+
+def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
+    """Warn where the residuals contradict the weights."""
+    # The inverse equation weights residuals otherwise than the physical model, so its cost says nothing about the
+    # noise.
+    if problem.is_relative or any(result.part.kind == "inverse" for result in results):
+        return
+    cost = sum(result.residual_cost for result in results)
+    degrees_of_freedom = sum(6 * r.part.number_of_measurements - r.part.number_of_unknowns for r in results)
+    ratio = contradicted_by(cost, degrees_of_freedom)
+    if ratio is not None and _is_from_corners(problem):
+        _warn_of_images(results)
+    elif ratio is not None:
+        warnings.warn(
+            f"the residuals cost {cost:.4g}, {ratio:.3g} times what sigma and kappa predict ({cost / ratio:.4g}): the "
+            "noise is larger than they say, some measurements are wrong, or A or B is inverted",
+            WeightsWarning,
+            stacklevel=4,
+        )
+
+
+def _is_from_corners(problem: Problem) -> bool:
+    """Whether ``add_corners`` made all measurements: nobody stated their noise."""
+    return all(pair.target in problem.boards and pair.sensor in problem.cameras for pair in problem.pairs)
+
+
+def _warn_of_images(results: list[PartSolution]) -> None:
+    """Warn where images contradict A by more than any arm is off.
+
+    B's covariance is that of the corners' noise alone: errors of A and of intrinsics, which every rig has, are not in
+    it, so that a cost above the expected one is no news.
+    """
+    found = {pair: residual for result in results for pair, residual in result.residuals.items()}
+    size = {pair: max(of.rotation_rms_rad / ARM_RAD, of.translation_rms_m / ARM_M) for pair, of in found.items()}
+    pair = max(size, key=size.__getitem__)
+    worst = found[pair]
+    if size[pair] > 1.0:
+        warnings.warn(
+            f"the target's poses by the corners of {pair} are off by {np.degrees(worst.rotation_rms_rad):.2g} degrees "
+            f"and {1e3 * worst.translation_rms_m:.3g} mm (rms) from what A and the answer predict, more than an arm or "
+            "a tracker is: A is inverted, in another unit or of other images, the board's size is wrong, intrinsics "
+            "are far off, or some images are misread (refine with robust='gnc')",
+            WeightsWarning,
+            stacklevel=5,
+        )

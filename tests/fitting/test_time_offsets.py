@@ -10,7 +10,7 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry import Trajectory
-from gtsam_rwhec.geometry.carrier_motion import LocalPaths
+from gtsam_rwhec.geometry.trajectory import LocalPaths
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 

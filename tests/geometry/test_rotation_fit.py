@@ -8,8 +8,8 @@ from rwhec_factors import se3
 from turning_tracks import X, Y, path
 
 from gtsam_rwhec.geometry import Trajectory
-from gtsam_rwhec.geometry.carrier_motion import SmoothPath
 from gtsam_rwhec.geometry.time_offset import RotationFit, RotationProblem
+from gtsam_rwhec.geometry.trajectory import SmoothPath
 
 STAMPS = np.arange(500) * 20_000_000
 SEEN = 500_000_000 + np.arange(120) * 70_000_000

@@ -8,7 +8,7 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry import Trajectory
-from gtsam_rwhec.geometry.carrier_motion import SmoothPath
+from gtsam_rwhec.geometry.trajectory import SmoothPath
 
 STAMPS = np.arange(1000) * 10_000_000
 INSIDE = np.arange(500_000_000, 9_000_000_000, 13_000_001)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from turning_tracks import Y, carrier, track
 
-from gtsam_rwhec.geometry.carrier_motion import SmoothPath
 from gtsam_rwhec.geometry.time_offset import Turns, aligned
+from gtsam_rwhec.geometry.trajectory import SmoothPath
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 

@@ -13,14 +13,13 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.bound import Bound, lower_bound
-from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
+from gtsam_rwhec.solver.descent import Descent, descend, homogeneous, spectral_start
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, vec
 from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.starts import spectral_start
 
 #: One centimetre, and half a degree about each axis.
 SMALL_NOISE = Noise(0.01, 6500.0)

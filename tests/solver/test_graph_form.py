@@ -16,13 +16,12 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import part_form
 from gtsam_rwhec.solver.answers import answer_of
-from gtsam_rwhec.solver.descent import descend, homogeneous
+from gtsam_rwhec.solver.descent import descend, homogeneous, spectral_start, unconstrained_start
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.graph_form import GraphForm
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT, kkt_multipliers, random_rotations, tangent_basis
-from gtsam_rwhec.solver.starts import spectral_start, unconstrained_start
 
 
 @pytest.fixture

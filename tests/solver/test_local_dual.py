@@ -11,7 +11,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.certificate import Cause, Multipliers
-from gtsam_rwhec.solver.descent import descend
+from gtsam_rwhec.solver.descent import descend, spectral_start
 from gtsam_rwhec.solver.local_dual import (
     OF_Q,
     OF_Z,
@@ -27,7 +27,6 @@ from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.relaxation import solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.starts import spectral_start
 
 
 def form_of(form: PartForm, R: Array, frames: list[int]) -> tuple[LocalForm, Evaluation, Array]:

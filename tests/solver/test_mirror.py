@@ -8,9 +8,8 @@ from small_problems import part_of, reduced, searched, simulated, true_rotations
 
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.solver.answers import answer_of
-from gtsam_rwhec.solver.descent import cost_of
+from gtsam_rwhec.solver.descent import cost_of, mirrored
 from gtsam_rwhec.solver.rotations import random_rotations
-from gtsam_rwhec.solver.starts import mirrored
 
 
 @pytest.mark.parametrize(("sides", "odometry"), [((2, 2), 0), ((1, 3), 0), ((0, 1), 6), ((2, 1), 6)])

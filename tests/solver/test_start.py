@@ -9,9 +9,9 @@ from small_problems import GROSS_NOISE, part_of, simulated, true_rotations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Simulation
+from gtsam_rwhec.solver.descent import spectral_start, unconstrained_start
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.starts import spectral_start, unconstrained_start
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
