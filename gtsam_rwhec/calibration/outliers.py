@@ -5,27 +5,18 @@ agrees with itself far better than what was kept (a planar target that is seen f
 """
 
 from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
+
 import numpy as np
-from gtsam_rwhec.calibration.calibrate_options import Run
-from gtsam_rwhec.calibration.calibrate_options import offsets_of
-from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI
-from gtsam_rwhec.calibration.trial_fits import Sample
-from gtsam_rwhec.calibration.trial_fits import Sampled
-from gtsam_rwhec.calibration.trial_fits import TrialFit
-from gtsam_rwhec.calibration.trial_fits import fitted
-from gtsam_rwhec.calibration.trial_fits import implausible
-from gtsam_rwhec.calibration.trial_fits import residuals
-from gtsam_rwhec.calibration.verdict import OUTLIERS
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.errors import OutlierError
-from gtsam_rwhec.errors import ScaleError
+
+from gtsam_rwhec.calibration.calibrate_options import Run, offsets_of
+from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Sampled, TrialFit, fitted, implausible, residuals
+from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
+from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.robust_solution import robust_solution
@@ -33,8 +24,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.solution import solve
+from gtsam_rwhec.solver.solution import Solution, solve
 
 #: "Half of its measurements".
 HALF = 0.5

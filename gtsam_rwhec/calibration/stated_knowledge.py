@@ -5,41 +5,41 @@ without what was stated; what they say is compared with it under both covariance
 """
 
 from __future__ import annotations
+
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.calibration.calibrate_options import Run
-from gtsam_rwhec.calibration.moved_frames import Measured
-from gtsam_rwhec.calibration.moved_frames import TwoPoses
-from gtsam_rwhec.calibration.moved_frames import by_station
-from gtsam_rwhec.calibration.moved_frames import means_of
-from gtsam_rwhec.calibration.moved_frames import moved_frame
-from gtsam_rwhec.calibration.moved_frames import moved_with_outliers
-from gtsam_rwhec.calibration.moved_frames import residual_twists
-from gtsam_rwhec.calibration.moved_frames import two_poses
+from gtsam_rwhec.calibration.moved_frames import (
+    Measured,
+    TwoPoses,
+    by_station,
+    means_of,
+    moved_frame,
+    moved_with_outliers,
+    residual_twists,
+    two_poses,
+)
 from gtsam_rwhec.calibration.noise_choice import estimated
 from gtsam_rwhec.calibration.outliers import Inliers
-from gtsam_rwhec.calibration.sizes import TargetSize
-from gtsam_rwhec.calibration.sizes import common_factor
-from gtsam_rwhec.calibration.sizes import sizes
+from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
-from gtsam_rwhec.fitting.noise_search import CORRELATED
-from gtsam_rwhec.fitting.noise_search import likeness_of_neighbours
+from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.robust_solution import robust_solution
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS
-from gtsam_rwhec.problem.knowledge import Prior
+from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS, Prior
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected

@@ -1,67 +1,56 @@
 """Refinement from corners: GTSAM's optimum, the noise that the corners have, and what was stated and is not so."""
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.fitting.corner_checks import check_arguments
-from gtsam_rwhec.fitting.corner_checks import check_clocks
-from gtsam_rwhec.fitting.corner_checks import check_corners
-from gtsam_rwhec.fitting.corner_checks import check_determined
-from gtsam_rwhec.fitting.corner_checks import check_motion
-from gtsam_rwhec.fitting.corner_checks import check_names
-from gtsam_rwhec.fitting.corner_checks import check_options
-from gtsam_rwhec.fitting.corner_checks import check_rays
-from gtsam_rwhec.fitting.corner_checks import farthest
-from gtsam_rwhec.fitting.corner_checks import few_corners
-from gtsam_rwhec.fitting.corner_checks import findings_of_images_left_out
-from gtsam_rwhec.fitting.corner_checks import first_of
-from gtsam_rwhec.fitting.corner_checks import told_where_it_fails
+from gtsam_rwhec.errors import CameraError, RwhecWarning
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.corner_checks import (
+    check_arguments,
+    check_clocks,
+    check_corners,
+    check_determined,
+    check_motion,
+    check_names,
+    check_options,
+    check_rays,
+    farthest,
+    few_corners,
+    findings_of_images_left_out,
+    first_of,
+    told_where_it_fails,
+)
 from gtsam_rwhec.fitting.corner_findings import findings_of
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
-from gtsam_rwhec.fitting.corner_model import BEHIND
-from gtsam_rwhec.fitting.corner_model import Model
-from gtsam_rwhec.fitting.corner_model import Point
-from gtsam_rwhec.fitting.corner_noise import Noise
-from gtsam_rwhec.fitting.corner_noise import Reduced
-from gtsam_rwhec.fitting.corner_noise import degrees_of_freedom
-from gtsam_rwhec.fitting.corner_noise import weights_of
-from gtsam_rwhec.fitting.corner_residuals import SHAPE
-from gtsam_rwhec.fitting.corner_residuals import shaped
-from gtsam_rwhec.fitting.corner_residuals import stacks_of
-from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
-from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.fit_options import CornerOptions
-from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.observations import first_intrinsics
-from gtsam_rwhec.fitting.observations import solved_with_chosen_poses
+from gtsam_rwhec.fitting.corner_model import BEHIND, Model, Point
+from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, degrees_of_freedom, weights_of
+from gtsam_rwhec.fitting.corner_residuals import SHAPE, shaped, stacks_of
+from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions, RefineOptions
+from gtsam_rwhec.fitting.observations import Observations, first_intrinsics, solved_with_chosen_poses
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.stated_intrinsics import Innovation
-from gtsam_rwhec.fitting.stated_intrinsics import camera_with
-from gtsam_rwhec.fitting.stated_intrinsics import free_model
-from gtsam_rwhec.fitting.stated_intrinsics import innovation_of
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
-from gtsam_rwhec.fitting.stated_intrinsics import prior_of
-from gtsam_rwhec.fitting.stated_intrinsics import wider
+from gtsam_rwhec.fitting.stated_intrinsics import (
+    Innovation,
+    camera_with,
+    free_model,
+    innovation_of,
+    parameters_of,
+    prior_of,
+    wider,
+)
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.geometry.poses import one_transform
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.solution import solve
+from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3

@@ -1,63 +1,46 @@
 """``refine``: GTSAM's poses and covariances under the full noise model, from the certified solution."""
 
 from __future__ import annotations
+
 import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
+
 import gtsam
 import numpy as np
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.errors import NotConvergedWarning
-from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.errors import WeightsWarning
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import check_progress
-from gtsam_rwhec.files.progress import silent
+
+from gtsam_rwhec.errors import (
+    FrameError,
+    NotConvergedWarning,
+    NotUniqueWarning,
+    OptionError,
+    RwhecWarning,
+    ScaleError,
+    WeightsWarning,
+)
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.fitting.admission import inlier_threshold
 from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.free_space import FreeSpace
-from gtsam_rwhec.fitting.free_space import free_space_of
+from gtsam_rwhec.fitting.free_space import FreeSpace, free_space_of
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.pair_data import FactorsByPair
-from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pair_data import group_of
-from gtsam_rwhec.fitting.pair_data import local_paths
-from gtsam_rwhec.fitting.pair_data import residual_covariance
-from gtsam_rwhec.fitting.pose_fit import Model
-from gtsam_rwhec.fitting.pose_fit import SettledFit
-from gtsam_rwhec.fitting.pose_fit import fit
-from gtsam_rwhec.fitting.pose_models import ChordalModel
-from gtsam_rwhec.fitting.pose_models import GeodesicModel
-from gtsam_rwhec.fitting.pose_models import linearized
-from gtsam_rwhec.fitting.refined import FactorGraph
-from gtsam_rwhec.fitting.refined import Movement
-from gtsam_rwhec.fitting.refined import PairNoise
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.robust_solution import Inliers
-from gtsam_rwhec.fitting.robust_solution import robust_solution
-from gtsam_rwhec.fitting.robust_solution import until_inliers_stay
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.fitting.unknowns import UnknownKind
-from gtsam_rwhec.fitting.unknowns import Variables
+from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, group_of, local_paths, residual_covariance
+from gtsam_rwhec.fitting.pose_fit import Model, SettledFit, fit
+from gtsam_rwhec.fitting.pose_models import ChordalModel, GeodesicModel, linearized
+from gtsam_rwhec.fitting.refined import FactorGraph, Movement, PairNoise, Refined
+from gtsam_rwhec.fitting.robust_solution import Inliers, robust_solution, until_inliers_stay
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import WINDOW_S
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED
-from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.problem.selection import AS_STATED, selected
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.solution import contradicted_by
+from gtsam_rwhec.solver.solution import Solution, contradicted_by, solve
 from gtsam_rwhec.solver.solve_options import check_against_knowledge
-from gtsam_rwhec.geometry.trajectory import WINDOW_S
-from gtsam_rwhec.solver.solution import solve
 
 #: The inliers are chosen again under the full noise at most this many times; two or three are usual.
 MAX_CHOICES = 10

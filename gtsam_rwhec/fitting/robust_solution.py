@@ -18,41 +18,27 @@ Every stage has a bound on its number of fits, so that no measurements make it r
 """
 
 from __future__ import annotations
+
 import contextlib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
-from typing import TypeVar
+from typing import Literal, TypeVar
+
 import numpy as np
-from scipy.special import chdtr
-from scipy.special import chdtri
-from gtsam_rwhec.errors import CountError
-from gtsam_rwhec.errors import OutlierError
-from gtsam_rwhec.errors import OutliersWarning
-from gtsam_rwhec.errors import ScaleError
-from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
-from gtsam_rwhec.fitting.admission import DOF
-from gtsam_rwhec.fitting.admission import inlier_threshold
-from gtsam_rwhec.fitting.admission import judged
-from gtsam_rwhec.fitting.weighted_fit import Measured
-from gtsam_rwhec.fitting.weighted_fit import Squares
-from gtsam_rwhec.fitting.weighted_fit import WeightedFit
-from gtsam_rwhec.fitting.weighted_fit import by_vote
-from gtsam_rwhec.fitting.weighted_fit import weighted_fit
+from scipy.special import chdtr, chdtri
+
+from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.admission import DOF, inlier_threshold, judged
+from gtsam_rwhec.fitting.weighted_fit import Measured, Squares, WeightedFit, by_vote, weighted_fit
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED
-from gtsam_rwhec.problem.selection import VarianceFactors
-from gtsam_rwhec.problem.selection import reweighted
-from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.solution import Solution
-from gtsam_rwhec.solver.solution import solve
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors, reweighted, selected
+from gtsam_rwhec.solver.solution import Solution, solve
 
 NoiseScale = Literal["given", "estimate"]
 #: By pair, (N,) booleans: which measurements count.

@@ -14,35 +14,26 @@ by GTSAM, from the same moments.
 """
 
 from __future__ import annotations
-from dataclasses import dataclass
-from dataclasses import replace
+
+from dataclasses import dataclass, replace
 from itertools import pairwise
+
 import gtsam
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.pose_graph import optimise
-from gtsam_rwhec.fitting.unknowns import State
-from gtsam_rwhec.fitting.unknowns import Variables
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import to_pose3
+from gtsam_rwhec.fitting.unknowns import State, Variables
+from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED
-from gtsam_rwhec.problem.selection import VarianceFactors
-from gtsam_rwhec.solver.answers import Answer
-from gtsam_rwhec.solver.answers import answer_of
-from gtsam_rwhec.solver.answers import rotations_as_variables
-from gtsam_rwhec.solver.answers import scales_of
-from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.search import MIRROR_COST
-from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
+from gtsam_rwhec.solver.answers import Answer, answer_of, rotations_as_variables, scales_of
+from gtsam_rwhec.solver.descent import descend, mirrored, spectral_start, unconstrained_start
+from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.search import MIRROR_COST, Search
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.descent import mirrored
-from gtsam_rwhec.solver.descent import spectral_start
-from gtsam_rwhec.solver.descent import unconstrained_start
 
 #: So many Newton steps lead from a start to its optimum; three to ten are usual.
 MAX_DESCENT_STEPS = 50

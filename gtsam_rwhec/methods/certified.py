@@ -1,25 +1,20 @@
 """This library's own method as one of the methods: the certified global optimum (RWHEC paper, Algorithm 1)."""
 
 from __future__ import annotations
+
 import warnings
+
 import numpy as np
-from gtsam_rwhec.errors import NotCertifiedWarning
-from gtsam_rwhec.errors import NotUniqueWarning
-from gtsam_rwhec.errors import WeightsWarning
+
+from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, WeightsWarning
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.hand_eye_request import Request
-from gtsam_rwhec.methods.method import Method
-from gtsam_rwhec.methods.method import MethodOptions
-from gtsam_rwhec.methods.method import Outcome
-from gtsam_rwhec.methods.method import Poses
-from gtsam_rwhec.methods.method import Properties
-from gtsam_rwhec.methods.method import Takes
+from gtsam_rwhec.methods.method import Method, MethodOptions, Outcome, Poses, Properties, Takes
 from gtsam_rwhec.methods.opencv_methods import Stations
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
 from gtsam_rwhec.solver.solve_options import SolveOptions
-from gtsam_rwhec.solver.solution import solve
 
 SOURCE = (
     "E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "

@@ -1,18 +1,18 @@
 """Result files."""
 
 from __future__ import annotations
+
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from harness import Harness
-from harness import scratch
+
+from harness import Harness, scratch
 from mutations import json_tree
+
 from gtsam_rwhec.calibration.stages import calibrate
-from gtsam_rwhec.fitting import refined
-from gtsam_rwhec.fitting import refinement
+from gtsam_rwhec.fitting import refined, refinement
 from gtsam_rwhec.results import result_file
-from gtsam_rwhec.simulate import Noise
-from gtsam_rwhec.simulate import general
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import solution as certified_solution
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
