@@ -84,7 +84,7 @@ def test_a_table_is_for_type_checkers_what_it_is_for_programs() -> None:
 def test_what_the_readme_names_is_reached_without_another_import() -> None:
     code = (
         "import gtsam_rwhec as rw\n"
-        "for name in ('report', 'cameras', 'detect', 'logs', 'rig', 'export', 'runs', 'methods'):\n"
+        "for name in ('report', 'cameras', 'detect', 'logs', 'rig', 'runs', 'methods'):\n"
         "    assert getattr(rw, name).__name__ == f'gtsam_rwhec.{name}' and name in dir(rw)\n"
         "assert rw.calibrate_log is rw.runs.calibrate_log\n"
     )

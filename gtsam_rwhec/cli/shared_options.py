@@ -100,7 +100,7 @@ def exported(solved: rw.runs.Solved | rw.runs.OdometrySolved, *, anyway: bool) -
     """The message that files of poses that are not to be used were written, or that they were not; or none."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
         return []
-    names = ", ".join([*rw.export.FILES, *(f"{folder}/" for folder in rw.export.FOLDERS)])
+    names = ", ".join([*rw.rig.FILES, *(f"{folder}/" for folder in rw.rig.FOLDERS)])
     if anyway:
         return [f"Written although the poses are not to be used, and marked so in the head: {names}."]
     return [f"Not written, as the poses are not to be used: {names}. --anyway writes them, marked."]

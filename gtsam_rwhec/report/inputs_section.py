@@ -9,10 +9,10 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.report.report_blocks import Block, CopyText, Folded, Paragraph, Section, Table
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER
+from gtsam_rwhec.rig.exported_files import copied_texts
 from gtsam_rwhec.rig.rig_frames import RigFrames
 
 #: The kind of each text, before the name of its file.

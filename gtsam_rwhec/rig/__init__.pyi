@@ -15,6 +15,21 @@ from .rig_reference import reference_text as reference_text
 from .rig_file import TodoLine as TodoLine
 from .rig_file import todo_lines as todo_lines
 
+# A calibrated rig in files for other programs.
+from .exported_cameras import camchain_yaml as camchain_yaml
+from .exported_cameras import camera_info_yaml as camera_info_yaml
+from .exported_cameras import colmap_cameras_txt as colmap_cameras_txt
+from .exported_cameras import opencv_yaml as opencv_yaml
+from .exported_files import COPIED as COPIED
+from .exported_files import FILES as FILES
+from .exported_files import FOLDERS as FOLDERS
+from .exported_files import copied_texts as copied_texts
+from .exported_files import export_all as export_all
+from .exported_poses import python_poses as python_poses
+from .exported_poses import static_tf_launch as static_tf_launch
+from .exported_poses import tf_yaml as tf_yaml
+from .exported_poses import urdf_xacro as urdf_xacro
+
 # The sections of a rig file.
 from .sections import Intrinsics as Intrinsics
 from .odometry_sections import GivenDirection as GivenDirection

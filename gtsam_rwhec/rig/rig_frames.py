@@ -143,7 +143,7 @@ def frames_of_refined(
     target_carrier: str = "targetcarrier",
     warnings: tuple[str, ...] = (),
 ) -> RigFrames:
-    """The frames and cameras of a refinement, for ``rw.export.export_all``.
+    """The frames and cameras of a refinement, for ``rw.rig.export_all``.
 
     Parameters
     ----------

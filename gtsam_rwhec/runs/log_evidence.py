@@ -9,7 +9,6 @@ from os.path import commonpath
 from pathlib import Path
 
 from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs.mcap_reader import Log
 from gtsam_rwhec.problem.measurements import Pair
@@ -26,6 +25,7 @@ from gtsam_rwhec.results.residual_evidence import residuals_of
 from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
 from gtsam_rwhec.results.weak_poses import weak_directions
 from gtsam_rwhec.rig import rig_text
+from gtsam_rwhec.rig.exported_files import copied_texts
 from gtsam_rwhec.runs.corner_answer import with_intrinsics
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.run_log import EVIDENCE_FILE, REPORT_FILE, RESULT_FILE

@@ -6,12 +6,11 @@ from pathlib import Path
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import LogError, RwhecError
-from gtsam_rwhec.export import export_all
-from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.exported_files import FILES, export_all
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log

@@ -13,9 +13,9 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict
 
 from gtsam_rwhec.errors import LogError, RwhecError
-from gtsam_rwhec.export.files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.files.whole_files import why_not_writable, write_atomically
 from gtsam_rwhec.logs import Log
+from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.runs.kept_detections import KeptDetections, differences, kept_inputs
 from gtsam_rwhec.runs.run_log import (
     CLEAN_LOG,

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.export import export_all
-from gtsam_rwhec.export.files import FILES, FOLDERS
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -16,6 +14,7 @@ from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.result_file import result_json
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, export_all
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import check_image_options, detected

@@ -98,7 +98,7 @@ def test_files_for_others_have_the_estimated_intrinsics(text: str, tmp_path: Pat
     texts = []
     for answer in (refined(), rw.read_refined(tmp_path / "refined.json"), corners):
         frames = rw.rig.frames_of_refined(answer, {"cam_0": wide}, sensor_carrier="base", target_carrier="hand")
-        texts.append([path.read_text(encoding="utf-8") for path in rw.export.export_all(frames, tmp_path)])
+        texts.append([path.read_text(encoding="utf-8") for path in rw.rig.export_all(frames, tmp_path)])
     assert texts[0] == texts[1] == texts[2]
     read = read_cameras(tmp_path / "cameras.opencv.yaml")
     for name, intrinsics in refined().intrinsics.items():

@@ -18,7 +18,7 @@ from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.failures import exit_status
 from gtsam_rwhec.simulate import frame_distance
 
-FILES = set(rw.export.FILES)
+FILES = set(rw.rig.FILES)
 
 
 def seen(
@@ -62,7 +62,7 @@ def test_one_that_nothing_was_seen_of_is_named_and_files_are_written_only_on_req
             text = (out / name).read_text(encoding="utf-8")
             assert f"Left out, because it has no answer: {said}" in words(text)
             assert words(text[:200]).count("Do not use these poses: cam_1: 0 measurements") == 1
-    assert f"marked so in the head: {', '.join(rw.export.FILES)}" in words(done.stderr)
+    assert f"marked so in the head: {', '.join(rw.rig.FILES)}" in words(done.stderr)
     result = rw.results.read_result(out / "result.json")
     assert result.refined is not None
     assert set(result.refined.Y) == {"cam_0"}

@@ -21,8 +21,8 @@ import yaml
 from places import DEMO
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.export.files import export_all
 from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.rig.exported_files import export_all
 from gtsam_rwhec.runs.output_folder import LIST_FILE
 from gtsam_rwhec.runs.run_log import SEEN_SHEET
 

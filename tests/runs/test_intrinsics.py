@@ -67,7 +67,7 @@ def test_what_a_calibration_wrote_is_read_again(tmp_path: Path, log: rw.logs.Log
     K = [[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]]
     camera = rw.cameras.Camera.of(640, 480, "radtan", K, [0.1, 0.0, 0.0, 1.0 / 3.0], "test")
     frames = rw.rig.RigFrames("base", "hand", {"cam0": np.eye(4), "cam1": np.eye(4)}, {}, {"cam1": camera})
-    rw.export.export_all(frames, tmp_path)
+    rw.rig.export_all(frames, tmp_path)
     with log:
         for source in ("cameras.opencv.yaml", "{file: camera_info/cam1.yaml, stated: calibration}", "camchain.yaml"):
             given = parse_rig(RIG.format(source=source), "rig.yaml", tmp_path)

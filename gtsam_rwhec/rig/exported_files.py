@@ -7,16 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.export.camchain import camchain_yaml
-from gtsam_rwhec.export.camera_info import camera_info_yaml
-from gtsam_rwhec.export.camera_words import comment
-from gtsam_rwhec.export.colmap import colmap_cameras_txt
-from gtsam_rwhec.export.opencv_cameras import FIRST_LINES, opencv_yaml
-from gtsam_rwhec.export.python_snippet import python_poses
-from gtsam_rwhec.export.static_tf import static_tf_launch
-from gtsam_rwhec.export.tf_tree import tf_yaml
-from gtsam_rwhec.export.urdf import urdf_xacro
 from gtsam_rwhec.files.whole_files import write_atomically
+from gtsam_rwhec.rig.exported_cameras import (
+    FIRST_LINES,
+    camchain_yaml,
+    camera_info_yaml,
+    colmap_cameras_txt,
+    comment,
+    opencv_yaml,
+)
+from gtsam_rwhec.rig.exported_poses import python_poses, static_tf_launch, tf_yaml, urdf_xacro
 from gtsam_rwhec.rig.rig_frames import RigFrames
 
 #: These functions give the text of each file, by its name.
@@ -44,16 +44,7 @@ SUFFIX = ".yaml"
 def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
     """Write the files of `FILES`, and ``camera_info/NAME.yaml`` for each camera.
 
-    Parameters
-    ----------
-    frames : RigFrames
-    folder
-        It must exist; files of these names in it are replaced.
-
-    Returns
-    -------
-    list of Path
-        The written files.
+    `folder` must exist; files of these names in it are replaced. Returns the written files.
 
     Raises
     ------

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_calibration_yaml, read_cameras, read_colmap_cameras
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.export import camchain_yaml, camera_info_yaml, colmap_cameras_txt, export_all, opencv_yaml
-from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.rig import RigFrames, camchain_yaml, camera_info_yaml, colmap_cameras_txt, export_all, opencv_yaml
 
 #: Every lens model, with as many coefficients as it may have; numbers with all their digits.
 LENSES = {

@@ -10,8 +10,7 @@ import yaml
 from exported_rigs import ONE, camera, on_random_poses
 
 from gtsam_rwhec.cameras.intrinsics_files import read_kalibr_camchain
-from gtsam_rwhec.export import camchain_yaml
-from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.rig import RigFrames, camchain_yaml
 
 
 @on_random_poses
