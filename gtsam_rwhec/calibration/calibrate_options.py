@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal
 
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
@@ -20,97 +20,58 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, CornerOptions, Drift, NoiseGroups
-from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
-from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.fitting.fit_options import About, CornerOptions, Drift, PoseOptions, check_choices
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
-NoiseChoice = Literal["auto", "given", "estimate"]
 RobustChoice = Literal["auto", "gnc", "none"]
 SizesChoice = Literal["check", "known"]
 ObservationChoice = Literal["auto", "corners", "poses"]
 
 
 @dataclass(frozen=True)
-class CalibrateOptions:
-    """The options of ``calibrate``; the defaults leave every choice to the data.
+class CalibrateOptions(PoseOptions):
+    """The options of ``calibrate``; the defaults leave every choice to the data."""
 
-    Attributes
-    ----------
-    noise : "auto", "given" or "estimate"
-        The noise of B. "auto" and "estimate": from the residuals; what the measurements state gives the ratios between
-        them. "auto" takes the stated noise where the residuals are too few to estimate it. "given": as stated.
-    noise_groups : "all", "sensor" or "pair"
-        Which measurements share an estimate of the noise.
-    carrier_noise : CarrierNoise, optional
-        The noise of A, if you know it.
-    drift : "auto", "walk", "correlated" or "none"
-        Errors of neighbours in time: found out, a random walk (odometry), with a correlation time, or independent.
-    systematic : bool
-        Whether A has errors that vary with the configuration (an arm's kinematics). The constant part, which no
-        residual shows, is assumed to be twice as large, as probably as the data say.
-    hand : "targetcarrier", "sensorcarrier" or None
-        The carrier to which errors of A are fixed: an arm's hand. None: found out.
-    robust : "auto", "gnc" or "none"
-        "auto" and "gnc": measurements that contradict the others are left out, and the rest is certified again. "auto"
-        leaves this out where there are too few measurements to tell. "none": every measurement counts.
-    inlier_confidence : float
-        Probability that a good measurement is kept.
-    misreadings : bool
-        Look for likely mistakes in the reading of A and B. Where there are any, or residuals that no sensor has (these
-        are looked for whatever this says), nothing else is done.
-    sizes : "check" or "known"
-        "check": where the sizes of targets are said to be known (``scale="known"``), a size that the motion contradicts
-        is found. "known": it is not looked for.
-    time_offsets : "auto", bool or tuple of str
-        Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
-        sensor where stamps and motion determine it, also where it is small; not over standstill, nor between stations
-        without a ``carrier_path``.
-    carrier_path : Trajectory, optional
-        T_sensorcarrier_targetcarrier over time, along which time offsets move A.
-    observations : "auto", "corners" or "poses"
-        What the answer is refined from. "auto": from the corners where the problem holds them for every measurement
-        (``problem.add_corners``) and they give a better answer than the poses. "corners": such a problem is asked for.
-    corners : CornerOptions, optional
-        How: where the intrinsics are from, what of the boards is free. Left out: intrinsics are nominal, boards are as
-        stated, and A's noise is estimated, or as in ``carrier_noise``.
-    level : float
-        Probability of the ellipsoids in the report, in task units.
-    solve : SolveOptions
-        Options of the certified solver.
-    """
-
-    noise: NoiseChoice = "auto"
-    noise_groups: NoiseGroups = "all"
-    carrier_noise: CarrierNoise | None = None
+    #: Errors of neighbours in time: found out, a random walk (odometry), with a correlation time, or independent.
     drift: Drift = "auto"
+    #: Whether A has errors that vary with the configuration (an arm's kinematics). The constant part, which no residual
+    #: shows, is assumed to be twice as large, as probably as the data say.
     systematic: bool = True
+    #: The carrier to which errors of A are fixed: an arm's hand. None: found out.
     hand: About | None = None
+    #: "auto" and "gnc": measurements that contradict the others are left out, and the rest is certified again. "auto"
+    #: leaves this out where there are too few measurements to tell. "none": every measurement counts.
     robust: RobustChoice = "auto"
-    inlier_confidence: float = 0.997
+    #: Look for likely mistakes in the reading of A and B. Where there are any, or residuals that no sensor has (these
+    #: are looked for whatever this says), nothing else is done.
     misreadings: bool = True
+    #: "check": where the sizes of targets are said to be known (``scale="known"``), a size that the motion contradicts
+    #: is found. "known": it is not looked for.
     sizes: SizesChoice = "check"
+    #: Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
+    #: sensor where stamps and motion determine it, also where it is small; not over standstill, nor between stations
+    #: without a ``carrier_path``.
     time_offsets: Literal["auto"] | bool | tuple[str, ...] = "auto"
-    carrier_path: Trajectory | None = None
+    #: What the answer is refined from. "auto": from the corners where the problem holds them for every measurement
+    #: (``problem.add_corners``) and they give a better answer than the poses. "corners": such a problem is asked for.
     observations: ObservationChoice = "auto"
+    #: How: where the intrinsics are from, what of the boards is free. Left out: intrinsics are nominal, boards are as
+    #: stated, and A's noise is estimated, or as in ``carrier_noise``.
     corners: CornerOptions | None = None
+    #: Probability of the ellipsoids in the report, in task units.
     level: float = 0.95
+    #: Options of the certified solver.
     solve: SolveOptions = field(default_factory=SolveOptions)
 
     def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            if not is_one_of(getattr(self, name), get_args(choices)):
-                raise OptionError(
-                    f"CalibrateOptions.{name}={brief(getattr(self, name))} is not one of "
-                    f"{', '.join(map(repr, get_args(choices)))}"
-                )
-        for name, least in (("inlier_confidence", 0.5), ("level", 0.0)):
-            value = getattr(self, name)
-            if not (is_real(value) and least < value < 1.0):
-                raise OptionError(f"CalibrateOptions.{name}={brief(value)}; give one between {least:g} and 1")
-        if not isinstance(self.misreadings, bool):
-            raise OptionError(f"CalibrateOptions.misreadings={brief(self.misreadings)}; give True or False")
+        super().__post_init__()
+        choices = {"drift": Drift, "robust": RobustChoice, "sizes": SizesChoice, "observations": ObservationChoice}
+        check_choices(self, choices if self.hand is None else choices | {"hand": About})
+        self.check_share("level", 0.0)
+        for name in ("misreadings", "systematic"):
+            if not isinstance(getattr(self, name), bool):
+                raise OptionError(f"CalibrateOptions.{name}={brief(getattr(self, name))}; give True or False")
         offsets = self.time_offsets
         is_word = isinstance(offsets, bool) or (isinstance(offsets, str) and offsets == "auto")
         if not is_word and not (isinstance(offsets, tuple) and all(isinstance(name, str) for name in offsets)):
@@ -118,31 +79,12 @@ class CalibrateOptions:
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
                 "sensors' names: ('cam_0',)"
             )
-        for name, kind in (("carrier_noise", CarrierNoise), ("carrier_path", Trajectory), ("corners", CornerOptions)):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise OptionError(f"CalibrateOptions.{name} is a {type(value).__name__}; give a {kind.__name__}")
+        if self.corners is not None and not isinstance(self.corners, CornerOptions):
+            raise OptionError(f"CalibrateOptions.corners is a {type(self.corners).__name__}; give a CornerOptions")
         if not isinstance(self.solve, SolveOptions):
             raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
-        if self.hand is not None and not is_one_of(self.hand, get_args(About)):
-            raise OptionError(
-                f"CalibrateOptions.hand={brief(self.hand)}; give None, or one of "
-                f"{', '.join(map(repr, get_args(About)))}"
-            )
-        if not isinstance(self.systematic, bool):
-            raise OptionError(f"CalibrateOptions.systematic={brief(self.systematic)}; give True or False")
-
-
-_CHOICES = {
-    "noise": NoiseChoice,
-    "noise_groups": NoiseGroups,
-    "drift": Drift,
-    "robust": RobustChoice,
-    "sizes": SizesChoice,
-    "observations": ObservationChoice,
-}
 
 
 def offsets_of(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:

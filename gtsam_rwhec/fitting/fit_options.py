@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -23,6 +23,7 @@ Robust = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"]
 CarrierModel = Literal["auto", "propagated", "variables"]
 About = Literal["targetcarrier", "sensorcarrier"]
 ObservationKind = Literal["poses", "corners"]
+Stated = Literal["exact", "calibration", "nominal", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,7 @@ class CarrierNoise:
     about: About = "targetcarrier"
 
     def __post_init__(self) -> None:
-        if not is_one_of(self.about, get_args(About)):
-            raise OptionError(
-                f"CarrierNoise.about={brief(self.about)} is not one of {', '.join(map(repr, get_args(About)))}"
-            )
+        check_choices(self, {"about": About})
         if self.covariances is not None:
             if self.rotation_rad or self.translation_m:
                 raise NoiseError(
@@ -59,16 +57,57 @@ class CarrierNoise:
                 )
 
 
+def check_choices(options: object, choices: Mapping[str, Any]) -> None:
+    """OptionError for an option, by name, that is none of the words of its Literal."""
+    for name, words in choices.items():
+        value = getattr(options, name)
+        if not is_one_of(value, get_args(words)):
+            raise OptionError(
+                f"{type(options).__name__}.{name}={brief(value)} is not one of {', '.join(map(repr, get_args(words)))}"
+            )
+
+
 @dataclass(frozen=True)
-class RefineOptions:
+class PoseOptions:
+    """What ``refine`` and ``calibrate`` are both told."""
+
+    #: The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": from the residuals; what is
+    #: stated gives the ratios. "auto": ``refine`` takes what is given if there are weights, else it estimates;
+    #: ``calibrate`` estimates, and takes what is given where the residuals are too few.
+    noise: NoiseSource = "auto"
+    #: The measurements that share an estimate of the noise.
+    noise_groups: NoiseGroups = "all"
+    #: Probability that a good measurement is kept, at least: all good ones together are kept with 95 %.
+    inlier_confidence: float = 0.997
+    #: The noise of A, if you know it. Without it A counts as exact in ``refine``; if A is not exact, covariances are
+    #: then too small. ``calibrate`` estimates it.
+    carrier_noise: CarrierNoise | None = None
+    #: T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Time offsets move A along
+    #: this path. Without it the measurements' own A give the carriers' motion.
+    carrier_path: Trajectory | None = None
+
+    def __post_init__(self) -> None:
+        check_choices(self, {"noise": NoiseSource, "noise_groups": NoiseGroups})
+        self.check_share("inlier_confidence", 0.5)
+        for name, kind, how in (
+            ("carrier_noise", CarrierNoise, "CarrierNoise(rotation_rad=..., translation_m=...)"),
+            ("carrier_path", Trajectory, "a Trajectory"),
+        ):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise OptionError(f"{type(self).__name__}.{name} is a {type(value).__name__}; give {how}")
+
+    def check_share(self, name: str, least: float) -> None:
+        """OptionError for an option that is no number between a least one and 1."""
+        value = getattr(self, name)
+        if not (is_real(value) and least < value < 1.0):
+            raise OptionError(f"{type(self).__name__}.{name}={brief(value)}; give one between {least:g} and 1")
+
+
+@dataclass(frozen=True)
+class RefineOptions(PoseOptions):
     """The options of ``refine``."""
 
-    #: The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": these times variance factors,
-    #: one for rotations and one for translations, estimated from the residuals. "auto": given if there are weights,
-    #: else estimated.
-    noise: NoiseSource = "auto"
-    #: The groups of residuals that share a variance factor.
-    noise_groups: NoiseGroups = "all"
     #: "geodesic": Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements. "chordal": the certified
     #: cost's residual, from moments alone; then GTSAM's optimum is the certified optimum.
     residual: ResidualKind = "geodesic"
@@ -76,10 +115,6 @@ class RefineOptions:
     #: Many gross outliers pull this start away. "gnc" is graduated truncated least squares around the certified solver.
     #: It needs no good start, and leaves outliers out.
     robust: Robust = "none"
-    #: With "gnc": probability that a good measurement is kept, at least: all good ones together are kept with 95 %.
-    inlier_confidence: float = 0.997
-    #: The noise of A. Without it A counts as exact; if A is not exact, covariances are then too small.
-    carrier_noise: CarrierNoise | None = None
     #: "propagated": A's noise is propagated into each residual to first order. "variables": each A is a variable,
     #: shared by the measurements of one stamp. "auto": variables if measurements share a stamp; else propagated, which
     #: is then the same.
@@ -87,10 +122,7 @@ class RefineOptions:
     #: Estimate the clock offset of each sensor, or of the named sensors: a sensor's stamp t is the carriers' t + offset
     #: (Kalibr's convention). The measurements need stamps.
     time_offsets: bool | tuple[str, ...] = False
-    #: T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Time offsets move A along
-    #: this path. Without it the measurements' own A give the carriers' motion.
-    carrier_path: Trajectory | None = None
-    #: Largest number of Levenberg-Marquardt steps.
+    #: Largest number of the optimiser's steps.
     max_iterations: int = 100
     #: What is refined from: the measured poses B, or, from there on, the corners of the images that the problem holds
     #: (``problem.add_corners``). The other options are then those of the poses, of which outliers among images are left
@@ -98,31 +130,22 @@ class RefineOptions:
     observations: ObservationKind = "poses"
 
     def __post_init__(self) -> None:
-        for name, choices in _REFINE_CHOICES.items():
-            if not is_one_of(getattr(self, name), get_args(choices)):
-                raise OptionError(
-                    f"RefineOptions.{name}={brief(getattr(self, name))} is not one of "
-                    f"{', '.join(map(repr, get_args(choices)))}"
-                )
-        if not (isinstance(self.inlier_confidence, float) and 0.5 < self.inlier_confidence < 1.0):
-            raise OptionError(
-                f"RefineOptions.inlier_confidence={brief(self.inlier_confidence)}; give one between 0.5 and 1"
-            )
+        super().__post_init__()
+        check_choices(
+            self,
+            {
+                "residual": ResidualKind,
+                "robust": Robust,
+                "carrier_model": CarrierModel,
+                "observations": ObservationKind,
+            },
+        )
         if not isinstance(self.time_offsets, (bool, tuple)):
             raise OptionError(
                 f"RefineOptions.time_offsets={brief(self.time_offsets)}; give True, or a tuple of sensors' names: "
                 "('cam_0',)"
             )
-        if not is_whole(self.max_iterations, 1):
-            raise OptionError(
-                f"RefineOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "
-                f"{LARGEST_WHOLE}"
-            )
-        if self.carrier_noise is not None and not isinstance(self.carrier_noise, CarrierNoise):
-            raise OptionError(
-                f"RefineOptions.carrier_noise is a {type(self.carrier_noise).__name__}; give "
-                "CarrierNoise(rotation_rad=..., translation_m=...)"
-            )
+        check_iterations(self, self.max_iterations)
         if self.carrier_path is not None and not self.time_offsets:
             raise OptionError("RefineOptions.carrier_path has no use without time_offsets; give time_offsets too")
         if self.residual == "chordal":
@@ -137,14 +160,12 @@ class RefineOptions:
                     )
 
 
-_REFINE_CHOICES = {
-    "noise": NoiseSource,
-    "noise_groups": NoiseGroups,
-    "residual": ResidualKind,
-    "robust": Robust,
-    "carrier_model": CarrierModel,
-    "observations": ObservationKind,
-}
+def check_iterations(options: object, number: object) -> None:
+    """OptionError for a limit of iterations that is no whole number."""
+    if not is_whole(number, 1):
+        raise OptionError(
+            f"{type(options).__name__}.max_iterations={brief(number)}; give a whole number from 1 to {LARGEST_WHOLE}"
+        )
 
 
 class Component(StrEnum):
@@ -266,11 +287,7 @@ class CornerOptions:
             raise OptionError(
                 f"CornerOptions.time_offsets={brief(offsets)}; give a tuple of sensors' names, such as ('cam_0',)"
             )
-        if not is_whole(self.max_iterations, 1):
-            raise OptionError(
-                f"CornerOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "
-                f"{LARGEST_WHOLE}"
-            )
+        check_iterations(self, self.max_iterations)
 
     def stated_of(self, sensor: str) -> Stated:
         """Where a sensor's intrinsics come from."""
@@ -283,6 +300,3 @@ class CornerOptions:
     def camera_of(self, sensor: str) -> str:
         """The sensor whose intrinsics this sensor has: its own, or the first one's of its group."""
         return next((group[0] for group in self.shared if sensor in group), sensor)
-
-
-Stated = Literal["exact", "calibration", "nominal", "unknown"]

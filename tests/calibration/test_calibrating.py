@@ -189,7 +189,7 @@ def test_moments_alone_are_calibrated_without_outliers() -> None:
         ({"time_offsets": "always"}, "time_offsets='always'"),
         ({"time_offsets": np.array(["sensor0"])}, "give 'auto', True, False, or a tuple of sensors' names"),
         ({"time_offsets": (3,)}, "give 'auto', True, False, or a tuple of sensors' names"),
-        ({"carrier_noise": 0.1}, "carrier_noise is a float; give a CarrierNoise"),
+        ({"carrier_noise": 0.1}, "carrier_noise is a float; give CarrierNoise"),
     ],
 )
 def test_options_that_are_not_valid_are_refused(options: dict[str, object], words: str) -> None:

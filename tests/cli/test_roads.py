@@ -12,10 +12,11 @@ import typer
 from places import CELL, DEMO
 from typer.testing import CliRunner
 
-from gtsam_rwhec.calibration.calibrate_options import NoiseChoice, RobustChoice
+from gtsam_rwhec.calibration.calibrate_options import RobustChoice
 from gtsam_rwhec.cli import calibrate_command, convert_command, shared_options
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.shared_options import command_of
+from gtsam_rwhec.fitting.fit_options import NoiseSource
 from gtsam_rwhec.logs.image_folder import Columns
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.solver import solve_options as solver_options
@@ -101,7 +102,7 @@ def test_choices_are_those_of_the_library() -> None:
     """The command writes them again, so that its help need not import the library."""
     assert set(get_args(shared_options.Scale)) == set(get_args(ScaleMode))
     assert set(get_args(calibrate_command.Method)) == set(get_args(solver_options.Method))
-    assert set(get_args(calibrate_command.Noise)) == set(get_args(NoiseChoice))
+    assert set(get_args(calibrate_command.Noise)) == set(get_args(NoiseSource))
     assert set(get_args(calibrate_command.Robust)) == set(get_args(RobustChoice))
     assert set(get_args(convert_command.Columns)) == set(get_args(Columns))
 
