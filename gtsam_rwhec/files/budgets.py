@@ -68,22 +68,6 @@ MESSAGE_TYPES = 1000
 #: Bytes of text with poses for a folder of images: half a million lines.
 POSES_TEXT = 64 * MIB
 
-#: Bytes. A chunk or a compressed message of a ROS bag yields at most this much, and `CHUNK_SHARE` of the bag's size
-#: more: `rosbags` and the conversion hold six copies of it.
-BAG_CHUNK = 24 * MIB
-#: Bytes of bz2 count as this many opened bytes: it opens more slowly than zstd and lz4.
-BZ2_BYTES = 8
-#: Bytes. The definitions of a ROS bag's messages have at most this much; `rosbags` takes 20 us to read one of them.
-BAG_DEFINITIONS = 96 * 1024
-#: Bytes of definitions for each byte of the bag, which has them uncompressed, and most often twice.
-BAG_DEFINITIONS_SHARE = 0.125
-#: Entries of a list of fixed length, unless they are numbers: `rosbags` makes code for each of them.
-FIXED_LIST = 1000
-#: Bytes of the metadata of a ROS 2 bag; `rosbags` takes 40 us to read one of them. Fifty topics have 30 kB.
-BAG_METADATA = 32 * 1024
-#: Bytes of metadata for each byte of the bag.
-BAG_METADATA_SHARE = 1 / 64
-
 #: Pixels that any compressed image may have, whatever its size in bytes.
 PIXELS = 1 << 24
 #: Pixels for each byte of a compressed image. Black JPEG reaches 85; black PNG of up to 22 megapixels fits as well.
@@ -109,11 +93,6 @@ class LogBudget:
     def chunk(self) -> int:
         """Bytes that one chunk may yield."""
         return CHUNK + int(CHUNK_SHARE * self.size)
-
-    @property
-    def bag_chunk(self) -> int:
-        """Bytes that one chunk, or one compressed message, of a ROS bag may yield."""
-        return BAG_CHUNK + int(CHUNK_SHARE * self.size)
 
     @property
     def open(self) -> int:

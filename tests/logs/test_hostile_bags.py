@@ -14,7 +14,11 @@ import pytest
 import zstandard
 from limited_process import MEMORY, SECONDS, Reader
 
+from gtsam_rwhec.logs.ros_bags import MEMORY_FOR_A_BYTE
+
 MIB = 1 << 20
+#: Bytes of the process before it reads anything.
+IMPORTS = 100 * MIB
 COMPRESS: dict[str, Callable[[bytes], bytes]] = {"none": bytes, "bz2": bz2.compress, "lz4": lz4.frame.compress}
 STRING = "string data"
 
@@ -110,41 +114,25 @@ def connections_between(count: int) -> bytes:
 
 
 LINES = "\n".join(f"float64 a{i}" for i in range(20_000))
-ROS1: dict[str, tuple[Callable[[], bytes], str]] = {
-    "lz4": (lambda: one_message(text(bytes(100 * MIB))), "a chunk yields"),
-    "bz2": (lambda: one_message(text(bytes(100 * MIB)), "bz2"), "a chunk yields"),
-    "lz4 that states less": (lambda: one_message(text(bytes(100 * MIB)), stated=1000), "and states 1000"),
-    "bz2 that states less": (lambda: one_message(text(bytes(100 * MIB)), "bz2", stated=1000), "and states 1000"),
-    "lz4 that states more": (lambda: one_message(b"", stated=20 * MIB), "after decompression, and states"),
-    "many bz2": (
-        lambda: bag([(chunk(message(text(bytes(20 * MIB))), "bz2"), [(0, 0)])] * 60), "its chunks yield",
+ROS1: dict[str, Callable[[], bytes]] = {
+    "lz4": lambda: one_message(text(bytes(300 * MIB))),
+    "bz2": lambda: one_message(text(bytes(300 * MIB)), "bz2"),
+    "lz4 that states less": lambda: one_message(text(bytes(300 * MIB)), stated=1000),
+    "lz4 that states more": lambda: one_message(b"", stated=20 * MIB),
+    "many bz2": lambda: bag([(chunk(message(text(bytes(20 * MIB))), "bz2"), [(0, 0)])] * 60),
+    "chunk listed often": lambda: bag([(chunk(message(text(b"x")), "none"), [(0, 0)] * 10_000)], listed=1000),
+    "chunks that take turns": lambda: turns(2000),
+    "connections between": lambda: connections_between(5000),
+    "record of 4 GB": lambda: one_message(b"")[:-200] + b"\xff" * 200,
+    "long definition": lambda: one_message(text(b"x"), definition=LINES),
+    "fixed list of strings": lambda: one_message(b"", definition="string[99999999] s"),
+    "list of empty messages": lambda: one_message(
+        number(2**32 - 1), definition="E[] s\n" + "=" * 80 + "\nMSG: std_msgs/E\n"
     ),
-    "many lz4": (lambda: bag([(chunk(message(text(bytes(20 * MIB)))), [(0, 0)])] * 2), ""),
-    "chunk listed often": (
-        lambda: bag([(chunk(message(text(b"x")), "none"), [(0, 0)] * 10_000)], listed=1000), "more than once",
-    ),
-    "chunks that take turns": (lambda: turns(2000), "its chunks yield"),
-    "connections between": (lambda: connections_between(5000), "places where no message is"),
-    "index beside messages": (
-        lambda: bag([(chunk(message(text(b"x")), "none"), [(0, 7)])]), "places where no message is",
-    ),
-    "record of 4 GB": (lambda: one_message(b"")[:-200] + b"\xff" * 200, "bytes of data"),
-    "long definition": (lambda: one_message(text(b"x"), definition=LINES), "the definitions of its messages have more"),
-    "fixed list of strings": (
-        lambda: one_message(b"", definition="string[99999999] s"), "a list of 99999999 string, and at most 1000",
-    ),
-    "list of empty messages": (
-        lambda: one_message(number(2**32 - 1), definition="E[] s\n" + "=" * 80 + "\nMSG: std_msgs/E\n"),
-        "Invalid sequence length 4294967295",
-    ),
-    "list of numbers": (
-        lambda: one_message(number(2**32 - 1), definition="float64[] s"), "Invalid sequence length 4294967295",
-    ),
-    "itself": (lambda: one_message(bytes(99), definition="String s"), "cannot be read as a ROS bag"),
-    "empty records": (
-        lambda: bag([(chunk(record(b"", op=9) * (20 * MIB // 16)), [])]), "messages, records, numbers and strings",
-    ),
-}  # fmt: skip
+    "list of numbers": lambda: one_message(number(2**32 - 1), definition="float64[] s"),
+    "itself": lambda: one_message(bytes(99), definition="String s"),
+    "empty records": lambda: bag([(chunk(record(b"", op=9) * (20 * MIB // 16)), [])]),
+}
 
 SCHEMA = "CREATE TABLE schema(schema_version INTEGER, ros_distro TEXT); INSERT INTO schema VALUES (4, 'rolling');"
 TABLES = f"""
@@ -221,50 +209,41 @@ def computed(data: str) -> str:
     return HONEST_DB3.replace("data BLOB", f"data BLOB AS ({data})") + "INSERT INTO messages VALUES (1, 1, 0);"
 
 
-DB3: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "computed column": (lambda folder: db3(folder, computed("zeroblob(900000000)")), "has computed columns"),
-    "endless view": (lambda folder: db3(folder, HONEST_DB3.replace(SCHEMA, ENDLESS)), "has a view, 'schema'"),
-    "trigger": (
-        lambda folder: db3(folder, HONEST_DB3 + "CREATE TRIGGER t AFTER INSERT ON topics BEGIN SELECT 1; END;"),
-        "has a trigger",
+DB3: dict[str, Callable[[Path], Path]] = {
+    "computed column": lambda folder: db3(folder, computed("zeroblob(900000000)")),
+    "endless view": lambda folder: db3(folder, HONEST_DB3.replace(SCHEMA, ENDLESS)),
+    "one topic thousands of times": lambda folder: db3(
+        folder, HONEST_DB3 + TOPIC * 3000, [b"\0\1\0\0" + text(b"x\0")] * 3000
     ),
-    "one topic thousands of times": (
-        lambda folder: db3(folder, HONEST_DB3 + TOPIC * 3000, [b"\0\1\0\0" + text(b"x\0")] * 3000),
-        "cannot be read as a ROS bag",
-    ),
-    "long definition": (
-        lambda folder: db3(folder, HONEST_DB3 + REDEFINED),
-        "the definitions of its messages have more",
-    ),
-    "compressed file": (compressed_file, "its chunks yield"),
-    "compressed message": (compressed_messages, "a message yields more than"),
-    "long metadata": (long_metadata, "and that of a bag of"),
-    "mcap": (mcap_bag, "is in MCAP already"),
-}  # fmt: skip
+    "long definition": lambda folder: db3(folder, HONEST_DB3 + REDEFINED),
+    "compressed file": compressed_file,
+    "compressed message": compressed_messages,
+    "long metadata": long_metadata,
+    "mcap": mcap_bag,
+}
+#: What costs no more than an honest bag is converted.
+HARMLESS = ("empty records", "long metadata")
 
 
-def refused(reader: Reader, path: Path, size: int, words: str) -> None:
+def refused(reader: Reader, path: Path, size: int, name: str) -> None:
     reading = reader("bag", path)
-    assert reading.error in ("LogError", "BudgetError") or not words, (reading.error, reading.message)
-    assert not reading.error.startswith("not ours"), (reading.error, reading.message)
-    assert words in reading.message, reading.message
+    assert reading.error == ("" if name in HARMLESS else "LogError"), (reading.error, reading.message)
     assert reading.peak_bytes <= MEMORY + size
+    assert reading.children_peak_bytes <= IMPORTS + MEMORY + MEMORY_FOR_A_BYTE * size
     assert reading.seconds <= SECONDS
 
 
 @pytest.mark.parametrize("name", ROS1)
 def test_a_hostile_ros_1_bag_is_refused_within_its_budget(reader: Reader, tmp_path: Path, name: str) -> None:
-    make, words = ROS1[name]
     path = tmp_path / "a.bag"
-    path.write_bytes(make())
-    refused(reader, path, path.stat().st_size, words)
+    path.write_bytes(ROS1[name]())
+    refused(reader, path, path.stat().st_size, name)
 
 
 @pytest.mark.parametrize("name", DB3)
 def test_a_hostile_db3_bag_is_refused_within_its_budget(reader: Reader, tmp_path: Path, name: str) -> None:
-    make, words = DB3[name]
-    path = make(tmp_path)
-    refused(reader, path, sum(file.stat().st_size for file in tmp_path.iterdir()), words)
+    path = DB3[name](tmp_path)
+    refused(reader, path, sum(file.stat().st_size for file in tmp_path.iterdir()), name)
 
 
 @pytest.mark.parametrize("compression", list(COMPRESS))

@@ -177,8 +177,8 @@ def reader() -> Iterator[Reader]:
 
 BAD_BAGS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "bz2": (bz2_bomb, "it takes more memory than a bag of its size may"),
-    "zstd message": (zstd_bomb, "a message yields more than"),
-    "zstd file": (zstd_file_bomb, "its chunks yield"),
+    "zstd message": (zstd_bomb, "it takes more memory than a bag of its size may"),
+    "zstd file": (zstd_file_bomb, "it decompresses to more"),
     "metadata": (odd_metadata, "cannot be read as a ROS bag"),
     "type": (odd_type, "cannot be read as a ROS bag"),
     "pipe": (pipe, "is not a file"),
@@ -194,7 +194,7 @@ def test_a_bag_that_means_harm_is_refused(tmp_path: Path, kind: str, reader: Rea
     (tmp_path / "bags").mkdir()
     bag = make(tmp_path / "bags")
     reading = reader("bag", bag, out=str(tmp_path / "out.mcap"))
-    assert reading.error in ("LogError", "BudgetError")
+    assert reading.error == "LogError"
     assert re.search(words, reading.message)
     assert len(reading.message) < 1000
     assert [file.name for file in tmp_path.iterdir()] == ["bags"]
