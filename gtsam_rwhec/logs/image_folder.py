@@ -1,10 +1,8 @@
-"""Logs made of a folder of images and a text file of poses, the form in which older tools take data.
+"""Folders of images with poses beside them: which pose belongs to which image, and the log that both make.
 
-The file is any that `read_poses` reads; names of columns, if it has them, go before the stated order. A pose's name is
-
-- the file name of an image, with or without its ending: the image was taken at this pose. Images get stamps 1 s apart;
-- or a stamp, in seconds (``1700000000.25``) or integer nanoseconds (16 digits or more). Then the images' file names are
-  stamps too (``1700000000250000000.png``), and poses may come at another rate.
+Poses are in one file for all images, in a folder with one file an image, or in an index. Where the names of images and
+poses are stamps (seconds with a decimal point, or nanoseconds of 16 digits or more), the log has them, and poses may
+come at another rate. Other images were taken at rest, and have the pose of their name, of its number, or of their order.
 """
 
 from __future__ import annotations
@@ -66,15 +64,16 @@ def write_image_folder(
         The folder has no images, a line is not a pose, or a name is neither an image nor a stamp. The message has the
         file and the line.
     """
-    images, poses = checked_path(images), checked_path(poses)
-    files = sorted((f for f in images.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
-    if not files:
-        raise LogError(f"{images} has no images ({', '.join(FORMATS)}).")
+    files, poses = images_in(checked_path(images)), checked_path(poses)
     found = read_poses(poses, PoseStatement(length="m", columns=columns))
-    names, T = list(found.names), found.T
-    image_stamps, pose_stamps = _stamps(files, names, poses)
-    entries = [(stamp, True, i) for i, stamp in enumerate(image_stamps)]
-    entries += [(stamp, False, i) for i, stamp in enumerate(pose_stamps)]
+    of_images, of_poses = image_stamps(files), pose_stamps(found)
+    T = found.T
+    if of_images is None or of_poses is None:  # taken at rest: 1 s apart
+        matched = match(files, found, str(poses))
+        of_images, of_poses = ([(i + 1) * 10**9 for i in which] for which in (range(len(files)), matched.images))
+        T = T[list(matched.poses)]
+    entries = [(stamp, True, i) for i, stamp in enumerate(of_images)]
+    entries += [(stamp, False, i) for i, stamp in enumerate(of_poses)]
     with LogWriter(path) as out:
         for stamp, is_image, i in sorted(entries):
             if not is_image:
@@ -86,25 +85,6 @@ def write_image_folder(
                 raise LogError(str(error)) from error
             out.compressed_image(f"/{camera}/image", stamp, camera, FORMATS[files[i].suffix.lower()], data)
     return len(files), len(T)
-
-
-def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[list[int], list[int]]:
-    """The stamps of the images and the stamps of the poses."""
-    known = {file.name: i for i, file in enumerate(files)} | {file.stem: i for i, file in enumerate(files)}
-    if all(name in known for name in names):
-        if len(set(names)) < len(names):
-            raise LogError(f"{poses}: an image has two poses: {Counter(names).most_common(1)[0][0]}.")
-        if all(as_ns(file.stem) is None for file in files):
-            return [(i + 1) * 10**9 for i in range(len(files))], [(known[name] + 1) * 10**9 for name in names]
-    image_stamps = [as_ns(file.stem) for file in files]
-    pose_stamps = [as_ns(name.removesuffix(Path(name).suffix) if name in known else name) for name in names]
-    for stamps, what in ((pose_stamps, names), (image_stamps, [file.name for file in files])):
-        if None in stamps:
-            raise LogError(
-                f"{poses}: {what[stamps.index(None)]!r} is neither the name of an image nor a stamp in seconds or "
-                f"nanoseconds; the first image is {files[0].name}, the first pose's name {names[0]!r}."
-            )
-    return [s for s in image_stamps if s is not None], [s for s in pose_stamps if s is not None]
 
 
 #: A stamp in nanoseconds has at least this many digits.

@@ -57,9 +57,9 @@ def test_by_stamp(tmp_path: Path) -> None:
     [
         (["a.txt"], f"a {POSE}", "no images"),
         (["a.png"], "", "no poses"),
-        (["a.png"], f"b {POSE}", "'b' is neither the name of an image nor a stamp"),
-        (["a.png"], f"1700000000.5 {POSE}", "'a.png' is neither"),
-        (["a.png"], f"a {POSE}\na {POSE}", "an image has two poses: a"),
+        (["a.png", "c.png"], f"b {POSE}\nd {POSE}", "no pose has the name of an image"),
+        (["a.png", "b.png"], f"1700000000.5 {POSE}", "2 images and 1 poses"),
+        (["a.png", "b.png"], f"a {POSE}\na 9 2 3 0 0 0.6 0.8", "image a has two poses"),
         (["a.png"], "\n" * 500_001, "has 500001 lines; at most 500000 are read"),
         (["a.png"], f"a {POSE}" + " 1" * 5000, "line 1: longer than 10000 characters"),
         (["a.png"], f"a {POSE}\nb 1 2 3", "line 2: 4 fields"),
