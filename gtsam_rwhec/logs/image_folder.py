@@ -2,7 +2,8 @@
 
 Poses are in one file for all images, in a folder with one file an image, or in an index. Where the names of images and
 poses are stamps (seconds with a decimal point, or nanoseconds of 16 digits or more), the log has them, and poses may
-come at another rate. Other images were taken at rest, and have the pose of their name, of its number, or of their order.
+come at another rate. Other images were taken at rest, and have the pose of their name, of its number, or of their
+order.
 """
 
 from __future__ import annotations
