@@ -9,11 +9,9 @@ from rwhec_factors import se3
 
 from gtsam_rwhec import odometry, simulate
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.given_rows import GivenRows
-from gtsam_rwhec.odometry.likelihood import eliminated, linearised, weights
-from gtsam_rwhec.odometry.sampling import SampledTrack
-from gtsam_rwhec.odometry.unknowns import SCALE, Layout, State
-from gtsam_rwhec.odometry.window_motions import WindowMotions
+from gtsam_rwhec.odometry.prior_knowledge import GivenRows
+from gtsam_rwhec.odometry.window_likelihood import SCALE, Layout, State, eliminated, linearised, weights
+from gtsam_rwhec.odometry.window_motions import SampledTrack, WindowMotions
 from gtsam_rwhec.simulate.drives import Drive, DriveShape
 
 #: Three LiDARs and three cameras: degrees and metres that a second of driving adds (about each and along each axis).

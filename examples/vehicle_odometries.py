@@ -39,9 +39,9 @@ for name, (stamps_ns, poses) in driven.tracks.items():
 rig = rw.rig.read_rig(Path(__file__).with_name("vehicle_rig.yaml"))
 without = rig.model_copy(update={"given": rw.rig.GivenSection()})
 for words, described in (("Without heights", without), ("With heights", rig)):
-    solved = rw.runs.calibrate_odometry_log(folder, described, folder / words.lower().replace(" ", "_"))
+    solved = rw.odometry.calibrate_odometry_log(folder, described, folder / words.lower().replace(" ", "_"))
     print(f"\n{words}:")
-    rw.report.print_odometry(solved.result)
+    rw.odometry.print_odometry(solved.result)
     for name in list(MOUNTS)[1:]:
         off = rw.simulate.frame_distance(solved.result.pose(name), driven.T("lidar_front", name))
         print(f"{name} is {off.translation_mm:.0f} mm and {off.rotation_deg:.2f} degrees from the truth")

@@ -312,8 +312,10 @@ class Judgement:
         return bool(_MISREAD.intersection(self.grounds))
 
     @staticmethod
-    def of(findings: list[Finding], praise: str) -> Judgement:
+    def of(findings: list[Finding], praise: str, advice_on: Mapping[Ground, str] | None = None) -> Judgement:
         """The judgement that some findings lead to; without any, ``praise`` is why the poses are to be used.
+
+        ``advice_on`` has what to do about grounds of which their own advice does not speak.
 
         What a mistake makes is no ground beside it: what a misreading leaves undetermined says nothing of the motion,
         and errors that a wrong size, wrong intrinsics or a late clock make say nothing of the arm.
@@ -342,7 +344,8 @@ class Judgement:
         worst = max((ground.verdict for ground in grounds), key=list(Verdict).index)
         facts = "; ".join(words for group in by_ground.values() for words in group)
         # What makes poses useless comes first, and the rest may go with it.
-        advice = [grounds[0].advice] if worst is Verdict.DO_NOT_USE else list(dict.fromkeys(g.advice for g in grounds))
+        what_to_do = [(advice_on or {}).get(ground, ground.advice) for ground in grounds]
+        advice = what_to_do[:1] if worst is Verdict.DO_NOT_USE else list(dict.fromkeys(what_to_do))
         numbered = advice if len(advice) == 1 else [f"({i}) {each}" for i, each in enumerate(advice, start=1)]
         return Judgement(worst, grounds, f"{facts}. What to do: {'; '.join(numbered)}")
 

@@ -177,14 +177,14 @@ def calibrate(
     if rig is not None or is_log(source):
         refuse(context, NOT_FOR_A_LOG)
         described = None if rig is None else rw.rig.read_rig(rig)
-        if rw.runs.is_of_odometries(described, source):
+        if rw.odometry.is_of_odometries(described, source):
             refuse(context, NOT_FOR_ODOMETRIES)
         if output is None:
             needed = "give -o FOLDER"
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
-        if rw.runs.is_of_odometries(described, source):
+        if rw.odometry.is_of_odometries(described, source):
             return calibrate_odometries(source, described, output, anyway=anyway, force=force, verbose=verbose)
         return calibrate_log(
             source,
@@ -333,5 +333,5 @@ def calibrate_odometries(
 ) -> ExitStatus:
     """Run all stages of sensors that know only their own motion, and print the report."""
     with StageDisplay() as stage, said_in_the_report():
-        solved = rw.runs.calibrate_odometry_log(source, rig, output, anyway=anyway, replace=force, progress=stage)
+        solved = rw.odometry.calibrate_odometry_log(source, rig, output, anyway=anyway, replace=force, progress=stage)
     return show_odometries(solved, output, anyway=anyway, verbose=verbose)

@@ -34,8 +34,8 @@ def report(
     check_output(output, *read_of(result))
     with StageDisplay() as stage:
         stage("writing the report")
-        if rw.report.is_page_of_odometries(result):
-            rw.report.write_odometry_page(result, output)
+        if rw.odometry.is_page_of_odometries(result):
+            rw.odometry.write_odometry_page(result, output)
         else:
             rw.report.write_html(result, output, images=images, figures=figures)
     beside = "" if figures is None else f"; figures: {shown_path(figures)}"

@@ -1,17 +1,19 @@
 """Options and arguments that several subcommands share, and the report that two of them print."""
 
 from __future__ import annotations
-
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
+from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
-
+from typing import Annotated
+from typing import Literal
 import typer
-
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import ExitStatus, exit_status
-from gtsam_rwhec.files.terminal_text import say, shown_path
+from gtsam_rwhec.cli.failures import ExitStatus
+from gtsam_rwhec.cli.failures import exit_status
+from gtsam_rwhec.files.terminal_text import say
+from gtsam_rwhec.files.terminal_text import shown_path
 
 FOLDER_OF_CSV = "folder of CSV files such as tag_0_cam_0_A.csv and tag_0_cam_0_B.csv"
 #: Headings in the help.
@@ -96,7 +98,7 @@ VerboseOption = Annotated[
 WHOLE = "--verbose"
 
 
-def exported(solved: rw.runs.Solved | rw.runs.OdometrySolved, *, anyway: bool) -> list[str]:
+def exported(solved: rw.runs.Solved | rw.odometry.OdometrySolved, *, anyway: bool) -> list[str]:
     """The message that files of poses that are not to be used were written, or that they were not; or none."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
         return []
@@ -123,11 +125,11 @@ def show(
     return exit_status(calibrated.judgement, of_rig=True)
 
 
-def show_odometries(solved: rw.runs.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
+def show_odometries(solved: rw.odometry.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
     """Print the report of sensors that know only their own motion, and where the files are; its exit status."""
     written = [name for name in rw.runs.OUTPUTS if (output / name).exists()]
     page = output / rw.runs.REPORT_FILE if rw.runs.REPORT_FILE in written else None
-    rw.report.print_odometry(solved.result, verbose=verbose, page=page)
+    rw.odometry.print_odometry(solved.result, verbose=verbose, page=page)
     messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(solved, anyway=anyway)]
     for message in messages:
         say(message, to_errors=True)

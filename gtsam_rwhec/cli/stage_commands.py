@@ -119,9 +119,9 @@ def solve(
 ) -> ExitStatus:
     """Third stage: find the certified poses, refine them, and print covariances."""
     described = None if rig is None else rw.rig.read_rig(rig)
-    if rw.runs.is_of_odometries(described, cleaned):
+    if rw.odometry.is_of_odometries(described, cleaned):
         with StageDisplay() as stage, said_in_the_report():
-            solved = rw.runs.solve_odometries_into(cleaned, described, output, progress=stage)
+            solved = rw.odometry.solve_odometries_into(cleaned, described, output, progress=stage)
         return show_odometries(solved, output, anyway=False, verbose=verbose)
     with StageDisplay() as stage, said_in_the_report():
         calibrated = rw.runs.solve_into(cleaned, described, output, progress=stage)
@@ -138,18 +138,18 @@ def export(
     anyway: AnywayOption = False,
 ) -> ExitStatus:
     """Last stage: write a launch file, tf, URDF, cameras (Kalibr, ROS, OpenCV, COLMAP) and plots from a solved log."""
-    if rw.runs.is_of_odometries(None, solved):
+    if rw.odometry.is_of_odometries(None, solved):
         with StageDisplay() as stage:
-            for path in rw.runs.export_odometries(solved, output, anyway=anyway, progress=stage):
+            for path in rw.odometry.export_odometries(solved, output, anyway=anyway, progress=stage):
                 say(shown_path(path))
-        return _said(rw.runs.read_odometries(solved), anyway=anyway)
+        return _said(rw.odometry.read_odometries(solved), anyway=anyway)
     with StageDisplay() as stage:
         for path in rw.runs.export_solved(solved, output, anyway=anyway, progress=stage):
             say(shown_path(path))
     return _said(rw.runs.read_solved(solved), anyway=anyway)
 
 
-def _said(found: rw.runs.Solved | rw.runs.OdometrySolved, *, anyway: bool) -> ExitStatus:
+def _said(found: rw.runs.Solved | rw.odometry.OdometrySolved, *, anyway: bool) -> ExitStatus:
     if found.judgement.verdict is not rw.Verdict.USE:
         say(str(found.judgement), to_errors=True)
     for message in exported(found, anyway=anyway):

@@ -18,22 +18,13 @@ from gtsam_rwhec.files.terminal_text import rounded, shown
 
 @dataclass(frozen=True)
 class NightEvent:
-    """What a robot's chart says at one night.
-
-    Attributes
-    ----------
-    robot : str
-    when_ns : int
-        The night's first measurement.
-    nights : int
-        Nights in the chart since the last change.
-    chance, limit : float
-        The statistic, and the limit below which it is an alarm. The limit is 0 at the first night: nothing is tested.
-    """
+    """What a robot's chart says at one night."""
 
     robot: str
-    when_ns: int
-    nights: int
+    when_ns: int  #: The night's first measurement
+    nights: int  #: Nights in the chart since the last change
+    #: chance, limit: the statistic, and the limit below which it is an alarm. The limit is 0 at the first night:
+    #: nothing is tested
     chance: float
     limit: float
 
@@ -82,46 +73,25 @@ class MovedFrame:
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """A robot's frames moved; ``str()`` says it.
-
-    Attributes
-    ----------
-    robot : str
-    when_ns : int
-        The night of the alarm.
-    last_unchanged_ns, first_changed_ns : int
-        It was between these two nights. Of a drift: it began there.
-    earliest_ns, latest_ns : int
-        First changed nights that are hardly less likely.
-    frames : tuple of MovedFrame
-        The fewest whose movement explains everything, the surest first.
-    is_of_all : bool
-        Whether these are all frames that were tested.
-    kind : "step", "drift" or "step or drift"
-    drift_gain : float
-        Log likelihood of a drift less that of a step.
-    chance, limit : float
-        As in `NightEvent`.
-    is_back : bool
-        Whether the frames are back where they were before the alarm before this one.
-    unit : str
-        The row's unit, which names its result.
-    """
+    """A robot's frames moved; ``str()`` says it."""
 
     robot: str
-    when_ns: int
+    when_ns: int  #: The night of the alarm
+    #: last_unchanged_ns, first_changed_ns: it was between these two nights. Of a drift: it began there
     last_unchanged_ns: int
     first_changed_ns: int
+    #: earliest_ns, latest_ns: first changed nights that are hardly less likely
     earliest_ns: int
     latest_ns: int
-    frames: tuple[MovedFrame, ...]
-    is_of_all: bool
+    frames: tuple[MovedFrame, ...]  #: The fewest whose movement explains everything, the surest first
+    is_of_all: bool  #: Whether these are all frames that were tested
     kind: str
-    drift_gain: float
+    drift_gain: float  #: Log likelihood of a drift less that of a step
+    #: chance, limit: as in `NightEvent`
     chance: float
     limit: float
-    is_back: bool
-    unit: str
+    is_back: bool  #: Whether the frames are back where they were before the alarm before this one
+    unit: str  #: The row's unit, which names its result
 
     def __str__(self) -> str:
         moved = "; ".join(map(str, self.frames))

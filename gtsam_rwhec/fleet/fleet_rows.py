@@ -29,20 +29,11 @@ _INFINITE = {"inf": math.inf, "-inf": -math.inf}
 
 @dataclass(frozen=True, eq=False)
 class RowFrame:
-    """The pose of one frame.
+    """The pose of one frame."""
 
-    Attributes
-    ----------
-    name : str
-        As the robot's rig file has it.
-    kind : "sensor" or "target"
-    T : (4, 4) array
-        T_sensorcarrier_sensor, or T_targetcarrier_target; metres.
-    """
-
-    name: str
+    name: str  #: As the robot's rig file has it
     kind: str
-    T: Array
+    T: Array  #: (4, 4): T_sensorcarrier_sensor, or T_targetcarrier_target; metres
 
 
 @dataclass(frozen=True)
@@ -58,74 +49,41 @@ class RobotRow:
     """One calibration of one robot: of all its logs, of a day or of a log; or why there is none.
 
     The robots of a site are solved together, and each has a row: of its own sensors and of the targets that it saw.
-
-    Attributes
-    ----------
-    unit : str
-        What was solved together: "arm_01", "arm_01@2026-11-22", "hall_a". Its files are in ``robots/UNIT/``.
-    site : str or None
-        The site whose robots were solved together.
-    begin_ns, end_ns : int or None
-        The first and the last measurement, UTC nanoseconds.
-    verdict : Verdict or None
-        None where there is no calibration.
-    reason : str
-        The verdict's reason in words, with what to do.
-    status : Status or None
-        Of the certificate; None also where there is no answer with a positive scale.
-    frames : tuple of RowFrame
-        Sensors first, then targets.
-    covariance : (6 n, 6 n) array or None
-        Joint covariance of the tangents of `frames`, in their order: right perturbations, [omega (rad), v (m)].
-        Infinite along free directions. None where the calibration was not refined.
-    constant_errors : two tuples of 6 float, or empty
-        Deviations of a constant error of the target carriers' and the sensor carriers' poses, which `covariance` holds:
-        the same in every calibration with the same carriers (`CalibrationFields`).
-    degrees_of_freedom : float
-        Of the estimated noise; infinite where it was given.
-    scale : float or dict of str to float
-        Measured over true length, for all or by target; nan where there is none.
-    measurements_sha256 : str
-        Checksum of the measurements' files, the same whatever worker or order.
-    logs : int
-        How many logs are in the answer; `failed_logs` gave nothing.
-    removed : dict of str to int
-        Measurements that cleaning left out, by reason.
-    findings : tuple of str
-        What speaks against the poses, and what the logs said of themselves, in words.
-    cpu_s, bytes_read, peak_bytes : float, int, int
-        Of its logs' tasks and the unit's own, also where an earlier run did them; of the logs' stores; the largest.
-    result : str or None
-        The result file's place below the output, with slashes.
-    failure : str or None
-        Why there is no calibration; without credentials.
     """
 
-    unit: str
+    unit: str  #: What was solved together: "arm_01", "arm_01@2026-11-22", "hall_a". Its files are in ``robots/UNIT/``
     robot: str
-    site: str | None = None
+    site: str | None = None  #: The site whose robots were solved together
+    #: begin_ns, end_ns: the first and the last measurement, UTC nanoseconds
     begin_ns: int | None = None
     end_ns: int | None = None
-    verdict: Verdict | None = None
-    reason: str = ""
+    verdict: Verdict | None = None  #: None where there is no calibration
+    reason: str = ""  #: The verdict's reason in words, with what to do
     grounds: tuple[Ground, ...] = ()
-    status: Status | None = None
-    frames: tuple[RowFrame, ...] = ()
+    status: Status | None = None  #: Of the certificate; None also where there is no answer with a positive scale
+    frames: tuple[RowFrame, ...] = ()  #: Sensors first, then targets
+    #: (6 n, 6 n): joint covariance of the tangents of `frames`, in their order: right perturbations, [omega (rad), v
+    #: (m)]. Infinite along free directions. None where the calibration was not refined
     covariance: Array | None = None
+    #: Deviations of a constant error of the target carriers' and the sensor carriers' poses, which `covariance` holds:
+    #: the same in every calibration with the same carriers (`CalibrationFields`)
     constant_errors: tuple[tuple[float, ...], ...] = ()
-    degrees_of_freedom: float = math.inf
+    degrees_of_freedom: float = math.inf  #: Of the estimated noise; infinite where it was given
+    #: Measured over true length, for all or by target; nan where there is none
     scale: float | Mapping[str, float] = math.nan
-    measurements_sha256: str = ""
-    logs: int = 0
+    measurements_sha256: str = ""  #: Checksum of the measurements' files, the same whatever worker or order
+    logs: int = 0  #: How many logs are in the answer; `failed_logs` gave nothing
     failed_logs: tuple[FailedLog, ...] = ()
     measurements: int = 0
-    removed: Mapping[str, int] = field(default_factory=dict)
-    findings: tuple[str, ...] = ()
+    removed: Mapping[str, int] = field(default_factory=dict)  #: Measurements that cleaning left out, by reason
+    findings: tuple[str, ...] = ()  #: What speaks against the poses, and what the logs said of themselves, in words
+    #: cpu_s, bytes_read, peak_bytes: of its logs' tasks and the unit's own, also where an earlier run did them; of the
+    #: logs' stores; the largest
     cpu_s: float = 0.0
     bytes_read: int = 0
     peak_bytes: int = 0
-    result: str | None = None
-    failure: str | None = None
+    result: str | None = None  #: The result file's place below the output, with slashes
+    failure: str | None = None  #: Why there is no calibration; without credentials
 
     @property
     def is_fine(self) -> bool:

@@ -48,32 +48,19 @@ Outcome = Receipt | Failed
 
 @dataclass(frozen=True)
 class FleetRun:
-    """What a run found and did.
+    """What a run found and did."""
 
-    Attributes
-    ----------
-    output : str
-        Its URL, without credentials.
-    rows : tuple of RobotRow
-        Robots in the manifest's order, sites after them; of each, calibrations in order of time.
-    logs : int
-        How many logs were asked for.
-    new_tasks, earlier_tasks : int
-        How many tasks this run did, and how many an earlier run, or another one, had done.
-    seconds, cpu_s : float
-        On the clock; of the tasks that this run did.
-    remarks : tuple of str
-        What the user should know of the output.
-    """
-
-    output: str
+    output: str  #: Its URL, without credentials
+    #: Robots in the manifest's order, sites after them; of each, calibrations in order of time
     rows: tuple[RobotRow, ...]
-    logs: int
+    logs: int  #: How many logs were asked for
+    #: new_tasks, earlier_tasks: how many tasks this run did, and how many an earlier run, or another one, had done
     new_tasks: int
     earlier_tasks: int
+    #: seconds, cpu_s: on the clock; of the tasks that this run did
     seconds: float
     cpu_s: float
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  #: What the user should know of the output
 
     @property
     def is_fine(self) -> bool:

@@ -39,21 +39,11 @@ MOST_FAULTS = 20
 
 @dataclass(frozen=True)
 class LogSource:
-    """One entry of a robot's logs.
+    """One entry of a robot's logs."""
 
-    Attributes
-    ----------
-    url : str
-        A log, or a pattern of logs.
-    rig : str
-        URL of its rig file.
-    place : str
-        Where the manifest has it, for messages.
-    """
-
-    url: str
-    rig: str
-    place: str
+    url: str  #: A log, or a pattern of logs
+    rig: str  #: URL of its rig file
+    place: str  #: Where the manifest has it, for messages
 
     @property
     def is_pattern(self) -> bool:
@@ -72,21 +62,11 @@ class Robot:
 
 @dataclass(frozen=True)
 class Manifest:
-    """A fleet.
+    """A fleet."""
 
-    Attributes
-    ----------
-    where : str
-        The manifest's URL, or the pattern of the command line.
-    robots : tuple of Robot
-        In the manifest's order; names are unique.
-    shared_rig : str or None
-        The rig file of all robots, where the manifest has one.
-    """
-
-    where: str
-    robots: tuple[Robot, ...]
-    shared_rig: str | None = None
+    where: str  #: The manifest's URL, or the pattern of the command line
+    robots: tuple[Robot, ...]  #: In the manifest's order; names are unique
+    shared_rig: str | None = None  #: The rig file of all robots, where the manifest has one
 
     @property
     def sites(self) -> dict[str, tuple[Robot, ...]]:

@@ -26,21 +26,12 @@ AXES = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z
 
 @dataclass(frozen=True, eq=False)
 class RobotFrames:
-    """The frames of a robot over all its nights, and where each is in the chart's numbers.
+    """The frames of a robot over all its nights, and where each is in the chart's numbers."""
 
-    Attributes
-    ----------
-    groups : dict of str to slice
-        By name; a name that is a sensor in some nights and a target in others has "(target)" after it for these.
-    reference : dict of str to (4, 4) array
-        The pose of its first night.
-    unit : (m,) array
-        The deviation of each number at its first night, rad and m: the numbers are multiples of it.
-    """
-
+    #: By name; a name that is a sensor in some nights and a target in others has "(target)" after it for these
     groups: dict[str, slice]
-    reference: dict[str, Array]
-    unit: Array
+    reference: dict[str, Array]  #: The pose of its first night
+    unit: Array  #: (m,): the deviation of each number at its first night, rad and m: the numbers are multiples of it
 
     @staticmethod
     def of(rows: Sequence[RobotRow]) -> RobotFrames:
@@ -102,23 +93,14 @@ class RobotFrames:
 
 @dataclass(frozen=True, eq=False)
 class Night:
-    """One night in the chart's numbers.
-
-    Attributes
-    ----------
-    when_ns : int
-    x : (m,) array
-    information, covariance : (m, m) arrays
-        Zero in rows that the night does not determine.
-    seen : (m,) array of bool
-        Rows that it determines.
-    """
+    """One night in the chart's numbers."""
 
     when_ns: int
-    x: Array
+    x: Array  #: (m,)
+    #: information, covariance: (m, m): zero in rows that the night does not determine
     information: Array
     covariance: Array
-    seen: np.ndarray
+    seen: np.ndarray  #: (m,): rows that it determines
 
 
 def names_of(rows: Iterable[RobotRow]) -> dict[tuple[str, str], str]:

@@ -37,38 +37,21 @@ _TRIANGLE = np.triu_indices(6)
 
 
 class LogFacts(BaseModel):
-    """The facts of one log, as its file has them.
-
-    Attributes
-    ----------
-    url : str
-        Without credentials.
-    begin_ns, end_ns : int
-        The first and the last measurement that is used, UTC nanoseconds.
-    about : "targetcarrier" or "sensorcarrier"
-        The carrier in whose axes A is noisy.
-    cameras : dict
-        Intrinsics by sensor.
-    detection, cleaning
-        The reports of the stages.
-    poses : dict of str to int
-        At how many poses of the carriers each frame is used.
-    findings : list of (ground, words)
-        What the log itself says against the poses.
-    warnings : list of str
-    """
+    """The facts of one log, as its file has them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    url: str
+    url: str  #: Without credentials
+    #: begin_ns, end_ns: the first and the last measurement that is used, UTC nanoseconds
     begin_ns: int
     end_ns: int
-    about: About
-    cameras: dict[str, dict[str, Any]]
+    about: About  #: The carrier in whose axes A is noisy
+    cameras: dict[str, dict[str, Any]]  #: Intrinsics by sensor
+    #: detection, cleaning: the reports of the stages
     detection: DetectionReport
     cleaning: CleaningReport
-    poses: dict[str, int]
-    findings: list[tuple[Ground, str]] = []
+    poses: dict[str, int]  #: At how many poses of the carriers each frame is used
+    findings: list[tuple[Ground, str]] = []  #: What the log itself says against the poses
     warnings: list[str] = []
 
     def camera(self, sensor: str) -> Camera:
@@ -86,40 +69,24 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class PairMeasurements:
-    """The cleaned measurements of one pair of a log.
+    """The cleaned measurements of one pair of a log."""
 
-    Attributes
-    ----------
-    stamps_ns : (N,) integers
-        On the carriers' clock.
-    A, B : (N, 4, 4) arrays
-    covariances : (N, 6, 6) array or None
-        Of B. The file has them in single precision.
-    pixels : (N, n, 2) array or None
-        The target's corners, nan where one was not seen. The file has them in single precision.
-    """
-
-    stamps_ns: np.ndarray
+    stamps_ns: np.ndarray  #: (N,): on the carriers' clock
+    #: A, B: (N, 4, 4)
     A: Array
     B: Array
-    covariances: Array | None
+    covariances: Array | None  #: (N, 6, 6): of B. The file has them in single precision
+    #: (N, n, 2): the target's corners, nan where one was not seen. The file has them in single precision
     pixels: Array | None
 
 
 @dataclass(frozen=True, eq=False)
 class PartialResult:
-    """What is kept of a log.
-
-    Attributes
-    ----------
-    facts : LogFacts
-    pairs : dict of Pair to PairMeasurements
-    path : (stamps_ns (M,), T (M, 4, 4)) or None
-        T_sensorcarrier_targetcarrier over time, where a clock is to be estimated.
-    """
+    """What is kept of a log."""
 
     facts: LogFacts
-    pairs: Mapping[Pair, PairMeasurements]
+    pairs: Mapping[Pair, PairMeasurements]  #: by Pair
+    #: T_sensorcarrier_targetcarrier over time, where a clock is to be estimated
     path: tuple[np.ndarray, Array] | None = None
 
     def packed(self) -> bytes:

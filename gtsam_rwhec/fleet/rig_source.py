@@ -25,20 +25,12 @@ MOST_BYTES = 4_000_000
 
 @dataclass(frozen=True)
 class RigSource:
-    """A rig file as bytes.
+    """A rig file as bytes."""
 
-    Attributes
-    ----------
-    url : str
-        Where it is.
-    text : str
-    files : tuple of (str, bytes)
-        The files with intrinsics and targets that it names: the path as it has it, and the content. Those of absolute
-        paths are read where they are, by every worker.
-    """
-
-    url: str
+    url: str  #: Where it is
     text: str
+    #: The files with intrinsics and targets that it names: the path as it has it, and the content. Those of absolute
+    #: paths are read where they are, by every worker
     files: tuple[tuple[str, bytes], ...] = ()
 
     @property

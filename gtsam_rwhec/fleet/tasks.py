@@ -35,34 +35,17 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 @dataclass(frozen=True)
 class Receipt:
-    """What a task did. Small: it travels between processes, the file does not.
+    """What a task did. Small: it travels between processes, the file does not."""
 
-    Attributes
-    ----------
-    key : str
-        The task's key.
-    file : str
-        The file's place below the output, with slashes.
-    sha256 : str
-        Checksum of the file's bytes, in hexadecimal digits.
-    was_there : bool
-        Whether an earlier run, or another one, had written the file.
-    cpu_s, seconds : float
-        Of the processor, and on the clock.
-    bytes_read : int
-        Bytes that came from the store of the logs.
-    peak_bytes : int
-        Peak memory of the process since the task began.
-    """
-
-    key: str
-    file: str
-    sha256: str
-    was_there: bool = False
+    key: str  #: The task's key
+    file: str  #: The file's place below the output, with slashes
+    sha256: str  #: Checksum of the file's bytes, in hexadecimal digits
+    was_there: bool = False  #: Whether an earlier run, or another one, had written the file
+    #: cpu_s, seconds: of the processor, and on the clock
     cpu_s: float = 0.0
     seconds: float = 0.0
-    bytes_read: int = 0
-    peak_bytes: int = 0
+    bytes_read: int = 0  #: Bytes that came from the store of the logs
+    peak_bytes: int = 0  #: Peak memory of the process since the task began
 
 
 @dataclass(frozen=True)
@@ -75,22 +58,13 @@ class Failed:
 
 @dataclass(frozen=True)
 class Task:
-    """One call of ``function(*arguments)``.
+    """One call of ``function(*arguments)``."""
 
-    Attributes
-    ----------
-    key : str
-        Unique in a run.
-    function : callable
-        A function of a module, which other processes can import. It returns a Receipt, raises an OSError for what a
-        second attempt may mend, and an error of the library for what none does.
-    arguments : tuple
-        Small, and picklable.
-    """
-
-    key: str
+    key: str  #: Unique in a run
+    #: A function of a module, which other processes can import. It returns a Receipt, raises an OSError for what a
+    #: second attempt may mend, and an error of the library for what none does
     function: Callable[..., Receipt]
-    arguments: tuple[Any, ...] = ()
+    arguments: tuple[Any, ...] = ()  #: Small, and picklable
 
 
 class Engine(Protocol):

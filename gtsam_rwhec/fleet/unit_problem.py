@@ -40,24 +40,13 @@ class UnitLog:
 
 @dataclass(frozen=True, eq=False)
 class UnitProblem:
-    """The problem of a unit, and what its rig files state beside it.
-
-    Attributes
-    ----------
-    problem : Problem
-    carrier_noise : CarrierNoise or None
-    estimated : tuple of str
-        Sensors whose clocks are to be estimated along `path`.
-    path : Trajectory or None
-    log_of : dict of (target, sensor) to (N,) integers
-        The place of each measurement's log among the unit's.
-    """
+    """The problem of a unit, and what its rig files state beside it."""
 
     problem: Problem
     carrier_noise: CarrierNoise | None
-    estimated: tuple[str, ...]
+    estimated: tuple[str, ...]  #: Sensors whose clocks are to be estimated along `path`
     path: Trajectory | None
-    log_of: dict[Pair, np.ndarray]
+    log_of: dict[Pair, np.ndarray]  #: by (target, sensor): The place of each measurement's log among the unit's
 
 
 def sensor_name(robot: str, sensor: str) -> str:

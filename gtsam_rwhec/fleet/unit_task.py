@@ -47,25 +47,12 @@ Each = Literal["robot", "day", "log"]
 
 @dataclass(frozen=True)
 class UnitTask:
-    """What one task solves.
+    """What one task solves."""
 
-    Attributes
-    ----------
-    name : str
-        The robot, the site, or the log's name.
-    site : str or None
-        The site whose robots are solved together.
-    logs : tuple of (robot, Receipt)
-        The partial results.
-    rigs : tuple of (robot, RigSource)
-        Each rig file of each robot once.
-    each : "robot", "day" or "log"
-    """
-
-    name: str
-    site: str | None
-    logs: tuple[tuple[str, Receipt], ...]
-    rigs: tuple[tuple[str, RigSource], ...]
+    name: str  #: The robot, the site, or the log's name
+    site: str | None  #: The site whose robots are solved together
+    logs: tuple[tuple[str, Receipt], ...]  #: The partial results
+    rigs: tuple[tuple[str, RigSource], ...]  #: Each rig file of each robot once
     each: Each = "robot"
 
     @property

@@ -30,24 +30,12 @@ DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """What the charts of a fleet say.
+    """What the charts of a fleet say."""
 
-    Attributes
-    ----------
-    rate : float
-        False alarms a night of one robot.
-    events : tuple of Event
-        In order of time.
-    robots : dict of str to RobotChart
-        Robots with at least one night that can be used.
-    spread : FoundSpread
-        How the nights scatter beside what their covariances say, from all of them.
-    """
-
-    rate: float
-    events: tuple[Event, ...]
-    robots: dict[str, RobotChart]
-    spread: FoundSpread
+    rate: float  #: False alarms a night of one robot
+    events: tuple[Event, ...]  #: In order of time
+    robots: dict[str, RobotChart]  #: Robots with at least one night that can be used
+    spread: FoundSpread  #: How the nights scatter beside what their covariances say, from all of them
 
     @property
     def alarms(self) -> tuple[AlarmEvent, ...]:
@@ -62,24 +50,14 @@ class Watched:
 
 @dataclass(eq=False)
 class RobotChart:
-    """The chart of one robot as it stands, with what it said.
-
-    Attributes
-    ----------
-    frames : RobotFrames
-    when_ns : list of int
-        Of each night.
-    x : list of (m,) arrays
-        Its numbers, in the frames' units; nan in what it does not determine.
-    tests : list of NightTest
-    alarms : list of AlarmEvent
-    """
+    """The chart of one robot as it stands, with what it said."""
 
     number: int
     frames: RobotFrames
     names: dict[tuple[str, str], str]
     chart: Chart
-    when_ns: list[int] = field(default_factory=list)
+    when_ns: list[int] = field(default_factory=list)  #: Of each night
+    #: Its numbers, in the frames' units; nan in what it does not determine
     x: list[Array] = field(default_factory=list)
     tests: list[NightTest] = field(default_factory=list)
     alarms: list[AlarmEvent] = field(default_factory=list)

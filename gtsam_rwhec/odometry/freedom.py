@@ -14,7 +14,7 @@ import scipy.linalg
 from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.unknowns import SCALE, Layout
+from gtsam_rwhec.odometry.window_likelihood import SCALE, Layout
 
 #: The probability that a free direction counts as determined: a fleet has many drives.
 SIGNIFICANCE = 1e-6
@@ -28,27 +28,13 @@ RIDGE = 1e-13
 
 @dataclass(frozen=True)
 class Freedom:
-    """What is free, and the information of the rest.
+    """What is free, and the information of the rest."""
 
-    Attributes
-    ----------
-    by_data : (p, f) array
-        Directions that the drive leaves free, in units of 1 rad, metres, a scale times e.
-    left : (p, l) array
-        Those of them that what is given leaves free too.
-    information : (p, p) array
-        H - N where the drive tells, plus that of what is given.
-    score : (p, p) array
-        H plus that of what is given: the covariance of the gradient.
-    weakest : float
-        The smallest ratio of information over its threshold.
-    """
-
-    by_data: Array
-    left: Array
-    information: Array
-    score: Array
-    weakest: float
+    by_data: Array  #: (p, f): directions that the drive leaves free, in units of 1 rad, metres, a scale times e
+    left: Array  #: (p, l): those of them that what is given leaves free too
+    information: Array  #: (p, p): h - N where the drive tells, plus that of what is given
+    score: Array  #: (p, p): h plus that of what is given: the covariance of the gradient
+    weakest: float  #: The smallest ratio of information over its threshold
 
     def complement(self) -> Array:
         """An orthonormal basis (p, p - l) of the directions that are determined."""

@@ -4,40 +4,146 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.sampling import SampledTrack
+
+#: Velocities are differences over so many seconds to each side, or a step if that is longer.
+HALF_S = 0.1
+#: A cubic has so many poses: one before, two around and one after.
+POINTS = 4
+
+
+@dataclass(frozen=True)
+class SampledTrack:
+    """A track with its clock's offset, times in seconds from ``origin_ns`` on the reference's clock."""
+
+    track: OdometryTrack
+    origin_ns: int
+    offset_s: float  #: A stamp t of the track is the reference's t + offset_s
+    good: np.ndarray  #: (N - 1,) booleans: steps that may be used
+
+    @cached_property
+    def times(self) -> Array:
+        """(N,) seconds on the reference's clock."""
+        stamps: Array = (np.asarray(self.track.stamps_ns) - self.origin_ns) * 1e-9 + self.offset_s
+        return stamps
+
+    @cached_property
+    def _bad_before(self) -> np.ndarray:
+        """How many steps that may not be used end at or before each pose, (N,)."""
+        counts: np.ndarray = np.r_[0, np.cumsum(~self.good)]
+        return counts
+
+    @cached_property
+    def _sums(self) -> tuple[Array, Array, Array]:
+        """Integrals to each pose of dt, p dt and p p' dt over the ends p of the steps, about the track's mean."""
+        p = self.track.T_start_sensor[:, :3, 3] - self.centre
+        dt = np.r_[0.0, np.diff(self.times)]
+        return self.times, np.cumsum(p * dt[:, None], axis=0), np.cumsum(_outer(p) * dt[:, None, None], axis=0)
+
+    @cached_property
+    def centre(self) -> Array:
+        """The mean (3,) of the track's positions."""
+        mean: Array = np.asarray(self.track.T_start_sensor)[:, :3, 3].mean(axis=0)
+        return mean
+
+    def poses(self, at: Array) -> Array:
+        """T_start_sensor (M, 4, 4) at times (M,), by cubics through the four nearest poses in their tangent space."""
+        times, T = self.times, np.asarray(self.track.T_start_sensor)
+        i = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+        if len(times) < POINTS:
+            share = ((at - times[i]) / (times[i + 1] - times[i]))[:, None]
+            return T[i] @ se3.expmap(share * se3.logmap(se3.inverse(T[i]) @ T[i + 1]))
+        first = np.clip(i - 1, 0, len(times) - POINTS)
+        weights = np.ones((len(at), POINTS))
+        for a in range(POINTS):  # Lagrange's polynomials
+            for b in range(POINTS):
+                if a != b:
+                    weights[:, a] *= (at - times[first + b]) / (times[first + a] - times[first + b])
+        from_here = se3.inverse(T[i])
+        tangent = np.zeros((len(at), 6))
+        for a in range(POINTS):
+            tangent += weights[:, a, None] * se3.logmap(from_here @ T[first + a])
+        poses: Array = T[i] @ se3.expmap(tangent)
+        return poses
+
+    def covers(self, start: Array, end: Array, max_gap_s: float) -> np.ndarray:
+        """Which windows (M,) are inside the track and have no bad step and no gap."""
+        times = self.times
+        inside = (start >= times[0] - 1e-9) & (end <= times[-1] + 1e-9)
+        a = np.clip(np.searchsorted(times, start + 1e-9, side="right") - 1, 0, len(times) - 1)
+        b = np.clip(np.searchsorted(times, end - 1e-9, side="left"), 0, len(times) - 1)
+        gaps = np.r_[0, np.cumsum(np.diff(times) > max_gap_s)]
+        clean: np.ndarray = inside & (self._bad_before[b] == self._bad_before[a]) & (gaps[b] == gaps[a])
+        return clean
+
+    def velocities(self, at: Array) -> Array:
+        """Body velocities (M, 6) at times (M,), [rad/s, m/s], by central differences."""
+        half = max(HALF_S, float(np.median(np.diff(self.times))))
+        before = np.clip(at - half, self.times[0], self.times[-1])
+        after = np.clip(at + half, self.times[0], self.times[-1])
+        motion = se3.logmap(se3.inverse(self.poses(before)) @ self.poses(after))
+        velocity: Array = motion / np.maximum(after - before, 1e-9)[:, None]
+        return velocity
+
+    def path_sums(self, start: Array, end: Array, T_end: Array) -> tuple[Array, Array, Array]:
+        """Over each window: its length (M,), and the integrals (M, 3), (M, 3, 3) of p and p p' in the end's frame.
+
+        p is where the sensor was, so that a twist of its pose there moves its pose at the end by the adjoint.
+        """
+        length, first, second = (_between(self.times, sums, start, end) for sums in self._sums)
+        R, at_end = T_end[:, :3, :3], T_end[:, :3, 3] - self.centre
+        # of p - p_end, then turned into the end's frame
+        second = second - _outer_sum(first, at_end) + length[:, None, None] * _outer(at_end)
+        first = first - length[:, None] * at_end
+        turned = np.swapaxes(R, 1, 2)
+        return length, np.einsum("nij,nj->ni", turned, first), turned @ second @ R
+
+
+def _between(times: Array, sums: Array, start: Array, end: Array) -> Array:
+    """The difference of cumulative sums (N, ...) at two times, linear between poses."""
+    flat = sums.reshape(len(times), -1)
+
+    def at(when: Array) -> Array:
+        i = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(times) - 2)
+        share = ((when - times[i]) / (times[i + 1] - times[i]))[:, None]
+        value: Array = flat[i] + share * (flat[i + 1] - flat[i])
+        return value
+
+    difference: Array = (at(end) - at(start)).reshape(len(start), *sums.shape[1:])
+    return difference
+
+
+def _outer(p: Array) -> Array:
+    product: Array = p[:, :, None] * p[:, None, :]
+    return product
+
+
+def _outer_sum(p: Array, q: Array) -> Array:
+    product: Array = p[:, :, None] * q[:, None, :] + q[:, :, None] * p[:, None, :]
+    return product
 
 
 @dataclass(frozen=True)
 class WindowMotions:
-    """Motions of m sensors over n windows that follow one another: their errors are independent.
+    """Motions of m sensors over n windows that follow one another: their errors are independent."""
 
-    Attributes
-    ----------
-    start, end : (n,) seconds
-    M : (m, n, 4, 4) array
-        T_before_after of each sensor, lengths as it measured them.
-    used : (m, n) booleans
-        Where a sensor has the window.
-    length : (m, n) seconds
-    first, second : (m, n, 3) and (m, n, 3, 3) arrays
-        Integrals of p dt and p p' dt along the way, p in the frame at the window's end.
-    by_offset : (m, n, 6) array
-        Derivative of M (right perturbation) by the sensor's time offset, per second.
-    """
-
+    #: start, end: (n,) s
     start: Array
     end: Array
-    M: Array
-    used: np.ndarray
-    length: Array
+    M: Array  #: (m, n, 4, 4): T_before_after of each sensor, lengths as it measured them
+    used: np.ndarray  #: (m, n) booleans: where a sensor has the window
+    length: Array  #: (m, n) s
+    #: first, second: (m, n, 3) and (m, n, 3, 3): Integrals of p dt and p p' dt along the way, p in the frame at the
+    #: window's end
     first: Array
     second: Array
-    by_offset: Array
+    by_offset: Array  #: (m, n, 6): derivative of M (right perturbation) by the sensor's time offset, per second
 
     @staticmethod
     def of(tracks: Sequence[SampledTrack], edges: Array, max_gap_s: float, *, clocks: bool = True) -> WindowMotions:
@@ -112,3 +218,117 @@ def _of_track(track: SampledTrack, start: Array, end: Array, *, clocks: bool) ->
     at_start = np.einsum("nij,nj->ni", se3.adjoint(se3.inverse(M)), track.velocities(start))
     # The sensor's stamp t is the reference's t + offset: a larger offset reads the track earlier.
     return M, length, first, second, at_start - track.velocities(end)
+
+
+def first_rotation_variances(windows: WindowMotions) -> Array:
+    """A start (m,), rad^2/s: the turn's angle is the same in all sensors, whatever their poses.
+
+    The difference of two sensors' angles has the sum of their variances; medians, so that outliers do not count.
+    """
+    angles = np.linalg.norm(windows.rotation_vectors(), axis=2)
+    m = windows.sensors
+    rows, right = [], []
+    for j in range(m):
+        for k in range(j + 1, m):
+            both = windows.used[j] & windows.used[k]
+            if both.sum() < 5:
+                continue
+            length = 0.5 * (windows.length[j] + windows.length[k])[both]
+            row = np.zeros(m)
+            row[[j, k]] = 1.0
+            rows.append(row)
+            right.append((np.median(np.abs(angles[j, both] - angles[k, both]) / np.sqrt(length)) / 0.6745) ** 2)
+    if not rows:
+        return np.full(m, 1e-6)
+    mean = float(np.mean(right)) / 2.0
+    # A little towards the mean: two sensors tell only the sum.
+    ridge = 1e-3 * np.eye(m)
+    found = np.linalg.lstsq(np.vstack([rows, ridge]), np.r_[right, np.full(m, 1e-3 * mean)], rcond=None)[0]
+    floor = max(0.05 * mean, 1e-16)
+    result: Array = np.maximum(found, floor)
+    return result
+
+
+#: Lengths that are tried, in steps of the slowest sensor.
+LADDER = (1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40)
+#: The longest window, seconds: a second of driving is one motion, a minute is not.
+LONGEST_S = 5.0
+#: Turns of more than this in 95 % of windows make rotation vectors a poor measure, rad.
+LARGEST_TURN_RAD = 1.2
+#: This part of the information along each axis may be lost to longer windows.
+LOSS = 0.01
+#: An axis has information if what it shows is so many times what noise would.
+CLEARLY = 4.0
+#: A vehicle turned about an axis if the square of its turns is so many times that of their noise, as it was found.
+PLAINLY = 10.0
+#: Fewer windows than this say little about their own noise.
+FEWEST = 20
+
+
+def edges_of(tracks: Sequence[SampledTrack], every: int) -> Array:
+    """Times (n + 1,) at each so-many-th pose of the slowest track, where at least two tracks are."""
+    slowest = max(tracks, key=lambda track: float(np.median(np.diff(track.times))))
+    begin = sorted(track.times[0] for track in tracks)[1]
+    end = sorted(track.times[-1] for track in tracks)[-2]
+    times = slowest.times[(slowest.times >= begin - 1e-9) & (slowest.times <= end + 1e-9)]
+    chosen: Array = times[::every]
+    return chosen
+
+
+def edges_near(tracks: Sequence[SampledTrack], seconds: float) -> Array:
+    """Times (n + 1,) about so many seconds apart."""
+    step = max(float(np.median(np.diff(track.times))) for track in tracks)
+    return edges_of(tracks, max(1, round(seconds / step)))
+
+
+def best_length(tracks: Sequence[SampledTrack], max_gap_s: float) -> float:
+    """The length, seconds, of the windows that have the most information of the turns."""
+    step = max(float(np.median(np.diff(track.times))) for track in tracks)
+    pilot = WindowMotions.of(tracks, edges_near(tracks, 5.0 * step), max_gap_s, clocks=False)
+    variances = first_rotation_variances(pilot)
+    found: list[tuple[float, float]] = []
+    for every in LADDER:
+        candidate = edges_of(tracks, every)
+        if every > 1 and (every * step > LONGEST_S or len(candidate) <= FEWEST):
+            break
+        windows = WindowMotions.of(tracks, candidate, max_gap_s, clocks=False)
+        if not len(windows):
+            continue
+        value, turn = _information(windows, variances)
+        if every > 1 and turn > LARGEST_TURN_RAD:
+            break
+        found.append((value, every * step))
+    if not found:
+        return step
+    # Of lengths that tell as much, the longest: fewer windows, with turns that stand out of the noise.
+    enough = max(value for value, _ in found) - LOSS * 3.0 * len(tracks)
+    return [seconds for value, seconds in found if value >= enough][-1]
+
+
+def _information(windows: WindowMotions, variances: Array) -> tuple[float, float]:
+    """The logarithm of the information along the axes in which there is any, and the turn of long windows."""
+    w = windows.rotation_vectors()
+    value = 0.0
+    for k in range(windows.sensors):
+        used = windows.used[k]
+        noise = variances[k] * windows.length[k, used]
+        rows = w[k, used] / np.sqrt(noise)[:, None]
+        N = 2.0 * float(used.sum())
+        S = np.linalg.eigvalsh(float((rows**2).sum()) * np.eye(3) - rows.T @ rows)
+        # What is above N by chance, or as the noise is known roughly, tells nothing.
+        told = np.where(S > CLEARLY * N, S - N, 0.0)
+        value += float(np.log1p(told**2 / (told + N + 1e-300)).sum())
+    return value, float(np.quantile(np.linalg.norm(w[windows.used], axis=1), 0.95))
+
+
+def axes_turned(windows: WindowMotions, motion: Array, variance: float) -> tuple[int, Array, Array]:
+    """About how many axes the fused motions turned beyond their noise (0 to 3), mean squares (3,), and the axes (3, 3).
+
+    ``variance`` is that of the fused rotation about each axis, rad^2 a second.
+    """
+    w = se3.so3_logmap(motion[:, :3, :3])
+    square, axes = np.linalg.eigh(w.T @ w)
+    order = np.argsort(-square)
+    n = max(len(windows), 1)
+    limit = PLAINLY * variance * float(np.median(windows.length)) * n
+    return int((square > limit).sum()), square[order] / n, axes[:, order].T

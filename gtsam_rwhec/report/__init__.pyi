@@ -6,9 +6,6 @@ from .covariance_report import print_refined as print_refined
 from .cross_validation_table import print_cross_validation as print_cross_validation
 from .demo_report import print_demo as print_demo
 from .log_report import print_log as print_log
-from .odometry_report import print_odometry as print_odometry
-from .odometry_report import is_page_of_odometries as is_page_of_odometries
-from .odometry_report import write_odometry_page as write_odometry_page
 from .pair_grid import PairGrid as PairGrid
 from .pose_table import sensor_table as sensor_table
 from .pose_table import target_table as target_table

@@ -27,13 +27,6 @@ from .recorded_logs import samples_problem as samples_problem
 from .recorded_logs import write_samples_log as write_samples_log
 
 # Sensors that know only their own motion.
-from .odometry_road import calibrate_odometry_log as calibrate_odometry_log
-from .odometry_road import export_odometries as export_odometries
-from .odometry_road import is_of_odometries as is_of_odometries
-from .odometry_solving import OdometrySolved as OdometrySolved
-from .odometry_solving import read_odometries as read_odometries
-from .odometry_solving import solve_odometries as solve_odometries
-from .odometry_solving import solve_odometries_into as solve_odometries_into
 from .odometry_tracks import read_odometry as read_odometry
 
 # What comes out, and what a log that a stage wrote holds.

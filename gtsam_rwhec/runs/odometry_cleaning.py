@@ -1,19 +1,123 @@
-"""Cleaning of odometries that are calibrated with one another: their steps, and why some are not used."""
+"""Cleaning of odometries: steps that are too fast, jumps of tracking, and gaps are not used, with the reason.
+
+The DQ paper (Appendix D.1) limits the step between two frames, 0.10 m and 11.5 degrees, which has its frame rate in it.
+Here the limits are speeds; and a step must be like those before and after it: a jump of tracking is one step that its
+neighbours do not lead to.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.geometry.odometry_track import OdometryTrack
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.odometry import OdometryTrack
-from gtsam_rwhec.odometry.gates import gated
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.odometry_solving import options_of
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
+
+#: A step whose velocity is so many robust deviations away from the mean of its neighbours' is a jump.
+JUMP = 12.0
+#: A jump is larger than this, whatever the deviation: rad/s and m/s.
+LEAST_RAD_PER_S, LEAST_M_PER_S = 0.2, 0.5
+
+
+@dataclass(frozen=True)
+class Gates:
+    """Steps of a track that are faster than this (m/s, rad/s) are not used, nor jumps, where `reject_jumps` says so."""
+
+    max_speed_m_per_s: float
+    max_turn_rad_per_s: float
+    reject_jumps: bool
+
+
+def gates_of(rig: Rig) -> Gates:
+    """The widest gates of all odometries of a rig file."""
+    sources = [one.odometry for one in rig.odometries.values()]
+    return Gates(
+        max_speed_m_per_s=max(one.max_speed_m_s for one in sources),
+        max_turn_rad_per_s=float(np.radians(max(one.max_turn_deg_s for one in sources))),
+        reject_jumps=rig.cleaning.robust != "none",
+    )
+
+
+@dataclass(frozen=True)
+class Gated:
+    """The steps (N - 1,) of a track that are good, why the others are not, and the track with these made smooth.
+
+    Poses after a step that is not good go on as if it had been like its neighbours, so that what is interpolated or
+    compared nearby is not torn. Motions over such a step are not used.
+    """
+
+    good: np.ndarray
+    removed: tuple[Removed, ...]
+    track: OdometryTrack
+
+
+def gated(track: OdometryTrack, gates: Gates) -> Gated:
+    """Speeds within the limits, and no jumps."""
+    stamps, T = np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor)
+    dt = np.diff(stamps) * 1e-9
+    velocity = se3.logmap(se3.inverse(T[:-1]) @ T[1:]) / dt[:, None]
+    turning, moving = np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
+    limits = [(RemovalReason.TURNING_FAST, turning, gates.max_turn_rad_per_s)]
+    if not track.has_unknown_scale:
+        limits.append((RemovalReason.MOVING_FAST, moving, gates.max_speed_m_per_s))
+    removed: dict[int, Removed] = {}
+    for reason, values, limit in limits:
+        _add(removed, reason, values, limit, stamps)
+    if gates.reject_jumps and len(dt) >= 5:
+        least_m = LEAST_M_PER_S if not track.has_unknown_scale else 0.2 * float(np.median(moving))
+        for reason, part, least in (
+            (RemovalReason.FIRST_SENSOR_STEP_RAD, velocity[:, :3], LEAST_RAD_PER_S),
+            (RemovalReason.FIRST_SENSOR_STEP_M, velocity[:, 3:], least_m),
+        ):
+            off = _off_neighbours(part)
+            limit = max(least, JUMP * float(np.median(off)) / 0.6745)
+            worst = off > limit
+            # The neighbours of a jump are off by half of it: of steps in a row only the largest is one.
+            peak = worst & (off >= np.r_[0.0, off[:-1]]) & (off >= np.r_[off[1:], 0.0])
+            values = np.where(peak, off * np.r_[dt], 0.0)
+            _add(removed, reason, values, limit * float(np.median(dt)), stamps)
+    good = np.ones(len(dt), dtype=bool)
+    good[[item.index - 1 for item in removed.values()]] = False
+    return Gated(good, tuple(removed[i] for i in sorted(removed)), _smoothed(track, velocity, dt, good))
+
+
+def _smoothed(track: OdometryTrack, velocity: Array, dt: Array, good: np.ndarray) -> OdometryTrack:
+    """Each bad step replaced by one with the mean velocity of the good steps about it."""
+    bad = np.flatnonzero(~good)
+    known = np.flatnonzero(good)
+    if not len(bad) or not len(known):
+        return track
+    T = np.asarray(track.T_start_sensor)
+    after = known[np.clip(np.searchsorted(known, bad), 0, len(known) - 1)]
+    before = known[np.clip(np.searchsorted(known, bad) - 1, 0, len(known) - 1)]
+    steps = se3.expmap(0.5 * (velocity[after] + velocity[before]) * dt[bad, None])
+    repaired, moved = T.copy(), np.eye(4)
+    for i, step, end in zip(bad, steps, np.r_[bad[1:], len(T) - 1], strict=True):
+        # What was at T[i + 1] is at the repaired pose i, one step on; all poses up to the next bad step move with it.
+        moved = repaired[i] @ step @ se3.inverse(T[i + 1][None])[0]
+        repaired[i + 1 : end + 1] = moved @ T[i + 1 : end + 1]
+    return replace(track, T_start_sensor=repaired)
+
+
+def _off_neighbours(velocity: Array) -> Array:
+    """How far each velocity is from the mean of those before and after it."""
+    padded = np.vstack([velocity[1:2], velocity, velocity[-2:-1]])
+    off: Array = np.linalg.norm(velocity - 0.5 * (padded[:-2] + padded[2:]), axis=1)
+    return off
+
+
+def _add(removed: dict[int, Removed], reason: RemovalReason, values: Array, limit: float, stamps: np.ndarray) -> None:
+    """The pose at the end of each step whose value is over the limit, if it is not there already."""
+    for i in np.flatnonzero(values > limit).tolist():
+        removed.setdefault(i + 1, Removed(reason, i + 1, int(stamps[i + 1]), float(values[i]), float(limit)))
 
 
 def odometry_steps(log: Log, rig: Rig, reference: OdometryTrack, sensor: str) -> MeasuredPairs:
@@ -34,7 +138,7 @@ def odometry_steps(log: Log, rig: Rig, reference: OdometryTrack, sensor: str) ->
     own_gap = np.diff(stamps) > 1e9 * rig.odometries[sensor].odometry.max_gap_s
     for i in np.flatnonzero(own_gap).tolist():
         reasons[i] = RemovalReason.ODOMETRY_GAP
-    for removed in gated(track, options_of(rig)).removed:
+    for removed in gated(track, gates_of(rig)).removed:
         reasons[removed.index - 1] = removed.reason
     return MeasuredPairs(
         target=sensor,

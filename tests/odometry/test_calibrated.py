@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rwhec_factors import se3
 
+from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.odometry import JointCertificate, OdometryCalibration, OdometryNoise, OtherAnswer, Windows
 from gtsam_rwhec.solver.certificate import Status
 
@@ -33,17 +34,19 @@ def _calibration(status: Status, others: tuple[OtherAnswer, ...] = ()) -> Odomet
 
 
 @pytest.mark.parametrize(
-    ("status", "others", "first"),
+    ("status", "others", "grounds"),
     [
-        (Status.CERTIFIED, (), "Use these poses."),
-        (Status.GAP, (), "Do not use these poses: no proof"),
-        (Status.CERTIFIED, (OtherAnswer("the distance has two signs", {}),), "Do not use these poses: another"),
+        (Status.CERTIFIED, (), ()),
+        (Status.GAP, (), (Ground.NOT_CERTIFIED,)),
+        (Status.CERTIFIED, (OtherAnswer("the distance has two signs", {}),), (Ground.NOT_UNIQUE,)),
     ],
 )
-def test_the_verdict_is_the_first_line(status: Status, others: tuple[OtherAnswer, ...], first: str) -> None:
-    words = str(_calibration(status, others)).splitlines()
-    assert words[0].startswith(first)
-    assert "noise of camera (found): 0.0573 deg and 10 mm after a second" in words
+def test_the_verdict_is_of_proof_and_uniqueness(
+    status: Status, others: tuple[OtherAnswer, ...], grounds: tuple[Ground, ...]
+) -> None:
+    found = _calibration(status, others)
+    assert found.judgement.grounds == grounds
+    assert str(found) == str(found.judgement)
 
 
 def test_poses_between_any_two_sensors() -> None:

@@ -12,9 +12,8 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec import odometry
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.odometry.gates import gated
-from gtsam_rwhec.odometry.sampling import SampledTrack
-from gtsam_rwhec.odometry.window_choice import best_length
+from gtsam_rwhec.odometry.window_motions import SampledTrack, best_length
+from gtsam_rwhec.runs.odometry_cleaning import gated
 
 
 def test_a_jump_is_one_bad_step_and_the_track_goes_on_without_it() -> None:
@@ -22,7 +21,7 @@ def test_a_jump_is_one_bad_step_and_the_track_goes_on_without_it() -> None:
     T = track.T_start_sensor.copy()
     jump = se3.expmap(np.array([[0.3, 0.0, 0.0, 0.0, 2.0, 0.0]]))[0]
     T[200:] = T[199] @ jump @ se3.inverse(T[199][None])[0] @ T[200:]
-    found = gated(replace(track, T_start_sensor=T), odometry.OdometryOptions())
+    found = gated(replace(track, T_start_sensor=T), odometry.OdometryOptions().gates)
     np.testing.assert_array_equal(np.flatnonzero(~found.good), [199])
     assert found.removed[0].index == 200
     step = se3.inverse(found.track.T_start_sensor[199][None])[0] @ found.track.T_start_sensor[200]
@@ -34,9 +33,9 @@ def test_a_jump_is_one_bad_step_and_the_track_goes_on_without_it() -> None:
 
 def test_speeds_are_limited_by_rate() -> None:
     track = tracks(drive("3d", 1))[0]
-    found = gated(track, odometry.OdometryOptions(max_speed_m_per_s=3.0))
+    found = gated(track, odometry.OdometryOptions(max_speed_m_per_s=3.0).gates)
     assert 0 < found.good.sum() < len(found.good)
-    assert not gated(track, odometry.OdometryOptions()).removed
+    assert not gated(track, odometry.OdometryOptions().gates).removed
 
 
 def test_poses_between_stamps() -> None:

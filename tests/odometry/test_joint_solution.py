@@ -7,8 +7,7 @@ import pytest
 from drives_with_sensors import drive
 from test_odometry_likelihood import SCALED, truth, windows_of
 
-from gtsam_rwhec.odometry.joint_form import JointForm, joint_form
-from gtsam_rwhec.odometry.joint_solution import solved, star_starts
+from gtsam_rwhec.odometry.joint_cost import JointForm, joint_form, solved, star_starts
 from gtsam_rwhec.solver.rotations import random_rotations, vec
 
 

@@ -11,12 +11,17 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry import OdometryTrack
-from gtsam_rwhec.odometry.likelihood import eliminated, information_of_noise, linearised, predicted, weights
-from gtsam_rwhec.odometry.noise_by_residuals import first_rotation_variances, found_variances
-from gtsam_rwhec.odometry.outlying import deletion_squares
-from gtsam_rwhec.odometry.sampling import SampledTrack
-from gtsam_rwhec.odometry.unknowns import Layout, State
-from gtsam_rwhec.odometry.window_motions import WindowMotions
+from gtsam_rwhec.odometry.residual_noise import deletion_squares, found_variances
+from gtsam_rwhec.odometry.window_likelihood import (
+    Layout,
+    State,
+    eliminated,
+    information_of_noise,
+    linearised,
+    predicted,
+    weights,
+)
+from gtsam_rwhec.odometry.window_motions import SampledTrack, WindowMotions, first_rotation_variances
 from gtsam_rwhec.simulate.drives import Drive
 
 

@@ -1,72 +1,126 @@
-"""The likelihood of all sensors' motions, with the vehicle's own motion eliminated window by window (design fact 24).
-
-Sensor k's motion over a window is M_k = T_k^-1 M T_k, with its translation times its scale; M is the motion of sensor 0
-and a nuisance. To first order in perturbations T_k Expmap(x), M Expmap(d):
-
-    r_k = Log(M_k^-1 measured),   r_k + J_k x + B_k d = noise,   J_k = -S (I - Ad(M_k^-1)),   B_k = -S Ad(T_k^-1)
-
-with S the scale on the translations' rows. The code has J and B with the opposite sign: what a step takes from r.
-
-The information H after the elimination holds what the noise of M's estimate adds, since J is evaluated there: the
-expected value of that part is N. So H - N is the information that the motion gives, and with it the covariance of the
-maximum of the likelihood is (H - N)^-1 H (H - N)^-1, as for total least squares.
-"""
+"""The unknowns of a calibration of odometries: their numbers, and one state of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.unknowns import OFFSET, SCALE, Layout, State
 from gtsam_rwhec.odometry.window_motions import WindowMotions
+
+#: Columns of each sensor in the derivatives: pose (6), logarithm of the scale, time offset.
+COLUMNS = 8
+SCALE, OFFSET = 6, 7
+#: The ground's: tilts of its normal about two axes (rad), the reference's height (m).
+GROUND = 3
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which of a sensor's eight columns are unknowns, and where the ground's three are."""
+
+    open: np.ndarray  #: (m, 8) booleans
+    has_ground: bool
+
+    @staticmethod
+    def of(scaled: np.ndarray, *, clocks: bool, has_ground: bool) -> Layout:
+        """Sensor 0 is the one in whose frame the poses are; ``scaled`` (m,) says whose scale is unknown."""
+        is_open = np.ones((len(scaled), COLUMNS), dtype=bool)
+        is_open[:, SCALE], is_open[:, OFFSET] = scaled, clocks
+        is_open[0] = False
+        return Layout(is_open, has_ground)
+
+    @cached_property
+    def size(self) -> int:
+        """How many unknowns there are."""
+        return int(self.open.sum()) + GROUND * self.has_ground
+
+    @cached_property
+    def at(self) -> np.ndarray:
+        """(m, 8) the number of each column, or ``size`` where it is none."""
+        numbers = np.full(self.open.shape, self.size)
+        numbers[self.open] = np.arange(int(self.open.sum()))
+        return numbers
+
+    @cached_property
+    def ground(self) -> np.ndarray:
+        """The numbers of the ground's unknowns."""
+        return np.arange(self.size - GROUND, self.size) if self.has_ground else np.arange(0)
+
+    @cached_property
+    def poses(self) -> np.ndarray:
+        """(m - 1, 6) the numbers of the poses' tangents."""
+        numbers: np.ndarray = self.at[1:, :6]
+        return numbers
+
+    def spread(self, step: Array) -> Array:
+        """A step (size,) by sensor and column, (m, 8)."""
+        by_column: Array = np.append(step, 0.0)[self.at]
+        return by_column
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all unknowns."""
+
+    T: Array  #: (m, 4, 4): poses in the frame of sensor 0
+    scale: Array  #: (m,): measured over true length
+    offset: Array  #: (m,): what is to be added to the time offsets with which the windows were made, seconds
+    motion: Array  #: (n, 4, 4): the motion of sensor 0 over each window
+    tilt: Array  #: (2,): of the ground's normal, rad
+    height: float  #: Of sensor 0 above the ground, metres
+
+    @staticmethod
+    def at(T: Array, scale: Array, windows: WindowMotions, height: float = 0.0) -> State:
+        """At poses and scales; the motions are those of the first sensor that has each window."""
+        m = len(T)
+        motion = np.tile(np.eye(4), (len(windows), 1, 1))
+        known = np.zeros(len(windows), dtype=bool)
+        for k in np.argsort(scale != 1.0, kind="stable"):
+            new = windows.used[k] & ~known
+            M = windows.M[k, new].copy()
+            M[:, :3, 3] /= scale[k]
+            motion[new] = T[k] @ M @ se3.inverse(T[k][None])
+            known |= new
+        return State(T, scale, np.zeros(m), motion, np.zeros(2), height)
+
+    def moved(self, layout: Layout, step: Array, of_motion: Array) -> State:
+        """After a step of the unknowns (size,) and of the motions (n, 6)."""
+        by_sensor = layout.spread(step)
+        ground = step[layout.ground]
+        return replace(
+            self,
+            T=self.T @ se3.expmap(by_sensor[:, :6]),
+            scale=self.scale * np.exp(by_sensor[:, SCALE]),
+            offset=self.offset + by_sensor[:, OFFSET],
+            motion=self.motion @ se3.expmap(of_motion),
+            tilt=self.tilt + ground[:2] if layout.has_ground else self.tilt,
+            height=self.height + float(ground[2]) if layout.has_ground else self.height,
+        )
 
 
 @dataclass(frozen=True)
 class Linear:
-    """Residuals and derivatives at a state.
+    """Residuals and derivatives at a state."""
 
-    Attributes
-    ----------
-    r : (m, n, 6) array
-    J : (m, n, 6, 8) array
-        By the sensor's own columns (`unknowns.COLUMNS`).
-    B : (m, n, 6, 6) array
-        By the window's motion.
-    """
-
-    r: Array
-    J: Array
-    B: Array
+    r: Array  #: (m, n, 6)
+    J: Array  #: (m, n, 6, 8): by the sensor's own columns (`unknowns.COLUMNS`)
+    B: Array  #: (m, n, 6, 6): by the window's motion
 
 
 @dataclass(frozen=True)
 class Eliminated:
-    """The normal equations after the elimination of the windows' motions.
+    """The normal equations after the elimination of the windows' motions."""
 
-    Attributes
-    ----------
-    H : (p, p) array
-    g : (p,) array
-        The step is H^-1 g.
-    G : (n, 6, p) array
-        sum_k B' W J of each window.
-    D : (n, 6, 6) array
-        sum_k B' W B of each window.
-    of_motion : (n, 6) array
-        sum_k B' W r.
-    cost : float
-        Half the weighted squares of the residuals.
-    """
-
-    H: Array
-    g: Array
-    G: Array
-    D: Array
-    of_motion: Array
-    cost: float
+    H: Array  #: (p, p)
+    g: Array  #: (p,): the step is H^-1 g
+    G: Array  #: (n, 6, p): sum_k B' W J of each window
+    D: Array  #: (n, 6, 6): sum_k B' W B of each window
+    of_motion: Array  #: (n, 6): sum_k B' W r
+    cost: float  #: Half the weighted squares of the residuals
 
     def motions(self, step: Array) -> Array:
         """The motions' step (n, 6) that goes with a step of the unknowns."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.terminal_text import shown_path
-from gtsam_rwhec.odometry.odometry_file import OdometryResult, SensorRecord, is_odometry_result, read_odometry_result
+from gtsam_rwhec.odometry.odometry_result import OdometryResult, SensorRecord, is_odometry_result, read_odometry_result
 from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
 from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells

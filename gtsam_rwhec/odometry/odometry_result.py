@@ -21,9 +21,7 @@ from gtsam_rwhec.errors import FileFormatError, FrameError
 from gtsam_rwhec.files.whole_files import read_whole, write_atomically
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.odometry.calibrated import OdometryCalibration
-from gtsam_rwhec.odometry.found import JointCertificate
-from gtsam_rwhec.odometry.judging import free_in_words, judgement_of
+from gtsam_rwhec.odometry.odometry_record import JointCertificate, OdometryCalibration, free_in_words
 
 FORMAT: Final = "gtsam-rwhec odometry result"
 FORMAT_VERSION: Final = 1
@@ -166,7 +164,7 @@ def result_of(
     found: OdometryCalibration, frames: Mapping[str, str] | None = None, sources: tuple[str, ...] = ()
 ) -> OdometryResult:
     """The record of a calibration; `frames` has the names of frames by sensor, `sources` the logs' file names."""
-    judgement = judgement_of(found)
+    judgement = found.judgement
     return OdometryResult(
         written_by=f"gtsam-rwhec {version('gtsam-rwhec')}",
         verdict=judgement.verdict,
@@ -210,7 +208,7 @@ def result_of(
             )
             for one in found.others
         ),
-        findings=found.findings,
+        findings=tuple(finding.words for finding in found.findings),
         remarks=found.remarks,
         certificate=CertificateRecord(
             status=found.certificate.status.value,

@@ -7,11 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.odometry import OdometryNoise, OdometryTrack
+from gtsam_rwhec.logs import Log
 from gtsam_rwhec.results.removed_measurements import RemovalReason
-from gtsam_rwhec.rig import Cleaning, OdometrySource
+from gtsam_rwhec.rig import Cleaning, OdometrySource, Rig
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion
+from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
+from gtsam_rwhec.runs.odometry_tracks import read_odometry
 
 #: Seconds. Windows have one of these lengths.
 LENGTHS_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -25,30 +31,16 @@ OF_MEDIAN = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class OdometryWindows:
-    """Motions over windows that follow one another.
-
-    Attributes
-    ----------
-    window_s : float
-    end_ns : (N,) integers
-        The ends of the windows, on the sensor's clock.
-    A, B : (N, 4, 4) arrays
-        T_before_after of the carriers (metres), and of the sensor (in its own lengths).
-    covariance : (N, 6, 6) array
-        Of B, rotation first, right perturbation.
-    noise : OdometryNoise
-        As stated, or found from what both motions must have in common.
-    reasons : tuple of str
-        Why a window is not used; empty where it is.
-    """
+    """Motions over windows that follow one another."""
 
     window_s: float
-    end_ns: np.ndarray
+    end_ns: np.ndarray  #: (N,): the ends of the windows, on the sensor's clock
+    #: A, B: (N, 4, 4): T_before_after of the carriers (metres), and of the sensor (in its own lengths)
     A: Array
     B: Array
-    covariance: Array
-    noise: OdometryNoise
-    reasons: tuple[str, ...]
+    covariance: Array  #: (N, 6, 6): of B, rotation first, right perturbation
+    noise: OdometryNoise  #: As stated, or found from what both motions must have in common
+    reasons: tuple[str, ...]  #: Why a window is not used; empty where it is
 
 
 def odometry_windows(
@@ -200,3 +192,55 @@ def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: np.ndarray) ->
     last = np.clip(np.searchsorted(stamps_ns, edges_ns[:, 1], side="left"), 0, len(wrong))
     has: np.ndarray = count[last] > count[first]
     return has
+
+
+#: Seconds. Clocks are compared over pieces of this length, within which an odometry has hardly drifted.
+PIECE_S = 30.0
+#: With fewer windows a sensor has no answer.
+FEWEST_USED = 3
+
+
+def odometry_pairs(log: Log, rig: Rig, sensor: str, motion: CarrierMotion) -> tuple[MeasuredPairs, float, float | None]:
+    """The motions of an odometry against the carriers', A Y = Y B; its time offset, and its deviation if estimated.
+
+    Raises
+    ------
+    StampError
+        The motion does not determine the time offset.
+    LogError
+        No window is left.
+    """
+    track = read_odometry(log, rig, sensor)
+    section = rig.odometries[sensor]
+    offset_s, sigma_s = _time_offset(track, rig, motion.trajectory)
+    windows = odometry_windows(
+        track, motion.trajectory, offset_s, section.odometry, rig.cleaning, rig.carriers.max_gap_s
+    )
+    pairs = MeasuredPairs(
+        target=sensor,
+        sensor=sensor,
+        stamps_ns=windows.end_ns,
+        B=windows.B,
+        covariance=windows.covariance,
+        reasons=windows.reasons,
+        A=windows.A,
+    )
+    if pairs.used.sum() < FEWEST_USED:
+        removed = ", ".join(f"{why}: {count}" for why, count in pairs.count.removed.items()) or "none was removed"
+        raise LogError(
+            f"{rig.source.place(('sensors', sensor))}: {section.odometry.place} has {int(pairs.used.sum())} windows of "
+            f"{windows.window_s:g} s to compare with the carriers' motion, of {len(pairs.B)} ({removed}). Are both of "
+            "one drive and of one clock? Else leave the sensor out"
+        )
+    return pairs, offset_s, sigma_s
+
+
+def _time_offset(track: OdometryTrack, rig: Rig, path: Trajectory) -> tuple[float, float | None]:
+    given = rig.odometries[track.sensor].time_offset
+    if given != "estimate":
+        return float(given), None
+    stamps, B = np.asarray(track.stamps_ns), se3.inverse(np.asarray(track.T_start_sensor))
+    piece = ((stamps - stamps[0]) // round(1e9 * PIECE_S)).astype(int)
+    pieces = [(stamps[piece == k], B[piece == k]) for k in np.unique(piece) if (piece == k).sum() >= 2]
+    found = offset_of_either_direction(path, pieces, rig.carriers.max_gap_s, track.sensor)
+    return found.offset_s, found.sigma_s

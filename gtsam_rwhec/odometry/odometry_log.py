@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
-from gtsam_rwhec.errors import LogError, OptionError
-from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.errors import LogError, OptionError, RwhecError
+from gtsam_rwhec.export import export_all
+from gtsam_rwhec.export.files import FILES
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.odometry import (
@@ -21,25 +23,40 @@ from gtsam_rwhec.odometry import (
     OdometryTrack,
     calibrate_odometries,
 )
-from gtsam_rwhec.odometry.odometry_file import (
+from gtsam_rwhec.odometry.odometry_report import write_odometry_page
+from gtsam_rwhec.odometry.odometry_result import (
     OdometryResult,
     parse_odometry_result,
     result_json,
     result_of,
     write_odometry_result,
 )
-from gtsam_rwhec.report.odometry_report import write_odometry_page
 from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig, RigFrames
-from gtsam_rwhec.runs.changed_rig import rig_for_solving
+from gtsam_rwhec.runs.changed_rig import changes, rig_for_solving
+from gtsam_rwhec.runs.cleaning_stage import clean_log
+from gtsam_rwhec.runs.detection_stage import detect_log
 from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
-from gtsam_rwhec.runs.odometry_tracks import read_odometry
-from gtsam_rwhec.runs.output_folder import list_written, made_output_folder
+from gtsam_rwhec.runs.odometry_cleaning import gates_of
+from gtsam_rwhec.runs.odometry_tracks import files_of, read_odometry, write_files
+from gtsam_rwhec.runs.output_folder import (
+    check_is_not_read,
+    list_written,
+    log_name,
+    made_folder,
+    made_output_folder,
+    output_folder,
+)
 from gtsam_rwhec.runs.run_log import (
     CLEAN_LOG,
+    CLEANING_METADATA,
+    DETECTED_LOG,
+    RECORDED_LOG,
     REPORT_FILE,
     RESULT_FILE,
     SOLUTION_TOPIC,
+    is_from_stage,
+    read_embedded_rig,
     read_metadata,
     topics_up_to_detection,
 )
@@ -47,23 +64,12 @@ from gtsam_rwhec.runs.run_log import (
 
 @dataclass(frozen=True, eq=False)
 class OdometrySolved:
-    """A calibration of odometries from a log.
+    """A calibration of odometries from a log."""
 
-    Attributes
-    ----------
-    result : OdometryResult
-        The content of ``result.json``.
-    rig : Rig
-        The rig file that was used.
-    cleaning : CleaningReport
-        What cleaning removed.
-    calibration : OdometryCalibration or None
-        What ``calibrate_odometries`` returned; None where the log was solved before.
-    """
-
-    result: OdometryResult
-    rig: Rig
-    cleaning: CleaningReport
+    result: OdometryResult  #: The content of ``result.json``
+    rig: Rig  #: The rig file that was used
+    cleaning: CleaningReport  #: What cleaning removed
+    #: What ``calibrate_odometries`` returned; None where the log was solved before
     calibration: OdometryCalibration | None = None
 
     @property
@@ -123,13 +129,13 @@ def given_of(rig: Rig) -> Given:
 
 def options_of(rig: Rig) -> OdometryOptions:
     """The options: the widest gates of all sensors, and clocks where one is to be estimated."""
-    sources = [one.odometry for one in rig.odometries.values()]
+    gates = gates_of(rig)
     return OdometryOptions(
         estimate_time_offsets=any(one.time_offset == "estimate" for one in rig.odometries.values()),
-        max_speed_m_per_s=max(one.max_speed_m_s for one in sources),
-        max_turn_rad_per_s=float(np.radians(max(one.max_turn_deg_s for one in sources))),
-        max_gap_s=max(one.max_gap_s for one in sources),
-        reject_outliers=rig.cleaning.robust != "none",
+        max_speed_m_per_s=gates.max_speed_m_per_s,
+        max_turn_rad_per_s=gates.max_turn_rad_per_s,
+        max_gap_s=max(one.odometry.max_gap_s for one in rig.odometries.values()),
+        reject_outliers=gates.reject_jumps,
     )
 
 
@@ -182,3 +188,135 @@ def frames_of_odometries(solved: OdometrySolved) -> RigFrames:
         time_offsets_s={rig.frame_of(one.sensor): one.time_offset_s for one in result.sensors},
         warnings=warnings,
     )
+
+
+def is_of_odometries(rig: Rig | None, source: str | Path | None = None) -> bool:
+    """Whether a rig file, or the one in a log that a stage wrote, has odometries alone and one of them as reference."""
+    if rig is not None:
+        return rig.is_of_odometries
+    if source is None or not Path(source).is_file():
+        return False
+    try:
+        with open_log(source) as log:
+            return is_from_stage(log) and read_embedded_rig(log).is_of_odometries
+    except RwhecError:
+        return False  # the stage that reads it says why
+
+
+@one_blas_thread()
+def calibrate_odometry_log(
+    log_path: str | Path,
+    rig: Rig | None,
+    out: str | Path,
+    *,
+    anyway: bool = False,
+    replace: bool = True,
+    progress: Progress | None = None,
+) -> OdometrySolved:
+    """Calibrate sensors that know only their own motion, from a log and a rig file to a folder of files.
+
+    The folder gets ``clean.mcap``, ``result.json``, ``report.html``, and the frames for ROS and URDF.
+
+    Parameters
+    ----------
+    log_path
+        As for ``open_log``; or a folder with the odometries in files (TUM), which the rig file names.
+    rig : Rig or None
+        With ``reference:``, and all sensors with ``odometry:``. None: the rig file of a log that a stage wrote.
+    out
+        The folder; it is made if it does not exist.
+    anyway : bool
+        Whether to write the frames of poses that are not to be used too, with the reason in the head of each file.
+    replace : bool
+        As for ``calibrate_log``.
+    progress : callable, optional
+
+    Raises
+    ------
+    LogError, StampError, TransformError
+        The log lacks what the rig file names.
+    RwhecError
+        As ``calibrate_odometries`` does.
+    """
+    source = Path(log_path)
+    if rig is not None and source.is_dir() and not any(source.glob("*.mcap")):
+        return _calibrate_files(source, rig, out, anyway=anyway, replace=replace, progress=progress)
+    with open_log(source) as log:
+        files = [file.path for file in log.files]
+        is_raw = not is_from_stage(log)
+        if is_raw and rig is None:
+            raise LogError(f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
+        if is_raw:
+            for name in (DETECTED_LOG, CLEAN_LOG):
+                check_is_not_read(log, Path(out) / name)
+        is_cleaned = CLEANING_METADATA in log.metadata() and (
+            rig is None or not changes(read_embedded_rig(log), rig).cleaning
+        )
+        sources = tuple(file.name for file in files) if is_raw else read_metadata(log).detection.sources
+    with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
+        output.begin()
+        return _stages(files, rig, output.path, is_raw=is_raw, is_cleaned=is_cleaned, anyway=anyway, progress=progress)
+
+
+def _calibrate_files(
+    folder: Path, rig: Rig, out: str | Path, *, anyway: bool, replace: bool, progress: Progress | None
+) -> OdometrySolved:
+    """By way of a log of the files, which is removed at the end."""
+    rig = rig.model_copy(update={"folder": folder})
+    in_files = {name for name, _ in files_of(rig)}
+    others = [name for name in rig.odometries if name not in in_files]
+    if others:
+        raise LogError(
+            f"{folder} has no MCAP file, and {rig.source.place(('sensors', others[0], 'odometry'))} is of a log; write "
+            "odometry: {file: NAME} for a file of poses in this folder"
+        )
+    name = f"{folder.resolve().name}{RECORDED_LOG}"
+    with output_folder(out, name, replace=replace) as output:
+        recorded = output.path / name
+        output.begin()
+        try:
+            with LogWriter(recorded) as log:
+                write_files(log, None, rig)
+            return _stages(
+                [recorded], rig, output.path, is_raw=True, is_cleaned=False, anyway=anyway, progress=progress
+            )
+        finally:
+            recorded.unlink(missing_ok=True)
+
+
+def _stages(
+    files: list[Path],
+    rig: Rig | None,
+    out: Path,
+    *,
+    is_raw: bool,
+    is_cleaned: bool,
+    anyway: bool,
+    progress: Progress | None,
+) -> OdometrySolved:
+    if is_raw:
+        assert rig is not None
+        detect_log(list(files), rig, out / DETECTED_LOG, progress=progress)
+        files = [out / DETECTED_LOG]
+    if not is_cleaned:
+        clean_log(files[0], out / CLEAN_LOG, rig, images="leave_out", progress=progress)
+        files = [out / CLEAN_LOG]
+    solved = solve_odometries_into(files[0], rig, out, progress=progress)
+    export_odometries(out / CLEAN_LOG, out, anyway=anyway, progress=progress)
+    return solved
+
+
+def export_odometries(
+    solved_path: str | Path, out: str | Path, *, anyway: bool = False, progress: Progress | None = None
+) -> list[Path]:
+    """Write the frames for other programs from a solved log of odometries; none of poses that are not to be used."""
+    out = made_folder(out)
+    (progress or silent)("exporting")
+    solved = read_odometries(solved_path)
+    if solved.judgement.verdict is Verdict.DO_NOT_USE and not anyway:
+        for name in FILES:
+            (out / name).unlink(missing_ok=True)
+        return []
+    written = export_all(frames_of_odometries(solved), out)
+    list_written(out, solved.result.sources, written)
+    return written

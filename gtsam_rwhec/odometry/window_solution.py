@@ -1,4 +1,4 @@
-"""One set of windows: the certified joint answer, the noise, outlying windows, what is free, the exact likelihood."""
+"""The maximum of the exact likelihood: Gauss-Newton over all unknowns, the windows' motions eliminated."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import OutlierError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.found import JointCertificate
 from gtsam_rwhec.odometry.freedom import Freedom, freedom
-from gtsam_rwhec.odometry.given_rows import GivenRows
-from gtsam_rwhec.odometry.joint_form import joint_form
-from gtsam_rwhec.odometry.joint_solution import solved, star_starts
-from gtsam_rwhec.odometry.likelihood import (
+from gtsam_rwhec.odometry.joint_cost import joint_form, solved, star_starts
+from gtsam_rwhec.odometry.odometry_record import JointCertificate
+from gtsam_rwhec.odometry.prior_knowledge import GivenRows, Rows
+from gtsam_rwhec.odometry.residual_noise import found_variances, outlying, uncertain_by
+from gtsam_rwhec.odometry.window_likelihood import (
+    Eliminated,
+    Layout,
+    Linear,
+    State,
     covariance_of_motions,
     covariances,
     eliminated,
@@ -23,11 +27,88 @@ from gtsam_rwhec.odometry.likelihood import (
     linearised,
     weights,
 )
-from gtsam_rwhec.odometry.noise_by_residuals import found_variances, uncertain_by
-from gtsam_rwhec.odometry.outlying import outlying
-from gtsam_rwhec.odometry.refining import Fit, motions_fitted, refined, settled
-from gtsam_rwhec.odometry.unknowns import Layout, State
 from gtsam_rwhec.odometry.window_motions import WindowMotions
+
+#: Steps at most. Well-excited drives take four.
+MAX_STEPS = 40
+#: Converged when a step would lower the cost by less than this.
+CONVERGED = 1e-9
+#: The largest turn or shift of one step, rad and m.
+LARGEST_STEP = 0.3
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The end of a refinement."""
+
+    state: State
+    linear: Linear
+    normal: Eliminated
+    rows: Rows  #: What was given
+    cost: float  #: Half the weighted squares of all residuals
+    converged: bool
+
+
+def motions_fitted(windows: WindowMotions, W: Array, state: State, layout: Layout, steps: int = 3) -> State:
+    """The same poses with each window's motion at its best."""
+    still = np.zeros(layout.size)
+    for _ in range(steps):
+        normal = eliminated(linearised(windows, state), W, layout)
+        state = state.moved(layout, still, normal.motions(still))
+    return state
+
+
+def refined(windows: WindowMotions, W: Array, state: State, layout: Layout, given: GivenRows, determined: Array) -> Fit:
+    """Go down from a state along the directions ``determined`` (p, q), orthonormal columns."""
+    state = motions_fitted(windows, W, state, layout, steps=2)
+    converged = False
+    for _ in range(MAX_STEPS):
+        linear, normal, rows, cost = _at(windows, W, state, layout, given)
+        H, g = normal.H + rows.information, normal.g - rows.J.T @ rows.r
+        inner, right = determined.T @ H @ determined, determined.T @ g
+        unit = 1.0 / np.sqrt(np.maximum(np.diagonal(inner), 1e-300))
+        solved = unit * np.linalg.lstsq(inner * unit[:, None] * unit, unit * right, rcond=1e-13)[0]
+        step = determined @ solved
+        expected = float(right @ solved) + float(
+            (normal.motions(step) * np.einsum("nab,nb->na", normal.D, normal.motions(step))).sum()
+        )
+        largest = float(np.abs(step).max(initial=0.0))
+        step *= min(1.0, LARGEST_STEP / max(largest, 1e-300))
+        state = state.moved(layout, step, normal.motions(step))
+        if expected < CONVERGED * max(1.0, cost):
+            converged = True
+            break
+    linear, normal, rows, cost = _at(windows, W, state, layout, given)
+    return Fit(state, linear, normal, rows, cost, converged)
+
+
+def _at(
+    windows: WindowMotions, W: Array, state: State, layout: Layout, given: GivenRows
+) -> tuple[Linear, Eliminated, Rows, float]:
+    linear = linearised(windows, state)
+    normal = eliminated(linear, W, layout)
+    rows = given.rows(state, layout)
+    return linear, normal, rows, normal.cost + 0.5 * float(rows.r @ rows.r)
+
+
+def settled(state: State, free: Array, layout: Layout) -> State:
+    """Free shifts taken out: along free directions of translations alone the sensors go where they are nearest."""
+    if not free.shape[1]:
+        return state
+    moved = np.array([layout.spread(direction) for direction in free.T])[:, :, :6]  # (f, m, 6)
+    shifts = np.einsum("mij,fmj->fmi", state.T[:, :3, :3], moved[:, :, 3:])
+    _, s, Vt = np.linalg.svd(moved[:, :, :3].reshape(len(moved), -1).T, full_matrices=True)
+    still = Vt[np.r_[s, np.zeros(len(moved) - len(s))] < 1e-2]  # combinations that turn nothing
+    if not len(still):
+        return state
+    columns = np.einsum("sf,fmi->smi", still, shifts).reshape(len(still), -1).T
+    t = state.T[:, :3, 3].ravel()
+    nearest = t - columns @ np.linalg.lstsq(columns, t, rcond=1e-9)[0]
+    T = state.T.copy()
+    T[:, :3, 3] = nearest.reshape(-1, 3)
+    T[0, :3, 3] = 0.0
+    return replace(state, T=T)
+
 
 #: Rounds of the certified form: its turns, ways and weights are those of the round before.
 ROUNDS = 8
@@ -43,20 +124,10 @@ FEWEST, LEAST_SHARE = 6, 0.3
 
 @dataclass(frozen=True)
 class Task:
-    """What does not change with the windows.
+    """What does not change with the windows."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Sensors; the poses are in the frame of the first.
-    scaled, stated : (m,) booleans
-        Whose scale is unknown, and whose noise was stated.
-    layout : Layout
-    given : GivenRows
-    reject : bool
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: Sensors; the poses are in the frame of the first
+    #: scaled, stated: (m,) booleans: Whose scale is unknown, and whose noise was stated
     scaled: np.ndarray
     stated: np.ndarray
     layout: Layout
@@ -66,31 +137,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Answer:
-    """What was found on one set of windows.
+    """What was found on one set of windows."""
 
-    Attributes
-    ----------
-    windows : WindowMotions
-        Those that are used.
-    left_out : (m, n') booleans
-        Outlying windows of the set that was given.
-    variances : (m, 2) array
-    fit : Fit
-    W : (m, n, 6, 6) array
-    freedom : Freedom
-    certificate : JointCertificate
-    certified : State
-        The certified answer, before the exact likelihood.
-    """
-
-    windows: WindowMotions
-    left_out: np.ndarray
-    variances: Array
+    windows: WindowMotions  #: Those that are used
+    left_out: np.ndarray  #: (m, n') booleans: outlying windows of the set that was given
+    variances: Array  #: (m, 2)
     fit: Fit
-    W: Array
+    W: Array  #: (m, n, 6, 6)
     freedom: Freedom
     certificate: JointCertificate
-    certified: State
+    certified: State  #: The certified answer, before the exact likelihood
 
 
 def solve_windows(

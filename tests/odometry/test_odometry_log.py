@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.failures import ExitStatus, exit_status
 from gtsam_rwhec.errors import FileFormatError, LogError
-from gtsam_rwhec.odometry.odometry_file import read_odometry_result, result_json
-from gtsam_rwhec.report.odometry_report import odometry_page, pose_table
+from gtsam_rwhec.odometry.odometry_report import odometry_page, pose_table
+from gtsam_rwhec.odometry.odometry_result import read_odometry_result, result_json
 from gtsam_rwhec.report.report_blocks import Number, Table, every
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive, frame_distance
 
@@ -118,10 +118,10 @@ def test_what_a_stage_writes_the_next_reads(
 ) -> None:
     _, folder, _ = six
     first = read_odometry_result(folder / "out" / "result.json")
-    solved = rw.runs.solve_odometries_into(folder / "out" / "clean.mcap", None, tmp_path)
+    solved = rw.odometry.solve_odometries_into(folder / "out" / "clean.mcap", None, tmp_path)
     assert solved.result == first
-    assert rw.runs.read_odometries(tmp_path / "clean.mcap").result == first
-    assert {path.name for path in rw.runs.export_odometries(tmp_path / "clean.mcap", tmp_path)} >= {"tf.yaml"}
+    assert rw.odometry.read_odometries(tmp_path / "clean.mcap").result == first
+    assert {path.name for path in rw.odometry.export_odometries(tmp_path / "clean.mcap", tmp_path)} >= {"tf.yaml"}
     with rw.logs.open_log(tmp_path / "clean.mcap") as log:
         pairs = rw.runs.read_pairs(log, solved.rig)
     assert {pair.sensor for pair in pairs} == set(MOUNTS)
@@ -141,7 +141,7 @@ def test_a_plane_leaves_heights_free_until_they_are_given(tmp_path: Path) -> Non
         f"  {name}: {{odometry: {{file: {name}.tum}}}}\n" for name in names
     )
     rig = rw.rig.parse_rig(text, "rig.yaml")
-    free = rw.runs.calibrate_odometry_log(tmp_path, rig, tmp_path / "free")
+    free = rw.odometry.calibrate_odometry_log(tmp_path, rig, tmp_path / "free")
     assert free.judgement.verdict is rw.Verdict.DO_NOT_USE
     assert exit_status(free.judgement, of_rig=True) is ExitStatus.NOT_UNIQUE
     assert free.result.not_determined == (FREE,)
@@ -151,7 +151,7 @@ def test_a_plane_leaves_heights_free_until_they_are_given(tmp_path: Path) -> Non
         assert [cell == "free" for cell in cells[:6]] == [False, False, True, False, False, False]
     assert {path.name for path in (tmp_path / "free").iterdir()} >= {"result.json", "report.html", "clean.mcap"}
     given = "given: {heights_m: {lidar_front: 0.6, lidar_rear: 0.9, lidar_roof: 1.9}}\n"
-    known = rw.runs.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text + given, "rig.yaml"), tmp_path / "known")
+    known = rw.odometry.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text + given, "rig.yaml"), tmp_path / "known")
     assert known.result.not_determined == ()
     assert known.judgement.verdict is not rw.Verdict.DO_NOT_USE, str(known.judgement)
     assert {one.what for one in known.result.given} >= {"height of lidar_rear"}
@@ -173,12 +173,12 @@ def test_files_that_are_not_there_and_rigs_of_another_road_are_refused(tmp_path:
     rig = rw.rig.parse_rig(text, "rig.yaml")
     (tmp_path / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n1.1 1 0 0 0 0 0 1\n1.2 2 0 0 0 0 0 1\n")
     with pytest.raises(LogError, match=r"rig.yaml, line 4: sensors.b.odometry: there is no file .*b\.tum"):
-        rw.runs.calibrate_odometry_log(tmp_path, rig, tmp_path / "out")
+        rw.odometry.calibrate_odometry_log(tmp_path, rig, tmp_path / "out")
     with pytest.raises(LogError, match=r"line 2: sensors: no sensor sees a target"):
         rw.calibrate_log(tmp_path, rig, tmp_path / "out")
     of_log = rw.rig.parse_rig(text.replace("file: b.tum", "topic: /b"), "rig.yaml")
     with pytest.raises(LogError, match=r"has no MCAP file, and rig.yaml, line 4: sensors.b.odometry is of a log"):
-        rw.runs.calibrate_odometry_log(tmp_path, of_log, tmp_path / "out")
+        rw.odometry.calibrate_odometry_log(tmp_path, of_log, tmp_path / "out")
 
 
 def test_a_first_rig_file_names_the_odometries_of_a_log(
@@ -203,7 +203,7 @@ def test_a_height_that_the_motions_contradict_is_named(tmp_path: Path) -> None:
         f"  {name}: {{odometry: {{file: {name}.tum}}}}\n" for name in names
     )
     text += "given: {heights_m: {lidar_rear: 2.9}, ground: {up: [0, 0, 1], below_m: 0.6}}\n"
-    solved = rw.runs.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text, "rig.yaml"), tmp_path / "out")
+    solved = rw.odometry.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text, "rig.yaml"), tmp_path / "out")
     assert solved.judgement.verdict is rw.Verdict.DO_NOT_USE
     assert exit_status(solved.judgement, of_rig=True) is ExitStatus.CONTRADICTED
     assert "what is given contradicts the motions (by so many standard deviations): " in str(solved.judgement)

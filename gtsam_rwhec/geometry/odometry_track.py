@@ -12,37 +12,17 @@ from gtsam_rwhec.geometry.poses import Array
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Errors that add up along the way: each step's error is independent of the others.
+    """Errors that add up along the way: each step's error is independent of the others."""
 
-    Attributes
-    ----------
-    rotation_rad_per_sqrt_s : float
-        Standard deviation of the rotation's error about each axis after one second, radians.
-    translation_m_per_sqrt_s : float
-        Standard deviation of the translation's error along each axis after one second, metres.
-    """
-
+    #: Standard deviation of the rotation's error about each axis after one second, radians
     rotation_rad_per_sqrt_s: float
+    #: Standard deviation of the translation's error along each axis after one second, metres
     translation_m_per_sqrt_s: float
 
 
 @dataclass(frozen=True)
 class OdometryTrack:
     """The motion that one sensor measured.
-
-    Attributes
-    ----------
-    sensor : str
-        The sensor's name.
-    stamps_ns : (N,) integers
-        Times of the poses, ascending, nanoseconds.
-    T_start_sensor : (N, 4, 4) array
-        The sensor's poses in the frame in which its odometry began, metres (times its unknown scale, where
-        ``has_unknown_scale``).
-    noise : OdometryNoise or None
-        None: it is estimated.
-    has_unknown_scale : bool
-        Visual odometry of one camera: lengths are true up to one factor.
 
     Raises
     ------
@@ -52,11 +32,13 @@ class OdometryTrack:
         The stamps do not ascend.
     """
 
-    sensor: str
-    stamps_ns: np.ndarray
+    sensor: str  #: The sensor's name
+    stamps_ns: np.ndarray  #: (N,): times of the poses, ascending, nanoseconds
+    #: (N, 4, 4): the sensor's poses in the frame in which its odometry began, metres (times its unknown scale, where
+    #: ``has_unknown_scale``)
     T_start_sensor: Array
-    noise: OdometryNoise | None = None
-    has_unknown_scale: bool = field(default=False)
+    noise: OdometryNoise | None = None  #: None: it is estimated
+    has_unknown_scale: bool = field(default=False)  #: Visual odometry of one camera: lengths are true up to one factor
 
     def __post_init__(self) -> None:
         stamps, poses = np.asarray(self.stamps_ns), np.asarray(self.T_start_sensor)

@@ -1,0 +1,395 @@
+"""The record of a calibration from its answer: the frame that was asked for, covariance, dependence, findings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry.freedom import REACHES, seven_each
+from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
+from gtsam_rwhec.odometry.prior_knowledge import upside_down
+from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
+from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE
+from gtsam_rwhec.odometry.window_motions import axes_turned
+from gtsam_rwhec.odometry.window_solution import Answer, Task, refined
+from gtsam_rwhec.results.removed_measurements import Removed
+from gtsam_rwhec.solver.certificate import Status
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_directions_of, reason_for, sparse_basis
+
+
+def calibration_of(
+    answer: Answer,
+    task: Task,
+    tracks: Sequence[OdometryTrack],
+    reference: str,
+    offsets: Array,
+    clocks: Sequence[Clock],
+    removed: dict[str, tuple[Removed, ...]],
+    origin_ns: int,
+) -> OdometryCalibration:
+    """All that a person is told."""
+    names, layout, state = task.names, task.layout, answer.fit.state
+    sensors = (reference, *(name for name in names if name != reference))
+    change, T, order = _in_frame_of(reference, task, state.T)
+    scaled = [name for k, name in enumerate(names) if task.scaled[k]]
+    C = answer.freedom.covariance()
+    covariance = change @ C @ change.T
+    left = change @ answer.freedom.left
+    if left.shape[1]:
+        reached = (np.abs(left) > REACHES * np.abs(left).max(axis=0)).any(axis=1)
+        covariance[reached], covariance[:, reached] = 0.0, 0.0
+        covariance[reached, reached] = np.inf
+    free = _free_directions(answer, task)
+    certificate = answer.certificate
+    others = other_answers(
+        answer, task, lambda pose: dict(zip(order, _in_frame_of(reference, task, pose)[1], strict=True))
+    )
+    if free and certificate.status is Status.CERTIFIED:
+        certificate = replace(certificate, status=Status.CERTIFIED_NOT_UNIQUE)
+    back = float(offsets[names.index(reference)])
+    clock_at = [int(layout.at[k, OFFSET]) for k in range(len(names))]
+    sigmas = _clock_sigmas(C, clock_at, names, reference) if layout.open[:, OFFSET].any() else {}
+    window = answer.windows
+    return OdometryCalibration(
+        reference=reference,
+        sensors=sensors,
+        T_reference_sensor={reference: np.eye(4), **dict(zip(order, T, strict=True))},
+        scales={name: float(state.scale[names.index(name)]) for name in scaled},
+        time_offsets_s={name: float(offsets[names.index(name)]) - back for name in order},
+        time_offset_sigmas_s=sigmas,
+        order=order,
+        covariance=covariance,
+        certificate=certificate,
+        free_directions=free,
+        windows=Windows(
+            seconds=float(np.median(window.end - window.start)),
+            count=len(window),
+            used={name: int(window.used[k].sum()) for k, name in enumerate(names)},
+            start_ns=origin_ns + np.round(window.start * 1e9).astype(np.int64),
+            end_ns=origin_ns + np.round(window.end * 1e9).astype(np.int64),
+        ),
+        noise={name: OdometryNoise(*(float(x) for x in np.sqrt(answer.variances[k]))) for k, name in enumerate(names)},
+        noise_was_found=frozenset(name for k, name in enumerate(names) if not task.stated[k]),
+        removed=removed,
+        residuals=_residual_sizes(answer, names),
+        influences=_influences(answer, task, change, order),
+        others=others,
+        findings=(
+            *(Finding(Ground.CONTRADICTED, words) for words in inverted_in_words(tracks)),
+            *(Finding(Ground.CONTRADICTED, words) for words in _contradictions(answer, task)),
+            *(Finding(Ground.COVARIANCE_DOUBTED, words) for words in _doubts(answer, task, tracks, clocks, sigmas)),
+        ),
+        remarks=_remarks(task),
+    )
+
+
+def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tuple[str, ...]]:
+    """The matrix (d, p) from the unknowns to the record's tangents and scales, the poses (m - 1, 4, 4), their names.
+
+    With T_r the reference's pose in the frame of sensor 0, a pose is T_r^-1 T_k, and its tangent x_k - Ad(pose^-1) x_r.
+    """
+    names, layout = task.names, task.layout
+    r = names.index(reference)
+    order = tuple(name for name in names if name != reference)
+    at = [names.index(name) for name in order]
+    poses = se3.inverse(T[r][None]) @ T[at]
+    scales = [k for k in range(len(names)) if task.scaled[k]]
+    change = np.zeros((6 * len(at) + len(scales), layout.size + 1))
+    back = se3.adjoint(se3.inverse(poses))
+    for row, k in enumerate(at):
+        rows = slice(6 * row, 6 * row + 6)
+        if k:
+            change[rows, layout.at[k, :6]] += np.eye(6)
+        if r:
+            change[rows, layout.at[r, :6]] -= back[row]
+    for row, k in enumerate(scales):
+        change[6 * len(at) + row, layout.at[k, SCALE]] = 1.0
+    return change[:, :-1], poses, order
+
+
+def _clock_sigmas(C: Array, at: list[int], names: tuple[str, ...], reference: str) -> dict[str, float]:
+    """Standard deviations of the offsets to the reference's clock."""
+    padded = np.pad(C, ((0, 1), (0, 1)))
+    r = at[names.index(reference)]
+    return {
+        name: float(np.sqrt(max(padded[k, k] + padded[r, r] - 2.0 * padded[k, r], 0.0)))
+        for name, k in zip(names, at, strict=True)
+        if name != reference
+    }
+
+
+def _free_directions(answer: Answer, task: Task) -> tuple[FreeDirection, ...]:
+    left = answer.freedom.left
+    if not left.shape[1]:
+        return ()
+    names = task.names[1:]
+    windows, fit = answer.windows, answer.fit
+    length = 1.0
+    variance = 1.0 / float((1.0 / answer.variances[:, 0]).sum())
+    turned, squares, _ = axes_turned(windows, fit.state.motion, variance)
+    residual = float(np.sqrt((fit.linear.r[..., :3] ** 2).sum(axis=2)[windows.used].mean()))
+    reason = reason_for(min(turned, 2), float(np.sqrt(squares.sum())), residual, len(windows))
+    if reason is FreeReason.CONTRADICTION:
+        reason = FreeReason.NOISE
+    basis = sparse_basis(seven_each(left, task.layout), length)
+    return free_directions_of(names, basis, length, dict.fromkeys(names, reason))
+
+
+def _influences(answer: Answer, task: Task, change: Array, order: tuple[str, ...]) -> tuple[Influence, ...]:
+    """dx / dg = (information)^-1 row' / sigma for each whitened row of what is given."""
+    rows = answer.fit.rows
+    Z = answer.freedom.complement()
+    inner = Z.T @ answer.freedom.information @ Z
+    solve = Z @ np.linalg.solve(inner + 1e-13 * np.diag(np.diagonal(inner)), Z.T)
+    result = []
+    C = answer.freedom.covariance()
+    for r, row, number in zip(rows.r, rows.J, rows.numbers, strict=True):
+        if not number.what:
+            continue
+        moved = (change @ solve @ row / number.sigma)[: 6 * len(order)].reshape(-1, 6)
+        spare = 1.0 - float(row @ C @ row)
+        result.append(
+            Influence(
+                number.what,
+                number.value,
+                number.sigma,
+                number.unit,
+                {name: _twist(twist) for name, twist in zip(order, moved, strict=True)},
+                {name: _twist(twist * number.sigma) for name, twist in zip(order, moved, strict=True)},
+                off_by=abs(float(r)) / np.sqrt(spare) if spare > 1e-3 else 0.0,
+            )
+        )
+    return tuple(result)
+
+
+def _twist(x: Array) -> tuple[float, float, float, float, float, float]:
+    a, b, c, d, e, f = (float(v) for v in x)
+    return a, b, c, d, e, f
+
+
+#: Correlation of neighbouring windows' residuals above which errors are not independent from step to step.
+CORRELATED = 0.3
+#: Correlation above which, with residuals of this part of the motions, a track is not of this vehicle, or is read in a
+#: wrong way. A bias or a wrong scale has smaller residuals.
+SAME, SAME_PART = 0.9, 0.2
+#: Stated noise is doubted when residuals are so many times as large, or as small.
+DOUBTED = 1.5
+#: A clock that the refinement knows to this, s, needs no first guess.
+CLOCK_KNOWN_S = 0.01
+#: The refined answer is that of the proof if it is within so many standard deviations of it.
+FAR = 10.0
+#: A pose whose standard deviation along or about an axis is larger than this is said to be loose.
+LOOSE_M, LOOSE_RAD = 0.2, float(np.radians(2.0))
+#: More of a track than this left out is said.
+MANY = 0.1
+
+
+def _residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Root mean square of each sensor's residuals in their standard deviations, rotation and translation.
+
+    A residual r against the fused motion of all sensors is smaller than the sensor's noise: the mean square of each
+    entry is compared with the expected one.
+    """
+    windows, r, B = answer.windows, answer.fit.linear.r, answer.fit.linear.B
+    V = np.linalg.inv(answer.W + ~windows.used[:, :, None, None] * np.eye(6))
+    fused = np.linalg.inv(answer.fit.normal.D)
+    expected = np.einsum("mnii->mni", V - B @ fused @ np.swapaxes(B, 2, 3))
+    sizes = {}
+    for k, name in enumerate(names):
+        used = windows.used[k]
+        square, mean = (r[k, used] ** 2).sum(axis=0), np.maximum(expected[k, used], 0.0).sum(axis=0)
+        sizes[name] = tuple(
+            float(np.sqrt(square[part].sum() / max(mean[part].sum(), 1e-300))) for part in (slice(0, 3), slice(3, 6))
+        )
+    return sizes  # type: ignore[return-value]
+
+
+def _doubts(
+    answer: Answer, task: Task, tracks: Sequence[OdometryTrack], clocks: Sequence[Clock], sigmas: dict[str, float]
+) -> tuple[str, ...]:
+    """The sentences; none where all is well. ``sigmas``: standard deviations of the clocks, s."""
+    said: list[str] = []
+    sizes = _residual_sizes(answer, task.names)
+    for k, name in enumerate(task.names):
+        if task.stated[k] and not 1.0 / DOUBTED < max(sizes[name]) < DOUBTED:
+            said.append(
+                f"the residuals of {name} are {max(sizes[name]):.2g} times what its stated noise makes; state its true "
+                "noise, or leave it out: it is estimated then"
+            )
+        share = max(_correlations(answer, k))
+        if share > CORRELATED and not _misfit(answer, k):
+            factor = np.sqrt((1.0 + share) / (1.0 - share))
+            said.append(
+                f"the errors of {name} are alike from window to window (correlation {share:.2f}): they are no random "
+                f"walk but drift (a wrong scale or a bias), and standard deviations may be {factor:.1f} times too small"
+            )
+        lost = int(answer.left_out[k].sum())
+        if lost > MANY * answer.left_out.shape[1]:
+            said.append(f"{name} contradicts the other sensors in {lost} of {answer.left_out.shape[1]} windows")
+    said += [
+        f"the clock of {track.sensor} was not found from its turning, and its offset was searched near "
+        f"zero: {clock.unknown}"
+        for track, clock in zip(tracks, clocks, strict=True)
+        if clock.unknown and sigmas.get(track.sensor, 0.0) > CLOCK_KNOWN_S
+    ]
+    C = answer.freedom.covariance()
+    for k, name in enumerate(task.names[1:], 1):
+        sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
+        if not task.given.given.distances_m and (apart := _apart(answer, task, k, sigma)):
+            said.append(f"the exact likelihood moved {name} by {apart}: the proof is of another answer")
+        if sigma[3:].max() > LOOSE_M or sigma[:3].max() > LOOSE_RAD:
+            said.append(
+                f"{name} is known only to {sigma[3:].max():.2g} m and {np.degrees(sigma[:3].max()):.2g} degrees (one "
+                "standard deviation): drive longer, with more turns about the axes that it lacks, or give what is known"
+            )
+    if not answer.fit.converged:
+        said.append("the refinement stopped before it converged; the poses may be off by more than they say")
+    return tuple(said)
+
+
+def _contradictions(answer: Answer, task: Task) -> tuple[str, ...]:
+    """Tracks that do not fit at all, and what distances move: the certified answer is without them."""
+    said = [
+        f"the motions of {name} do not fit the other sensors': what differs is the same from window to window, and "
+        f"{100 * part:.0f} % of the motion itself"
+        for k, name in enumerate(task.names)
+        if (part := _misfit(answer, k))
+    ]
+    if task.given.has_ground and task.given.given.ground is None:
+        other_way = upside_down(task.given.normal, answer.fit.state.T)
+        if other_way.sum() >= 0.0 and (other_way > 0.0).any():
+            named = ", ".join(name for name, down in zip(task.names, other_way, strict=True) if down > 0.0)
+            said.append(
+                f"heights count upwards as {task.names[0]} stands, and beside it {named} would hang upside down. If it "
+                f"is {task.names[0]} that hangs, all heights have the wrong sign: give the ground, with its up in the "
+                f"axes of {task.names[0]}"
+            )
+    if not task.given.given.distances_m:
+        return tuple(said)
+    C = answer.freedom.covariance()
+    for k, name in enumerate(task.names[1:], 1):
+        sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
+        if apart := _apart(answer, task, k, sigma):
+            said.append(f"the given distances contradict the motions: they moved {name} by {apart}")
+    return tuple(said)
+
+
+def _apart(answer: Answer, task: Task, k: int, sigma: Array) -> str:
+    """How far a pose moved, if by more than ``FAR`` deviations along axes that no free direction reaches, or ""."""
+    at = task.layout.at[k, :6]
+    moved = np.abs(se3.logmap(se3.inverse(answer.certified.T[k][None]) @ answer.fit.state.T[k])[0])
+    loose = answer.freedom.by_data[at]
+    bound = (np.abs(loose) < 0.02).all(axis=1) if loose.size else np.ones(6, dtype=bool)
+    if not (moved > FAR * np.maximum(sigma, 1e-9))[bound].any():
+        return ""
+    return (
+        f"{1e3 * np.linalg.norm(moved[3:]):.3g} mm and {np.degrees(np.linalg.norm(moved[:3])):.2g} degrees from the "
+        f"certified answer, more than {FAR:g} of its standard deviations"
+    )
+
+
+def _remarks(task: Task) -> tuple[str, ...]:
+    """What was assumed."""
+    said: list[str] = []
+    if len(task.names) == 2 and not task.stated.any():
+        said.append(
+            "the noise of two tracks cannot be told apart: both count as equally noisy. State the noise of one, or add "
+            "a third sensor"
+        )
+    ground = task.given.given.ground
+    if task.given.has_ground and ground is None:
+        n = task.given.normal
+        said.append(
+            "heights count along the axis that the vehicle turned about, with up along "
+            f"({', '.join(f'{x:.2f}' for x in n)}) of {task.names[0]}; give the ground if up is another way"
+        )
+    if ground is not None and task.given.normal[2] < -0.5:
+        said.append(
+            f"the given ground has its up along -z of {task.names[0]}: that sensor hangs upside down. If it does not, "
+            "turn the sign of up, since all heights have the wrong sign"
+        )
+    return tuple(said)
+
+
+def _misfit(answer: Answer, k: int) -> float:
+    """The part of a sensor's motion that its residuals are, where they are large and alike, or zero."""
+    windows, r = answer.windows, answer.fit.linear.r[k]
+    motion = se3.logmap(windows.M[k])
+    used, found = windows.used[k], 0.0
+    for part, share in zip((slice(0, 3), slice(3, 6)), _correlations(answer, k), strict=True):
+        of_motion = np.sqrt((r[used, part] ** 2).sum() / max(float((motion[used, part] ** 2).sum()), 1e-300))
+        if share > SAME and of_motion > SAME_PART:
+            found = max(found, float(of_motion))
+    return found
+
+
+def _correlations(answer: Answer, k: int) -> tuple[float, float]:
+    """The correlation of a sensor's residuals with those of the window before, of rotations and of translations."""
+    windows, r = answer.windows, answer.fit.linear.r[k]
+    follows = windows.used[k, 1:] & windows.used[k, :-1] & (np.abs(windows.start[1:] - windows.end[:-1]) < 1e-6)
+    if follows.sum() < 20:
+        return 0.0, 0.0
+    before, after = r[:-1][follows], r[1:][follows]
+    product, squares = (before * after), np.stack([before**2, after**2])
+    shares = (
+        float(product[:, part].sum() / max(np.sqrt(squares[:, :, part].sum(axis=(1, 2)).prod()), 1e-300))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return next(shares), next(shares)
+
+
+#: An answer that costs at most so much more than the best fits alike: two standard deviations.
+ALIKE = 2.0
+#: Two answers are one if no sensor is further apart than this, metres.
+SAME_M = 1e-3
+
+
+def other_answers(answer: Answer, task: Task, named: Callable[[Array], dict[str, Array]]) -> tuple[OtherAnswer, ...]:
+    """Start from the mirror image of each distance's free shift; keep what fits alike.
+
+    A distance is even in the shift that the drive leaves free: the sensor may be above or below.
+    """
+    given, free = task.given.given, answer.freedom
+    if not given.distances_m or not free.by_data.shape[1]:
+        return ()
+    found: list[OtherAnswer] = []
+    state = answer.fit.state
+    determined = free.complement()
+    for (first, second), _ in given.distances_m.items():
+        j, k = task.given.place[first], task.given.place[second]
+        for moving, fixed in ((k, j), (j, k)):
+            if moving == 0:
+                continue
+            axis = _free_shift(answer, task, moving)
+            if axis is None:
+                continue
+            T = state.T.copy()
+            apart = T[moving, :3, 3] - T[fixed, :3, 3]
+            T[moving, :3, 3] -= 2.0 * axis * float(axis @ apart)
+            fit = refined(answer.windows, answer.W, replace(state, T=T), task.layout, task.given, determined)
+            moved = float(np.linalg.norm(fit.state.T[:, :3, 3] - state.T[:, :3, 3], axis=1).max())
+            above = fit.cost - answer.fit.cost
+            if fit.converged and moved > SAME_M and above < ALIKE:
+                why = (
+                    f"the distance of {first} and {second} has two signs: {task.names[moving]} may be "
+                    f"{moved:.3g} m away, on the other side"
+                )
+                found.append(OtherAnswer(why, named(fit.state.T), above))
+                break
+    return tuple(found)
+
+
+def _free_shift(answer: Answer, task: Task, k: int) -> Array | None:
+    """The unit direction (3,), in the frame of sensor 0, along which the drive leaves sensor k free to shift."""
+    rows = answer.freedom.by_data[task.layout.at[k, 3:6]]
+    U, s, _ = np.linalg.svd(answer.fit.state.T[k, :3, :3] @ rows)
+    if not len(s) or s[0] < 0.05:
+        return None
+    axis: Array = U[:, 0]
+    return axis

@@ -1,0 +1,277 @@
+"""What a calibration of odometries found: poses, proof, windows, dependence, other answers, and the verdict on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement
+from gtsam_rwhec.geometry.odometry_track import OdometryNoise
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.removed_measurements import Removed
+from gtsam_rwhec.solver.certificate import Status
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
+
+#: What is given is contradicted by the data from so many standard deviations on.
+CONTRADICTED = 4.0
+#: So many of them are named.
+NAMED = 4
+#: A sensor takes part in a free direction from this part of the direction's largest shift or turn on.
+TAKES_PART = 0.05
+#: An axis of the reference is named where the direction is within 8 degrees of it.
+NEAR_AXIS = float(np.cos(np.radians(8.0)))
+#: What to do: where something is free, where a track is wrong as a whole, where what was given is contradicted.
+ADVICE = {
+    Ground.NOT_UNIQUE: "state the missing heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that "
+    "of the reference), or the ground, directions or distances; or drive other turns and a ramp, and calibrate again",
+    Ground.CONTRADICTED: "check the named tracks (poses T_start_sensor, quaternions x y z w, lengths in metres or "
+    "scale: estimate, one vehicle and one drive) and what is given, and calibrate again",
+    Ground.POSE_DOUBTED: "measure again what is given, in metres and in the axes of the reference, and correct the rig "
+    "file",
+}
+PRAISE = "the motions of all sensors agree, their joint cost is certified, and they determine every pose"
+PRAISE_WITH_GIVEN = (
+    "the motions of all sensors agree, their joint cost is certified, and with what was given they determine every "
+    "pose. The motions do not check all that was given: an error in it is an error of the poses"
+)
+
+
+@dataclass(frozen=True)
+class JointCertificate:
+    """The proof for the joint quadratic cost of all sensors (design fact 24).
+
+    The cost is half the squared residuals of the windows' rotation vectors and translations in all sensors at once,
+    with the vehicle's own motion eliminated. The turn of each window inside the lever arms' term, and the length of the
+    way that scales are compared with, are the fused ones. So the proof is of this cost; the exact likelihood is refined
+    from there.
+    """
+
+    status: Status
+    cost: float  #: The cost at the answer
+    lower_bound: float  #: No answer (of the region) costs less
+    #: A lower bound on the certificate matrix's smallest eigenvalue, after its diagonal was scaled to one
+    min_eigenvalue: float
+    tolerance: float  #: The gap up to which the answer counts as optimal
+    #: The bound is about all answers whose sensors are at most this far from the reference along each axis
+    region_m: float
+    #: A mirror image with a negative scale costs less, as a vehicle that turns about one axis may make it by chance
+    #: (design fact 5). Then cost and bound are of the form with a term that holds each unknown scale near its value
+    scales_held: bool = False
+
+    @property
+    def gap(self) -> float:
+        """Cost minus lower bound, at least 0."""
+        return max(0.0, self.cost - self.lower_bound)
+
+    @property
+    def is_optimal(self) -> bool:
+        """Whether the cost is proven optimal; other answers may cost the same."""
+        return self.status in (Status.CERTIFIED, Status.CERTIFIED_NOT_UNIQUE)
+
+    def __str__(self) -> str:
+        within = f" within {self.region_m:g} m" if np.isfinite(self.region_m) else ""
+        held = ", with scales held near the answer's (a mirror image fits as well)" if self.scales_held else ""
+        return f"{self.status}: joint cost {self.cost:.6g}, no answer{within} below {self.lower_bound:.6g}{held}"
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The windows of time over which motions were compared."""
+
+    seconds: float  #: Length of a window
+    count: int  #: How many there are
+    used: dict[str, int]  #: by sensor: in how many of them each sensor is used
+    #: start_ns, end_ns: (N,): their ends, on the reference's clock
+    start_ns: np.ndarray
+    end_ns: np.ndarray
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How the answer depends on one given number."""
+
+    what: str  #: The number: "height of lidar" and the like
+    #: value, sigma: as it was given; in its unit
+    value: float
+    sigma: float
+    unit: str
+    #: by sensor: derivative of each pose's tangent [omega, v] by the number
+    per_unit: dict[str, Twist] = field(hash=False)
+    #: by sensor: how far the pose moves if the number is off by one sigma: rad and m
+    per_sigma: dict[str, Twist] = field(hash=False)
+    #: How far the answer is from the number, in the sigmas of their difference; above ``CONTRADICTED`` the data
+    #: contradict it. Zero where the motions do not measure it
+    off_by: float = 0.0
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the motions contradict the number."""
+        return self.off_by > CONTRADICTED
+
+
+@dataclass(frozen=True)
+class OtherAnswer:
+    """Another answer that fits as well."""
+
+    why: str  #: What leaves it open: "the distance of a and b has two signs"
+    T_reference_sensor: dict[str, Array] = field(hash=False)  #: by sensor
+    cost_above: float = 0.0  #: Its cost (half a chi-square) above the answer's
+
+
+@dataclass(frozen=True)
+class OdometryCalibration:
+    """Poses of sensors that know only their own motion, and what is known of them. ``str()`` has the verdict first."""
+
+    reference: str  #: The sensor in whose frame the poses are
+    sensors: tuple[str, ...]  #: All sensors, the reference first
+    #: by sensor: the identity for the reference. Along a free direction a pose is as the search left it
+    T_reference_sensor: dict[str, Array] = field(hash=False)
+    #: by sensor: measured over true length, of the sensors of unknown scale
+    scales: dict[str, float] = field(hash=False)
+    time_offsets_s: dict[str, float] = field(hash=False)  #: by sensor: a sensor's stamp t is the reference's t + offset
+    #: by sensor: their standard deviations; empty where the clocks were not compared
+    time_offset_sigmas_s: dict[str, float] = field(hash=False)
+    order: tuple[str, ...]  #: The sensors in the order of ``covariance``: all but the reference
+    #: (d, d): joint covariance: [omega, v] of each sensor in ``order`` (right perturbation, rad and m), then the
+    #: logarithms of ``scales`` in their order. Infinite on the diagonal (and zero elsewhere in the row) where a free
+    #: direction reaches
+    covariance: Array = field(hash=False)
+    certificate: JointCertificate
+    #: How the answer can move while the measurements (and what was given) fit as well
+    free_directions: tuple[FreeDirection, ...]
+    windows: Windows = field(hash=False)
+    noise: dict[str, OdometryNoise] = field(hash=False)  #: by sensor: as it was stated or found
+    noise_was_found: frozenset[str]  #: The sensors whose noise was estimated
+    #: by sensor: poses and windows that were not used, and why
+    removed: dict[str, tuple[Removed, ...]] = field(hash=False)
+    #: by sensor: root mean square of the windows' residuals, in their standard deviations: 1 is expected
+    residuals: dict[str, tuple[float, float]] = field(hash=False)
+    influences: tuple[Influence, ...] = ()  #: How the answer depends on what was given
+    others: tuple[OtherAnswer, ...] = ()  #: Other answers that fit alike
+    #: CONTRADICTED: tracks look wrong as a whole, or contradict a given distance; COVARIANCE_DOUBTED: what is doubtful
+    findings: tuple[Finding, ...] = ()
+    remarks: tuple[str, ...] = ()  #: What was assumed, in sentences
+
+    @property
+    def status(self) -> Status:
+        """The certificate's status."""
+        return self.certificate.status
+
+    @property
+    def is_unique(self) -> bool:
+        """Whether measurements and what was given determine every pose."""
+        return not self.free_directions and not self.others
+
+    def covariance_of(self, sensor: str) -> Array:
+        """The covariance (6, 6) of a sensor's pose, [omega, v], rad and m; zero for the reference."""
+        if sensor == self.reference:
+            return np.zeros((6, 6))
+        first = 6 * self.order.index(sensor)
+        block: Array = self.covariance[first : first + 6, first : first + 6]
+        return block
+
+    def T(self, first: str, second: str) -> Array:
+        """The pose (4, 4) of sensor ``second`` in the frame of sensor ``first``: loops close exactly."""
+        inverse = np.linalg.inv(self.T_reference_sensor[first])
+        pose: Array = inverse @ self.T_reference_sensor[second]
+        return pose
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """The verdict with its grounds: never "use" where something is free, or where another answer fits as well."""
+        findings = []
+        if not self.certificate.is_optimal:
+            words = f"the joint cost is not proven optimal ({self.certificate})"
+            findings.append(Finding(Ground.NOT_CERTIFIED, words))
+        findings += [Finding(Ground.NOT_UNIQUE, words) for words in free_in_words(self)]
+        findings += [Finding(Ground.NOT_UNIQUE, f"another answer fits as well: {other.why}") for other in self.others]
+        findings += [*_contradicted(self), *self.findings]
+        is_unchecked = any(one.off_by == 0.0 for one in self.influences)
+        return Judgement.of(findings, PRAISE_WITH_GIVEN if is_unchecked else PRAISE, ADVICE)
+
+    def __str__(self) -> str:
+        return "\n".join([str(self.judgement), *(f"- {remark}" for remark in self.remarks)])
+
+
+def _contradicted(found: OdometryCalibration) -> list[Finding]:
+    """The given numbers that are farthest from the motions, if they contradict them; one that is wrong pulls others."""
+    wrong = sorted((one for one in found.influences if one.is_contradicted), key=lambda one: -one.off_by)
+    if not wrong:
+        return []
+    named = ", ".join(f"{one.what} = {one.value:g} {one.unit} ({one.off_by:.1f})" for one in wrong[:NAMED])
+    words = f"what is given contradicts the motions (by so many standard deviations): {named}"
+    if len(wrong) > NAMED:
+        words += f" and {len(wrong) - NAMED} more"
+    return [Finding(Ground.POSE_DOUBTED, words)]
+
+
+def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:
+    """What is not determined of which sensors, and why: a sentence for the heights, and for each other direction."""
+    said: list[str] = []
+    heights: dict[str, list[str]] = {}
+    for direction in found.free_directions:
+        if not direction.frames and not direction.own_scales:
+            said.append(str(direction))
+            continue
+        said += _of_frames(direction, found, heights)
+        said += [f"the scale of {name} is not determined: {_why(direction)}" for name in direction.own_scales]
+    of_heights = [_of_heights(axis, list(dict.fromkeys(names)), found.reference) for axis, names in heights.items()]
+    return tuple(dict.fromkeys((*of_heights, *said)))
+
+
+def _of_frames(direction: FreeDirection, found: OdometryCalibration, heights: dict[str, list[str]]) -> list[str]:
+    """The sentences of a direction; heights, which a plane leaves free, go by their axis into `heights`."""
+    turns, shifts = (
+        {
+            name: _in_reference(found.T_reference_sensor, name, np.array(twist)[part])
+            for name, twist in direction.frames.items()
+        }
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    said = []
+    largest_turn = max((float(np.linalg.norm(v)) for v in turns.values()), default=0.0)
+    largest_shift = max((float(np.linalg.norm(v)) for v in shifts.values()), default=0.0)
+    for name in direction.frames:
+        if largest_turn > TAKES_PART and np.linalg.norm(turns[name]) > TAKES_PART * largest_turn:
+            said.append(
+                f"the turn of {name} about {_axis(turns[name])} of {found.reference} is not determined: "
+                f"{_why(direction)}"
+            )
+        elif largest_turn <= TAKES_PART and np.linalg.norm(shifts[name]) > TAKES_PART * largest_shift:
+            axis = _axis(shifts[name])
+            # A vehicle in a plane turns about one axis, along which nothing tells where a sensor is: its height.
+            if direction.reason is FreeReason.ONE_AXIS:
+                heights.setdefault(axis, []).append(name)
+            else:
+                place = f"the place of {name} along {axis} of {found.reference}"
+                said.append(f"{place} is not determined: {_why(direction)}")
+    return said
+
+
+def _of_heights(axis: str, names: list[str], reference: str) -> str:
+    many = len(names) > 1
+    listed = f"{', '.join(names[:-1])} and {names[-1]}" if many else names[0]
+    heights = f"the height{'s' * many} of {listed} over {reference} (along {axis} of {reference})"
+    return f"{heights} {'are' if many else 'is'} not determined: the vehicle moved in a plane"
+
+
+def _why(direction: FreeDirection) -> str:
+    return "unknown why" if direction.reason is None else direction.reason.words
+
+
+def _in_reference(T_reference_sensor: Mapping[str, Array], name: str, v: Array) -> Array:
+    turned: Array = T_reference_sensor[name][:3, :3] @ v
+    return turned
+
+
+def _axis(v: Array) -> str:
+    """``the z axis``, or a direction in numbers."""
+    unit = v / np.linalg.norm(v)
+    i = int(np.argmax(np.abs(unit)))
+    if abs(unit[i]) > NEAR_AXIS:
+        return f"the {'xyz'[i]} axis"
+    unit = unit * np.sign(unit[i])
+    return f"({', '.join(f'{x:.2f}' for x in unit)})"

@@ -1,0 +1,380 @@
+"""What a person knows of sensors that know only their own motion: heights, the ground, directions, distances."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import FrameError, NoiseError, OptionError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry.window_likelihood import Layout, State
+from gtsam_rwhec.odometry.window_motions import WindowMotions
+
+Vector = tuple[float, float, float]
+#: What has a known direction: an axis of the sensor, or the line from the reference sensor to it.
+DirectionOf = Literal["x", "y", "z", "lever_arm"]
+
+#: No two sensors of a vehicle are further apart, metres; nor further above the ground.
+MOST_M = 150.0
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane that the vehicle drives on, in the reference sensor's frame."""
+
+    normal: Vector  #: (x, y, z): it points up, away from the ground; of any length
+    distance_m: float  #: Height of the reference sensor's origin above the plane, metres
+    sigma_rad: float  #: Standard deviation of the normal about each axis across it, radians
+    sigma_m: float  #: Standard deviation of the distance, metres
+
+
+@dataclass(frozen=True)
+class KnownDirection:
+    """A direction in the reference sensor's frame."""
+
+    sensor: str  #: The sensor that it is about
+    of: DirectionOf  #: An axis of the sensor, or the line from the reference sensor's origin to the sensor's
+    direction: Vector  #: (x, y, z): in the reference sensor's frame; of any length
+    sigma_rad: float  #: Standard deviation about each axis across it, radians
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a person knows; nothing by default."""
+
+    #: by sensor: heights of the sensors' origins above the ground, metres. The reference sensor needs one too, or the
+    #: ground
+    heights_m: dict[str, tuple[float, float]] = field(default_factory=dict, hash=False)
+    #: The plane that the vehicle drives on. Without it heights are along the axis that the vehicle turned about
+    ground: Ground | None = None
+    directions: tuple[KnownDirection, ...] = ()
+    #: by (sensor, sensor): Measured distances of two sensors' origins, metres. They are used in the refinement only
+    distances_m: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict, hash=False)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is given that says where a sensor is."""
+        return not (self.heights_m or self.directions or self.distances_m)
+
+    def checked(self, sensors: Collection[str], reference: str) -> None:
+        """Raise an error in words for what is not about these sensors, or is no number.
+
+        Raises
+        ------
+        FrameError
+            A sensor is not there, is the reference where it may not be, or is given twice in a distance.
+        NoiseError
+            A standard deviation is not positive and finite.
+        OptionError
+            A value is not finite or larger than a vehicle, a distance or height not sensible, or a direction has no
+            length.
+        """
+        for where, named in self._named():
+            if named not in sensors:
+                raise FrameError(
+                    f"{where} is of {named!r}, and no track is of that sensor; the sensors are {', '.join(sensors)}"
+                )
+        for where, value, sigma in self._numbers():
+            if not np.isfinite(value):
+                raise OptionError(f"{where} is {value!r}; give a finite number")
+            if not (np.isfinite(sigma) and sigma > 0.0):
+                raise NoiseError(f"{where} has the standard deviation {sigma!r}; give a positive number")
+            if abs(value) > MOST_M:
+                raise OptionError(
+                    f"{where} is {value:g} m, and no vehicle is larger than {MOST_M:g} m; give metres: {value:g} mm "
+                    f"would be {1e-3 * value:g}"
+                )
+        for where, direction in self._vectors():
+            length = float(np.linalg.norm(direction)) if len(direction) == 3 else 0.0
+            if not (np.isfinite(length) and length > 0.0):
+                raise OptionError(f"{where} is {direction!r}; give three numbers that are not all zero")
+        for known in self.directions:
+            if known.of not in get_args(DirectionOf):
+                raise OptionError(
+                    f"the direction of {known.sensor} is of {known.of!r}; choose one of "
+                    f"{', '.join(get_args(DirectionOf))}"
+                )
+            if known.sensor == reference:
+                raise FrameError(
+                    f"a direction is given for {reference!r}, which is the reference: its axes are the frame itself"
+                )
+        for (first, second), (value, _) in self.distances_m.items():
+            if first == second:
+                raise FrameError(f"a distance of {first!r} to itself is given; name two sensors")
+            if value <= 0.0:
+                raise OptionError(f"the distance of {first} and {second} is {value:g} m; give a positive number")
+        others = [name for name in self.heights_m if name != reference]
+        if others and reference not in self.heights_m and self.ground is None:
+            raise FrameError(
+                f"the height of {others[0]} is given, and neither that of the reference sensor {reference} nor the "
+                "ground: poses are in the reference's frame, so heights count from there; give its height too"
+            )
+
+    def _named(self) -> Iterator[tuple[str, str]]:
+        yield from (("a height", name) for name in self.heights_m)
+        yield from (("a direction", known.sensor) for known in self.directions)
+        yield from (("a distance", name) for pair in self.distances_m for name in pair)
+
+    def _numbers(self) -> Iterator[tuple[str, float, float]]:
+        yield from ((f"the height of {name}", *number) for name, number in self.heights_m.items())
+        yield from ((f"the distance of {a} and {b}", *number) for (a, b), number in self.distances_m.items())
+        yield from ((f"the direction of {known.sensor}", 0.0, known.sigma_rad) for known in self.directions)
+        if self.ground is not None:
+            yield "the ground's distance", self.ground.distance_m, self.ground.sigma_m
+            yield "the ground's normal", 0.0, self.ground.sigma_rad
+
+    def _vectors(self) -> Iterator[tuple[str, Vector]]:
+        yield from ((f"the direction of {known.sensor}", known.direction) for known in self.directions)
+        if self.ground is not None:
+            yield "the ground's normal", self.ground.normal
+
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+#: The least length of a lever arm whose direction is given, metres: shorter ones have none.
+LEAST_ARM_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Number:
+    """One given number: what it is, its value, standard deviation and unit ("m" or "rad")."""
+
+    what: str
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Whitened residuals (q,) and derivatives (q, p) at a state, with the number of each."""
+
+    r: Array
+    J: Array
+    numbers: tuple[Number, ...]
+
+    @property
+    def information(self) -> Array:
+        """(p, p)."""
+        product: Array = self.J.T @ self.J
+        return product
+
+
+@dataclass(frozen=True)
+class GivenRows:
+    """What is given, by the places of the sensors."""
+
+    given: Given
+    place: dict[str, int]  #: by sensor: 0 is the one in whose frame the poses are
+    #: (3,): the ground's normal there, as given or as the axis that the vehicle turned about; it points up
+    normal: Array
+    sigma_normal: float  #: rad
+    #: What time offsets may be off at most, one standard deviation: keeps those that the data do not tell
+    clock_sigma_s: float
+
+    @property
+    def has_ground(self) -> bool:
+        """Whether heights are given, so that the ground's normal and the reference's height are unknowns."""
+        return bool(self.given.heights_m)
+
+    @property
+    def first_height(self) -> float:
+        """A start for the height of sensor 0."""
+        ground = self.given.ground
+        named = [name for name, k in self.place.items() if k == 0]
+        if named[0] in self.given.heights_m:
+            return self.given.heights_m[named[0]][0]
+        return (
+            ground.distance_m if ground is not None else float(np.mean([h for h, _ in self.given.heights_m.values()]))
+        )
+
+    def rows(self, state: State, layout: Layout, *, distances: bool = True) -> Rows:
+        """All residuals at a state."""
+        r: list[float] = []
+        J: list[Array] = []
+        numbers: list[Number] = []
+
+        def add(number: Number, off: float, *parts: tuple[np.ndarray | int, Array | float]) -> None:
+            row = np.zeros(layout.size + 1)
+            for at, derivative in parts:
+                row[at] += derivative
+            r.append(off / number.sigma)
+            J.append(row[:-1] / number.sigma)
+            numbers.append(number)
+
+        T = state.T
+        if self.has_ground:
+            across = _across(self.normal)
+            n = self.normal + across @ state.tilt
+            tilts, height = layout.ground[:2], int(layout.ground[2])
+            for i in range(2):
+                number = Number(
+                    f"the ground's normal ({'first' if i == 0 else 'second'} tilt)", 0.0, self.sigma_normal, "rad"
+                )
+                add(number, float(state.tilt[i]), (int(tilts[i]), 1.0))
+            ground = self.given.ground
+            if ground is not None:
+                number = Number("the ground's distance", ground.distance_m, ground.sigma_m, "m")
+                add(number, state.height - ground.distance_m, (height, 1.0))
+            for name, (value, sigma) in self.given.heights_m.items():
+                k = self.place[name]
+                off = float(n @ T[k, :3, 3]) + state.height - value
+                by_pose = np.r_[np.zeros(3), n @ T[k, :3, :3]]
+                number = Number(f"height of {name}", value, sigma, "m")
+                add(number, off, (layout.at[k, :6], by_pose), (tilts, across.T @ T[k, :3, 3]), (height, 1.0))
+        for known in self.given.directions:
+            k, across = self.place[known.sensor], _across(_unit(known.direction))
+            R, t = T[k, :3, :3], T[k, :3, 3]
+            for i in range(2):
+                number = Number(
+                    f"direction of {known.sensor}'s {known.of.replace('_', ' ')} ({i + 1})", 0.0, known.sigma_rad, "rad"
+                )
+                if known.of == "lever_arm":
+                    arm = max(float(np.linalg.norm(t)), LEAST_ARM_M)
+                    by_pose = np.r_[np.zeros(3), across[:, i] @ R] / arm
+                    add(number, float(across[:, i] @ t) / arm, (layout.at[k, :6], by_pose))
+                else:
+                    e = np.eye(3)[_AXES[known.of]]
+                    by_pose = np.r_[-across[:, i] @ R @ se3.hat(e[None])[0], np.zeros(3)]
+                    add(number, float(across[:, i] @ R @ e), (layout.at[k, :6], by_pose))
+        if distances:
+            for (first, second), (value, sigma) in self.given.distances_m.items():
+                j, k = self.place[first], self.place[second]
+                apart = T[k, :3, 3] - T[j, :3, 3]
+                length = max(float(np.linalg.norm(apart)), LEAST_ARM_M)
+                u = apart / length
+                number = Number(f"distance of {first} and {second}", value, sigma, "m")
+                add(
+                    number,
+                    length - value,
+                    (layout.at[k, 3:6], u @ T[k, :3, :3]),
+                    (layout.at[j, 3:6], -u @ T[j, :3, :3]),
+                )
+        for k in np.flatnonzero(layout.open[:, 7]).tolist():
+            add(Number("", 0.0, self.clock_sigma_s, "s"), float(state.offset[k]), (int(layout.at[k, 7]), 1.0))
+        return Rows(np.array(r), np.array(J).reshape(-1, layout.size), tuple(numbers))
+
+    def form_rows(self, state: State, scaled: np.ndarray) -> Array:
+        """Whitened rows (q, d) over the certified form's y; distances are not linear and have none.
+
+        The height of sensor 0 is taken as given there, with its deviation in each height's; the exact likelihood has
+        what heights share.
+        """
+        K = len(state.T) - 1
+        which = np.flatnonzero(scaled[1:])
+        d = 12 * K + len(which) + 1
+        rows = []
+        reference = self.first_height if self.has_ground else 0.0
+        for name, (value, sigma) in self.given.heights_m.items():
+            k = self.place[name]
+            if k == 0:
+                continue
+            t = state.T[k, :3, 3]
+            lateral = float(np.linalg.norm(t - self.normal * (self.normal @ t)))
+            whole = np.sqrt(sigma**2 + self._reference_sigma**2 + (self.sigma_normal * lateral) ** 2)
+            # Of a scaled sensor the form has t' = alpha t: the row is about it times the scale of the estimate.
+            row = np.zeros(d)
+            row[9 * K + 3 * k - 3 : 9 * K + 3 * k] = self.normal
+            row[-1] = -state.scale[k] * (value - reference)
+            rows.append(row / (whole * state.scale[k]))
+        for known in self.given.directions:
+            k, across = self.place[known.sensor], _across(_unit(known.direction))
+            for i in range(2):
+                row = np.zeros(d)
+                if known.of == "lever_arm":
+                    arm = max(float(np.linalg.norm(state.T[k, :3, 3])), 0.1) * state.scale[k]
+                    row[9 * K + 3 * k - 3 : 9 * K + 3 * k] = across[:, i] / arm
+                else:
+                    axis = 9 * (k - 1) + 3 * _AXES[known.of]
+                    row[axis : axis + 3] = across[:, i]
+                rows.append(row / known.sigma_rad)
+                if known.of != "lever_arm":
+                    # Both ways of the axis are across it; the length along it tells them apart.
+                    along = np.zeros(d)
+                    along[axis : axis + 3] = _unit(known.direction)
+                    along[-1] = -1.0
+                    rows.append(along)
+        return np.array(rows).reshape(-1, d)
+
+    @property
+    def _reference_sigma(self) -> float:
+        ground = self.given.ground
+        named = [name for name, k in self.place.items() if k == 0]
+        sigmas = [self.given.heights_m[name][1] for name in named if name in self.given.heights_m]
+        sigmas += [ground.sigma_m] if ground is not None else []
+        return min(sigmas, default=0.0)
+
+
+def _unit(direction: tuple[float, float, float] | Array) -> Array:
+    vector: Array = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    return vector
+
+
+def _across(axis: Array) -> Array:
+    """Two unit vectors (3, 2) across an axis and each other."""
+    _, _, Vt = np.linalg.svd(axis[None])
+    basis: Array = Vt[1:].T
+    return basis
+
+
+#: An axis is taken as up where it is within this angle of the reference's z axis, or of the opposite of its y axis.
+NEAR_RAD = np.radians(40.0)
+
+
+def up_direction(given: Given, windows: WindowMotions, variances: Array, reference: str) -> tuple[Array, float]:
+    """The ground's normal (3,) in the frame of sensor 0, up, and its standard deviation in rad.
+
+    Without a given ground it is the axis about which sensor 0 turned most. Its sign is that of z, or, in an optical
+    frame (z forward, y down), that against y.
+
+    Raises
+    ------
+    OptionError
+        Heights are given without the ground, and the turning axis is near neither.
+    """
+    if given.ground is not None:
+        normal = np.asarray(given.ground.normal, dtype=float)
+        return normal / np.linalg.norm(normal), given.ground.sigma_rad
+    axis, sigma = turning_axis(windows, variances)
+    if abs(axis[2]) > np.cos(NEAR_RAD):
+        axis = axis * np.sign(axis[2])
+    elif abs(axis[1]) > np.cos(NEAR_RAD):
+        axis = -axis * np.sign(axis[1])
+    elif given.heights_m:
+        raise OptionError(
+            f"heights are given, and the vehicle turned about ({', '.join(f'{x:.2f}' for x in axis)}) of {reference}'s "
+            "frame, which is near neither its z axis nor its y axis: nothing says which way is up. Give the ground, "
+            "with its normal in that frame"
+        )
+    return axis, sigma
+
+
+def turning_axis(windows: WindowMotions, variances: Array) -> tuple[Array, float]:
+    """The axis (3,) about which sensor 0 turned most, and its standard deviation in rad.
+
+    A plane's normal is that axis up to noise. What the vehicle turns about other axes beyond its noise says that the
+    ground is no plane: then the axis is off by chance, as the mean of ten drives' parts would be.
+    """
+    used = windows.used[0]
+    w = windows.rotation_vectors()[0, used]
+    square, axes = np.linalg.eigh(w.T @ w)
+    noise = float((variances[0, 0] * windows.length[0, used]).sum())
+    of_noise = np.sqrt(noise / len(w) / max(square[2], 1e-300))
+    beyond = max(float(square[1]) - 1.3 * noise, 0.0)
+    return axes[:, 2], float(np.hypot(of_noise, np.sqrt(beyond / max(square[2], 1e-300) / 10.0)))
+
+
+def upside_down(normal: Array, T: Array) -> np.ndarray:
+    """(m,) for sensors at T (m, 4, 4): 1 where its own axes say that ``normal`` is down, -1 where up, 0 where neither.
+
+    As `up_direction` reads them: z is up; or, where it is level, y is down.
+    """
+    along = np.einsum("mij,i->mj", T[:, :3, :3], normal)
+    limit = np.cos(NEAR_RAD)
+    by_z = np.where(np.abs(along[:, 2]) > limit, -np.sign(along[:, 2]), 0.0)
+    by_y = np.where(np.abs(along[:, 1]) > limit, np.sign(along[:, 1]), 0.0)
+    said: np.ndarray = np.where(by_z != 0.0, by_z, by_y)
+    return said
