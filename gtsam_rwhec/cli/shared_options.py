@@ -1,19 +1,17 @@
 """Options and arguments that several subcommands share, and the report that two of them print."""
 
 from __future__ import annotations
+
 import shlex
-from collections.abc import Collection
-from collections.abc import Mapping
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
-from typing import Literal
+from typing import Annotated, Literal
+
 import typer
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import ExitStatus
-from gtsam_rwhec.cli.failures import exit_status
-from gtsam_rwhec.files.terminal_text import say
-from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.cli.failures import ExitStatus, exit_status
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 FOLDER_OF_CSV = "folder of CSV files such as tag_0_cam_0_A.csv and tag_0_cam_0_B.csv"
 #: Headings in the help.

@@ -9,8 +9,6 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.errors import LogError, OptionError, RwhecError
-from gtsam_rwhec.export import export_all
-from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import LogWriter, open_log
@@ -33,6 +31,7 @@ from gtsam_rwhec.odometry.odometry_result import (
 )
 from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig, RigFrames
+from gtsam_rwhec.rig.exported_files import FILES, export_all
 from gtsam_rwhec.runs.changed_rig import changes, rig_for_solving
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.detection_stage import detect_log

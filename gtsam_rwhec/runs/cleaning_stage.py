@@ -1,41 +1,34 @@
 """The second stage: from detections and the carriers' motion to a log of synchronised pairs (A, B)."""
 
 from __future__ import annotations
+
 import warnings
 from pathlib import Path
+
 import numpy as np
 from rwhec_factors import se3
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+
+from gtsam_rwhec.errors import LogError, LogWarning, StampError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import CleaningReport
-from gtsam_rwhec.results.removed_measurements import Kept
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning
 from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.measured_pairs import pair_records
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, pair_records
 from gtsam_rwhec.runs.odometry_cleaning import odometry_steps
+from gtsam_rwhec.runs.odometry_motions import odometry_pairs
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
 from gtsam_rwhec.runs.output_folder import check_writable
-from gtsam_rwhec.runs.pair_consensus import ConsensusOptions
-from gtsam_rwhec.runs.pair_consensus import find_consensus
-from gtsam_rwhec.runs.run_log import RunLog
-from gtsam_rwhec.runs.run_log import read_cleaning_report
-from gtsam_rwhec.runs.run_log import write_run_log
-from gtsam_rwhec.runs.tracks import Track
-from gtsam_rwhec.runs.tracks import read_tracks
-from gtsam_rwhec.runs.odometry_motions import odometry_pairs
+from gtsam_rwhec.runs.pair_consensus import ConsensusOptions, find_consensus
+from gtsam_rwhec.runs.run_log import RunLog, read_cleaning_report, write_run_log
+from gtsam_rwhec.runs.tracks import Track, read_tracks
 
 #: Nanoseconds. The carriers' speed at a stamp is measured from this time before it to this time after it.
 SPEED_STEP_NS = 20_000_000

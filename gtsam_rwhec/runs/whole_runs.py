@@ -1,60 +1,60 @@
 """All stages, one after the other: from a log and a rig file to a folder with the calibration in every form."""
 
 from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.result_file import result_json
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig.exported_files import FILES
-from gtsam_rwhec.rig.exported_files import FOLDERS
-from gtsam_rwhec.rig.exported_files import export_all
+from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, export_all
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import cleaned
-from gtsam_rwhec.runs.detection_stage import check_image_options
-from gtsam_rwhec.runs.detection_stage import detected
+from gtsam_rwhec.runs.detection_stage import check_image_options, detected
 from gtsam_rwhec.runs.image_detections import image_count
 from gtsam_rwhec.runs.image_pictures import has_images
 from gtsam_rwhec.runs.kept_detections import inputs_of
 from gtsam_rwhec.runs.log_evidence import write_report
-from gtsam_rwhec.runs.output_folder import LEFT
-from gtsam_rwhec.runs.output_folder import OutputFolder
-from gtsam_rwhec.runs.output_folder import check_is_not_read
-from gtsam_rwhec.runs.output_folder import list_written
-from gtsam_rwhec.runs.output_folder import log_name
-from gtsam_rwhec.runs.output_folder import made_folder
-from gtsam_rwhec.runs.output_folder import made_output_folder
-from gtsam_rwhec.runs.output_folder import output_folder
-from gtsam_rwhec.runs.output_folder import remove_unchanged
-from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder
-from gtsam_rwhec.runs.recorded_logs import is_file_of_samples
-from gtsam_rwhec.runs.recorded_logs import is_folder_of_images
-from gtsam_rwhec.runs.recorded_logs import write_folder_log
-from gtsam_rwhec.runs.recorded_logs import write_samples_log
-from gtsam_rwhec.runs.run_log import CLEAN_LOG
-from gtsam_rwhec.runs.run_log import CLEANING_METADATA
-from gtsam_rwhec.runs.run_log import RECORDED_LOG
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import SEEN_SHEET
-from gtsam_rwhec.runs.run_log import is_from_stage
-from gtsam_rwhec.runs.run_log import read_embedded_rig
-from gtsam_rwhec.runs.run_log import read_metadata
+from gtsam_rwhec.runs.output_folder import (
+    LEFT,
+    OutputFolder,
+    check_is_not_read,
+    list_written,
+    log_name,
+    made_folder,
+    made_output_folder,
+    output_folder,
+    remove_unchanged,
+)
+from gtsam_rwhec.runs.recorded_logs import (
+    check_is_no_other_folder,
+    is_file_of_samples,
+    is_folder_of_images,
+    write_folder_log,
+    write_samples_log,
+)
+from gtsam_rwhec.runs.run_log import (
+    CLEAN_LOG,
+    CLEANING_METADATA,
+    RECORDED_LOG,
+    RESULT_FILE,
+    SEEN_SHEET,
+    is_from_stage,
+    read_embedded_rig,
+    read_metadata,
+)
 from gtsam_rwhec.runs.seen_in_log import Pictures
 from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files
 from gtsam_rwhec.runs.solution_frames import frames_of
-from gtsam_rwhec.runs.solved_log import read_solved
-from gtsam_rwhec.runs.solved_log import write_solved
-from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.solving_stage import Solved
-from gtsam_rwhec.runs.solving_stage import solve_log
+from gtsam_rwhec.runs.solved_log import read_solved, write_solved
+from gtsam_rwhec.runs.solving_stage import Calibrated, Solved, solve_log
 
 #: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
 OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
