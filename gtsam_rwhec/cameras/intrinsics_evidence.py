@@ -17,7 +17,7 @@ from rwhec_factors import se3
 from scipy.special import fdtrc
 
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.unknown_intrinsics import fitted_to_planes, linearised
+from gtsam_rwhec.cameras.unknown_intrinsics import fitted_to_planes, linearised, poses_eliminated
 from gtsam_rwhec.geometry.poses import Array
 
 #: With fewer views nothing is said; a view needs this number of corners.
@@ -172,17 +172,30 @@ def _compared(camera: Camera, stated: _Fit, fitted: _Fit, known: np.ndarray, rea
         return None
     change = (_numbers(fitted.camera) - _numbers(camera))[:free]
     freedom = max(2 * corners - 6 * n - free, 1)
-    back = np.linalg.inv(fitted.H)
-    # Each view's part of the gradient: their scatter holds what is alike within a view (Liang and Zeger 1986).
-    of_views = back @ (fitted.parts.T @ fitted.parts) @ back * n / (n - 1.0)
-    of_corners = fitted.rms_px**2 * corners / freedom * back
-    squared = [float(change @ np.linalg.solve(S + 1e-12 * np.eye(free), change)) for S in (of_views, of_corners)]
-    probability = max(
-        float(fdtrc(free, n - free, squared[0] * (n - free) / (free * (n - 1.0)))),  # Hotelling's T^2
-        float(fdtrc(free, freedom, squared[1] / free)),
+    probability, sigma = change_test(
+        change, fitted.H, fitted.parts, fitted.rms_px**2 * corners / freedom, freedom, least=1e-12
     )
-    sigma = np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
     return IntrinsicsEvidence(camera, fitted.camera, sigma, stated.rms_px, fitted.rms_px, probability, n, reach)
+
+
+def change_test(
+    change: Array, H: Array, parts: Array, variance: float, freedom: int, least: float = 0.0
+) -> tuple[float, Array]:
+    """The probability of a change (q,) by chance, and its standard deviations (q,): the larger of two each.
+
+    By the scatter of the views' gradients `parts` (views, q), which holds what is alike within a view (Liang and Zeger
+    1986; Hotelling's T^2), and by the variance of a corner's residual, with so many degrees of freedom. `least` is
+    added to the covariances' diagonals.
+    """
+    n, q = parts.shape
+    back = np.linalg.inv(H)
+    of_views = back @ (parts.T @ parts) @ back * n / (n - 1.0)
+    of_corners = variance * back
+    squared = [float(change @ np.linalg.solve(S + least * np.eye(q), change)) for S in (of_views, of_corners)]
+    probability = max(
+        float(fdtrc(q, n - q, squared[0] * (n - q) / (q * (n - 1.0)))), float(fdtrc(q, freedom, squared[1] / q))
+    )
+    return probability, np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,15 +227,13 @@ def _fitted(
     for _ in range(ROUNDS):
         if not np.isfinite(r).all():
             return None
-        Jt, Kt, from_prior = J.swapaxes(1, 2), K.swapaxes(1, 2), (_numbers(camera) - _numbers(prior))[:q]
-        H_pk = Jt @ K
+        from_prior = (_numbers(camera) - _numbers(prior))[:q]
         try:
-            solved = np.linalg.solve(Jt @ J, np.concatenate([H_pk, Jt @ r[..., None]], axis=2))  # by intrinsics, and 1
+            H, parts, solved = poses_eliminated(r, J, K)
         except np.linalg.LinAlgError:
             return None
         weight = max(float((r**2).sum()) / max(2 * count - 6 * len(T), 1), LEAST_PX**2) / nominal**2
-        parts = (Kt @ r[..., None])[..., 0] - np.einsum("vij,vi->vj", H_pk, solved[..., q])
-        H = (Kt @ K - H_pk.swapaxes(1, 2) @ solved[..., :q]).sum(axis=0) + np.diag(weight)
+        H = H + np.diag(weight)
         step = -np.linalg.solve(H, parts.sum(axis=0) + weight * from_prior) if free else np.zeros(q)
         motion = -(solved[..., q] + solved[..., :q] @ step)
         cost = float((r**2).sum() + weight @ from_prior**2)

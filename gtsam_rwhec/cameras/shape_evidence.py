@@ -14,11 +14,11 @@ from typing import TypeAlias
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.special import fdtrc
 
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.intrinsics_evidence import different
+from gtsam_rwhec.cameras.intrinsics_evidence import change_test, different
 from gtsam_rwhec.cameras.targets import Charuco, Target
+from gtsam_rwhec.cameras.unknown_intrinsics import board_rows, poses_eliminated
 from gtsam_rwhec.geometry.poses import Array
 
 #: With fewer views, in which the moved corners were seen beside others, nothing is said.
@@ -131,15 +131,9 @@ def _tested(
         return None
     n, q, count = len(T), G.shape[2], int(known.sum())
     freedom = max(2 * count - 6 * n - q, 1)
-    back = np.linalg.inv(fitted.H)
-    of_views = back @ (fitted.parts.T @ fitted.parts) @ back * n / (n - 1.0)
-    of_corners = max(fitted.rms_px**2 * count / freedom, LEAST_PX**2) * back
-    squared = [float(fitted.theta @ np.linalg.solve(S, fitted.theta)) for S in (of_views, of_corners)]
-    probability = tries * max(
-        float(fdtrc(q, n - q, squared[0] * (n - q) / (q * (n - 1.0)))),  # Hotelling's T^2
-        float(fdtrc(q, freedom, squared[1] / q)),
-    )
-    sigma = np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
+    variance = max(fitted.rms_px**2 * count / freedom, LEAST_PX**2)
+    by_chance, sigma = change_test(fitted.theta, fitted.H, fitted.parts, variance, freedom)
+    probability = tries * by_chance
     surely = np.sign(fitted.theta) * np.maximum(np.abs(fitted.theta) - 2.0 * sigma, 0.0)
     moved = float(np.linalg.norm(G @ surely, axis=1).max())
     px_per_m = camera.focal_px / float(np.median(T[:, 2, 3]))
@@ -165,27 +159,14 @@ def _fitted(
     camera: Camera, corners: Array, G: Array, T: Array, u: Array, known: np.ndarray, *, is_free: bool
 ) -> _Fit | None:
     """Gauss-Newton on all poses, and on theta if it is free; None where it finds no end."""
-    q, views, on = G.shape[2], len(T), known[..., None].astype(float)
+    q = G.shape[2]
     theta = np.zeros(q)
     for round_ in range(ROUNDS + 1):
-        p = corners + G @ theta
-        seen = p @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
-        seen = np.where(known[..., None], seen, [0.0, 0.0, 1.0])
-        x = seen[..., :2] / seen[..., 2:]
-        predicted, by_x = camera.pixel_jacobian(x)
-        by_seen = np.concatenate([by_x, -(by_x @ x[..., None])], axis=-1) / seen[..., 2, None, None]
-        by_body = (by_seen @ T[:, None, :3, :3]) * on[..., None]
-        r = ((predicted - u) * on).reshape(views, -1)
-        J = np.concatenate([-by_body @ se3.hat(p), by_body], axis=-1).reshape(views, -1, 6)
-        K = (by_body @ G).reshape(views, -1, q)
+        r, J, by_place, _ = board_rows(camera, T, corners + G @ theta, u, known)
         if not np.isfinite(r).all():
             return None
-        Jt, Kt = J.swapaxes(1, 2), K.swapaxes(1, 2)
-        H_pk = Jt @ K
         try:
-            solved = np.linalg.solve(Jt @ J, np.concatenate([H_pk, Jt @ r[..., None]], axis=2))
-            parts = (Kt @ r[..., None])[..., 0] - np.einsum("vij,vi->vj", H_pk, solved[..., q])
-            H = (Kt @ K - H_pk.swapaxes(1, 2) @ solved[..., :q]).sum(axis=0)
+            H, parts, solved = poses_eliminated(r, J, (by_place @ G).reshape(len(T), -1, q))
             step = -np.linalg.solve(H, parts.sum(axis=0)) if is_free else np.zeros(q)
         except np.linalg.LinAlgError:
             return None

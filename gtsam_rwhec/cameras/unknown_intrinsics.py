@@ -383,28 +383,45 @@ def _sigma(fit: _Fit, views: Sequence[tuple[Array, Array]]) -> Array:
     return np.asarray(np.sqrt(variance * np.diagonal(np.linalg.inv(information))[:4]) / scale[:4])
 
 
-def linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, q: int) -> tuple[Array, Array, Array]:
-    """Residuals (views, 2 n), and their derivatives by the poses (right perturbations) and by q intrinsic numbers."""
+def board_rows(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array, Array, Array]:
+    """Errors of corners p (n, 3) or (views, n, 3) against pixels u, in views with poses T (views, 4, 4).
+
+    Residuals (views, 2 n), their derivatives by right perturbations of the poses (views, 2 n, 6) and by the places
+    (views, n, 2, 3), and normalised coordinates (views, n, 2); all zero where a corner is not `known`.
+    """
     seen = p @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
     seen = np.where(known[..., None], seen, [0.0, 0.0, 1.0])
     x = seen[..., :2] / seen[..., 2:]
     pixels, by_x = camera.pixel_jacobian(x)
     by_seen = np.concatenate([by_x, -(by_x @ x[..., None])], axis=-1) / seen[..., 2, None, None]
-    by_body = by_seen @ T[:, None, :3, :3]
-    J = np.concatenate([-by_body @ se3.hat(p), by_body], axis=-1)
-    bent = (pixels - camera.K[:2, 2]) / np.diagonal(camera.K)[:2]
+    on = known[..., None].astype(float)
+    by_place = by_seen @ T[:, None, :3, :3] * on[..., None]
+    J = np.concatenate([-by_place @ se3.hat(p), by_place], axis=-1)
+    return ((pixels - u) * on).reshape(len(T), -1), J.reshape(len(T), -1, 6), by_place, x
+
+
+def linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, q: int) -> tuple[Array, Array, Array]:
+    """Residuals (views, 2 n), and their derivatives by the poses (right perturbations) and by q intrinsic numbers."""
+    r, J, _, x = board_rows(camera, T, p, u, known)
+    bent = (camera.pixels(x) - camera.K[:2, 2]) / np.diagonal(camera.K)[:2]
     K = np.zeros((*bent.shape, q))
     K[..., 0, 0], K[..., 1, 1] = bent[..., 0], bent[..., 1]
     K[..., 0, 2] = K[..., 1, 3] = 1.0
     if q > 4:
         K[..., 4:] = np.diagonal(camera.K)[:2, None] * coefficient_jacobian(camera.model, camera.D, x)[..., : q - 4]
-    on = known[..., None].astype(float)
-    views, n = len(T), 2 * known.shape[1]
-    return (
-        ((pixels - u) * on).reshape(views, n),
-        (J * on[..., None]).reshape(views, n, 6),
-        (K * on[..., None]).reshape(views, n, q),
-    )
+    return r, J, (K * known[..., None, None]).reshape(len(T), -1, q)
+
+
+def poses_eliminated(r: Array, J: Array, K: Array) -> tuple[Array, Array, Array]:
+    """Gauss-Newton with the poses eliminated: H (q, q) and gradients (views, q) of the q numbers that all views share.
+
+    And the poses' solutions (views, 6, q + 1), by these numbers and by one. Raises LinAlgError for a singular view.
+    """
+    Jt, Kt = J.swapaxes(1, 2), K.swapaxes(1, 2)
+    H_pk, q = Jt @ K, K.shape[2]
+    solved = np.linalg.solve(Jt @ J, np.concatenate([H_pk, Jt @ r[..., None]], axis=2))
+    parts = (Kt @ r[..., None])[..., 0] - np.einsum("vij,vi->vj", H_pk, solved[..., q])
+    return (Kt @ K - H_pk.swapaxes(1, 2) @ solved[..., :q]).sum(axis=0), parts, solved
 
 
 def _number(value: float) -> str:

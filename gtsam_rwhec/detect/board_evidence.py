@@ -56,17 +56,38 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class BoardPlane:
-    """A board before a camera: H (3, 3) from squares, from the first corner, to pixels without distortion."""
+    """A board before a camera: H (3, 3) takes steps, from the first corner or circle, to pixels without distortion."""
 
     H: Array
     focal: float
     camera: Camera | None
 
-    def pixels(self, squares: Array) -> Array:
-        """Pixels (..., 2) of places (..., 2) on the board, in squares to the right and down from the first corner."""
-        flat = cv2.perspectiveTransform(np.asarray(squares, dtype=float).reshape(-1, 1, 2), self.H)
-        found: Array = np.asarray(flat, dtype=float).reshape(np.shape(squares))
+    @staticmethod
+    def through(steps: Array, pixels: Array, camera: Camera | None, method: int = 0) -> BoardPlane | None:
+        """The plane that fits pixels (..., 2) of places (..., 2), by OpenCV's method; None where there is none."""
+        focal = 1.0 if camera is None else camera.focal_px
+        flat = pixels.reshape(-1, 2) if camera is None else camera.undistort(pixels.reshape(-1, 2)) * focal
+        H = None
+        if len(flat) >= 4 and np.isfinite(flat).all():
+            H = cv2.findHomography(steps.reshape(-1, 2), flat, method)[0]
+        if H is None or not np.isfinite(H).all():
+            return None
+        return BoardPlane(np.asarray(H, dtype=float), focal, camera)
+
+    def pixels(self, steps: Array) -> Array:
+        """Pixels (..., 2) of places (..., 2) on the board, in steps to the right and down from the first."""
+        flat = cv2.perspectiveTransform(np.asarray(steps, dtype=float).reshape(-1, 1, 2), self.H)
+        found: Array = np.asarray(flat, dtype=float).reshape(np.shape(steps))
         return found if self.camera is None else self.camera.pixels(found / self.focal)
+
+    def jacobians(self, steps: Array) -> Array:
+        """Derivatives (..., 2, 2) of pixels by steps, by central differences over a fifth of a step."""
+        columns = [(self.pixels(steps + d) - self.pixels(steps - d)) / 0.2 for d in 0.1 * np.eye(2)]
+        return np.stack(columns, axis=-1)
+
+    def scales(self, steps: Array) -> Array:
+        """Pixels of a step (...): the geometric mean over directions."""
+        return np.asarray(np.sqrt(np.abs(np.linalg.det(self.jacobians(steps)))))
 
 
 def plane_through(
@@ -78,16 +99,11 @@ def plane_through(
     """
     rows, columns = grid.shape[:2]
     squares: Array = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
-    focal = 1.0 if camera is None else camera.focal_px
-    flat = grid[good] if camera is None else camera.undistort(grid[good]) * focal
-    if len(flat) < 4 or not np.isfinite(flat).all():
-        return None
     found: tuple[BoardPlane, Array] | None = None
     for method in (0, cv2.LMEDS):
-        H = cv2.findHomography(squares[good], flat, method)[0]
-        if H is None or not np.isfinite(H).all():
+        plane = BoardPlane.through(squares[good], grid[good], camera, method)
+        if plane is None:
             return None
-        plane = BoardPlane(np.asarray(H, dtype=float), focal, camera)
         found = plane, np.asarray(np.linalg.norm(plane.pixels(squares) - grid, axis=-1))
         if (found[1][good] <= most_px).all():
             break

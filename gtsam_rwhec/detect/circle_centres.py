@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.board_evidence import BoardPlane
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.geometry.poses import Array
 
@@ -32,38 +31,6 @@ FAR_PX = 1e5
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
-    """A board's plane before a camera: H (3, 3) takes steps (right, down) of the grid to normalised coordinates."""
-
-    H: Array
-    camera: Camera
-
-    @staticmethod
-    def through(steps: Array, pixels: Array, camera: Camera) -> Plane | None:
-        """The plane that fits pixels (..., 2) of places (..., 2) best; None where there is none."""
-        focal = camera.focal_px
-        flat = camera.undistort(pixels.reshape(-1, 2)) * focal
-        H = cv2.findHomography(steps.reshape(-1, 2), flat, 0)[0] if np.isfinite(flat).all() else None
-        if H is None or not np.isfinite(H).all():
-            return None
-        return Plane(np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ H, camera)
-
-    def pixels(self, steps: Array) -> Array:
-        """Pixels (..., 2) of places (..., 2)."""
-        flat = cv2.perspectiveTransform(np.asarray(steps, dtype=float).reshape(-1, 1, 2), self.H)
-        return self.camera.pixels(np.asarray(flat, dtype=float).reshape(np.shape(steps)))
-
-    def jacobians(self, steps: Array) -> Array:
-        """Derivatives (..., 2, 2) of pixels by steps, by central differences over a fifth of a step."""
-        columns = [(self.pixels(steps + d) - self.pixels(steps - d)) / 0.2 for d in 0.1 * np.eye(2)]
-        return np.stack(columns, axis=-1)
-
-    def scales(self, steps: Array) -> Array:
-        """Pixels of a step (...): the geometric mean over directions."""
-        return np.asarray(np.sqrt(np.abs(np.linalg.det(self.jacobians(steps)))))
-
-
-@dataclass(frozen=True, eq=False)
 class Circles:
     """Circles (...) as they are in an image."""
 
@@ -77,7 +44,7 @@ class Circles:
     seen: np.ndarray  #: (...): whether a circle is whole in the image and its numbers are finite
 
 
-def measured_circles(gray: Gray, plane: Plane, steps: Array, about_px: Array, radii: Array) -> Circles:
+def measured_circles(gray: Gray, plane: BoardPlane, steps: Array, about_px: Array, radii: Array) -> Circles:
     """Measure circles at places (..., 2) of the grid, near pixels about_px (..., 2), with about these radii (...).
 
     Around each, a plane is fitted to the gray values between it and its neighbours: light that changes across a circle
@@ -166,7 +133,7 @@ def _gaps(steps: Array, radii: Array) -> Array:
     return np.asarray(np.clip(apart.min(axis=1), 0.05, np.maximum(1.0 - 2.0 * radii, 0.2)))
 
 
-def _outlines(plane: Plane, steps: Array, radii: Array) -> tuple[Array, Array]:
+def _outlines(plane: BoardPlane, steps: Array, radii: Array) -> tuple[Array, Array]:
     """Areas (n,) of the circles' images, px^2, and how far (n, 2) their centroids are off the projected centres."""
     angle = 2.0 * np.pi * np.arange(OUTLINE) / OUTLINE
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -15,8 +15,8 @@ import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import CircleGrid
-from gtsam_rwhec.detect.board_evidence import FoundBoard, smallest_step
-from gtsam_rwhec.detect.circle_centres import Circles, Plane, measured_circles
+from gtsam_rwhec.detect.board_evidence import BoardPlane, FoundBoard, smallest_step
+from gtsam_rwhec.detect.circle_centres import Circles, measured_circles
 from gtsam_rwhec.detect.circle_lattice import Ellipses, ellipses, grids
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import Gray
@@ -91,7 +91,7 @@ def _candidates(gray: Gray, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
 
 def _tested(gray: Gray, board: CircleGrid, grid: Array, radii_px: Array, camera: Camera) -> FoundBoard:
     steps, there = board.steps(), np.isfinite(radii_px)
-    plane = Plane.through(steps[there], grid[there], camera)
+    plane = BoardPlane.through(steps[there], grid[there], camera)
     if plane is None:
         return FoundBoard(grid[there], np.flatnonzero(there), Rejection.NOT_A_GRID)
     predicted = plane.pixels(steps)
@@ -109,7 +109,7 @@ def _tested(gray: Gray, board: CircleGrid, grid: Array, radii_px: Array, camera:
         if not circles.seen.all():
             return FoundBoard(blobs.corners_px, blobs.indices, Rejection.NOT_WHOLE)
         centres, radii = circles.centres_px, circles.radii
-        again = Plane.through(steps, centres, camera)
+        again = BoardPlane.through(steps, centres, camera)
         if again is None:
             return blobs
         plane = again
@@ -142,7 +142,7 @@ def _tested(gray: Gray, board: CircleGrid, grid: Array, radii_px: Array, camera:
     return FoundBoard(np.rot90(centres, turn)[kept], np.flatnonzero(kept), rejection)
 
 
-def _off(plane: Plane, steps: Array, centres: Array) -> Array:
+def _off(plane: BoardPlane, steps: Array, centres: Array) -> Array:
     """How far (rows, columns) centres are from their places in the plane, pixels."""
     return np.asarray(np.linalg.norm(plane.pixels(steps) - centres, axis=-1))
 
@@ -156,7 +156,7 @@ def _turn(larger: np.ndarray, board: CircleGrid) -> int | None:
     return next((turn for turn in turns if np.rot90(larger, turn)[row, column]), None)
 
 
-def _goes_on(gray: Gray, plane: Plane, board: CircleGrid, radius: float, contrast: float) -> bool:
+def _goes_on(gray: Gray, plane: BoardPlane, board: CircleGrid, radius: float, contrast: float) -> bool:
     """Whether a whole row or column of circles lies beyond the board, on any of its sides."""
     columns, rows = np.arange(board.columns, dtype=float), np.arange(board.rows, dtype=float)
     if board.asymmetric:

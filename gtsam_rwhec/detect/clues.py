@@ -11,13 +11,10 @@ import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import CORNERS, AprilGrid, Checkerboard, CircleGrid, Tag, Target, is_same_print
-from gtsam_rwhec.detect.board_corners import refined_corners
-from gtsam_rwhec.detect.board_evidence import evidence, smallest_step
-from gtsam_rwhec.detect.checkerboards import OF_SQUARE
 from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.detect.detector import Detection, Detector
 from gtsam_rwhec.detect.images import Gray
-from gtsam_rwhec.detect.saddles import regions
+from gtsam_rwhec.detect.saddle_lattices import lattice_sizes
 from gtsam_rwhec.detect.tags import BY_TRUST, DOUBLE, identified, quadrangles, tags_in_image, unlike
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
@@ -131,10 +128,8 @@ def _slopes(values: Array) -> tuple[Array, Array]:
     return np.asarray(x), np.asarray(y)
 
 
-#: A checkerboard of any size is looked for in regions with at least this number of saddles.
-LEAST_SADDLES = 9
-#: Regions that are searched, and the pixels of one: larger ones are made smaller first.
-MOST_REGIONS, MOST_PIXELS = 2, 400_000
+#: A checkerboard has at most this number of corners each way.
+MOST_COUNTED = 30
 #: Percentiles of gray values that may be a tag's black.
 LEVELS = (2.0, 8.0, 20.0, 40.0, 60.0)
 #: An image of which this share is saturated is overexposed.
@@ -199,7 +194,7 @@ def clues(
 
 def _another_target(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
     if isinstance(target, Checkerboard):
-        return _other_board(gray, target, camera)
+        return _other_board(gray, target, camera, options)
     if isinstance(target, CircleGrid):
         return _other_grid(gray, target, camera, options)
     return _other_tags(gray, target)
@@ -250,60 +245,16 @@ def read(gray: Gray, camera: Camera, target: Target, options: DetectionOptions) 
     return next((detection for detection in seen.detections if detection.rejection is None), None)
 
 
-def _other_board(gray: Gray, board: Checkerboard, camera: Camera) -> Iterator[Clue]:
-    """The counts of the checkerboard that is in the image, in the order of the one that was looked for.
-
-    OpenCV's sector-based detector may find a board of any size, but its size is often one off; the classic detector is
-    asked for sizes about it and about the stated one, and what it finds is tested as every board is.
-    """
+def _other_board(gray: Gray, board: Checkerboard, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
+    """The counts of the checkerboard that is in the image, in the order of the one that was looked for."""
     stated = (min(board.columns, board.rows), max(board.columns, board.rows))
-    for level in (1, 2):
-        for region in regions(gray, LEAST_SADDLES, level)[:MOST_REGIONS]:
-            part, of_part = _cut_out(gray, camera, region)
-            likely = [*_any_size(part), *_neighbours(stated)]
-            for size in dict.fromkeys([*likely, *(other for found in likely[:1] for other in _neighbours(found))]):
-                if size != stated and _is_board(part, size, of_part):
-                    yield Clue(About.COUNTS, size if board.columns <= board.rows else size[::-1])
-                    return
-
-
-def _cut_out(gray: Gray, camera: Camera, region: tuple[slice, slice]) -> tuple[Gray, Camera]:
-    """A region of an image, made smaller where it is large, and its camera."""
-    part = np.ascontiguousarray(gray[region])
-    K = camera.K.copy()
-    K[:2, 2] -= region[1].start, region[0].start
-    of_part = replace(camera, width=part.shape[1], height=part.shape[0], K=K)
-    scale = float(np.sqrt(min(MOST_PIXELS / part.size, 1.0)))
-    return resized(part, of_part, scale) if scale < 1.0 else (part, of_part)
-
-
-def _any_size(part: Gray) -> list[tuple[int, int]]:
-    """The counts, the smaller first, of the board that OpenCV finds when it may find any size."""
-    is_found, _, meta = cv2.findChessboardCornersSBWithMeta(part, (3, 3), cv2.CALIB_CB_LARGER)
-    if not is_found or meta is None or min(meta.shape[:2]) < 3:
-        return []
-    return [(min(meta.shape[:2]), max(meta.shape[:2]))]
-
-
-def _neighbours(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Sizes about one, the smaller count first: one less of both is where squares were counted."""
-    a, b = size
-    steps = [(-1, -1), (1, 1), (0, 0), (-1, 0), (0, -1), (1, 0), (0, 1), (-1, 1), (1, -1)]
-    sizes = [(min(a + i, b + j), max(a + i, b + j)) for i, j in steps]
-    return [(low, high) for low, high in sizes if low >= 3]
-
-
-def _is_board(part: Gray, size: tuple[int, int], camera: Camera) -> bool:
-    """Whether OpenCV's classic detector finds a board of a size, and its squares are as printed."""
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    is_found, corners = cv2.findChessboardCorners(part, size, flags=flags)
-    if not is_found:
-        return False
-    grid = np.reshape(corners, (size[1], size[0], 2)).astype(float)
-    half = int(np.clip(OF_SQUARE[0] * smallest_step(grid), 2, 9))
-    return (
-        evidence(part, refined_corners(part, grid.reshape(-1, 2), half).reshape(grid.shape), camera).rejection is None
-    )
+    for size in dict.fromkeys((min(size), max(size)) for size in lattice_sizes(gray)):
+        counts = size if board.columns <= board.rows else size[::-1]
+        if size == stated or size[0] < 3 or size[1] > MOST_COUNTED:
+            continue
+        if read(gray, camera, replace(board, columns=counts[0], rows=counts[1]), options) is not None:
+            yield Clue(About.COUNTS, counts)
+            return
 
 
 def _other_grid(gray: Gray, grid: CircleGrid, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gtsam_rwhec.detect.saddles import Saddles
+from gtsam_rwhec.detect.images import Gray
+from gtsam_rwhec.detect.saddles import LEVELS, Saddles, groups_of, saddles, scaled_down
 from gtsam_rwhec.geometry.poses import Array
 
 #: A first neighbour is at most this far beside an edge's direction (radians), and among this number of nearest saddles.
@@ -45,7 +46,7 @@ class Lattice:
     steps: np.ndarray
 
 
-def lattices(saddles: Saddles, members: np.ndarray, corners: int) -> Iterator[Lattice]:
+def lattices(among: Saddles, members: np.ndarray, corners: int) -> Iterator[Lattice]:
     """Lattices among some (m,) of the saddles, from those nearest to their middle on.
 
     One with as many saddles as a board has corners, or with nearly all there are, is not looked for again from another
@@ -55,14 +56,14 @@ def lattices(saddles: Saddles, members: np.ndarray, corners: int) -> Iterator[La
     for _ in range(MOST_LATTICES):
         if len(free) < LEAST_SADDLES:
             return
-        places = saddles.places[free]
+        places = among.places[free]
         apart = np.linalg.norm(places[:, None] - places, axis=2)
-        beside = _neighbours(places, saddles.edges[free], saddles.light[free], apart)
+        beside = _neighbours(places, among.edges[free], among.light[free], apart)
         from_middle = np.linalg.norm(places - np.median(places, axis=0), axis=1)
         starts = np.lexsort((from_middle, -beside))[:STARTS]
         best: dict[tuple[int, int], int] = {}
         for start in starts.tolist():
-            best = max(best, _grown(saddles, free, apart, start), key=len)
+            best = max(best, _grown(among, free, apart, start), key=len)
             if len(best) >= min(corners, ENOUGH * len(free)):
                 break
         if len(best) < LEAST_SADDLES:
@@ -88,10 +89,10 @@ def _neighbours(places: Array, edges: Array, light: Array, apart: Array) -> np.n
     return np.asarray((ok & (sides[0] * sides[1] < 0.0)).sum(axis=1))
 
 
-def _grown(saddles: Saddles, members: np.ndarray, apart: Array, start: int) -> dict[tuple[int, int], int]:
+def _grown(among: Saddles, members: np.ndarray, apart: Array, start: int) -> dict[tuple[int, int], int]:
     """Places in `members` by their steps from `start`; empty where it has no neighbour along each of its edges."""
-    places, edges = saddles.places[members], saddles.edges[members]
-    light = saddles.light[members]
+    places, edges = among.places[members], among.edges[members]
+    light = among.light[members]
     nearest = np.argsort(apart[start])[: NEAREST + 1]
     nearest = nearest[apart[start][nearest] > LEAST_STEP_PX]
     first: list[Array] = []
@@ -171,3 +172,21 @@ def boards_in(lattice: Lattice, places: Array, rows: int, columns: int) -> Itera
         grid = grid.reshape(rows, columns, 2)
         grid[there] = seen
         yield grid, goes_on
+
+
+def lattice_sizes(gray: Gray) -> Iterator[tuple[int, int]]:
+    """Counts of corners (one way, the other way) of the lattices in an image, which may be checkerboards of any size.
+
+    Outer rows of which less than half is there do not count.
+    """
+    for level in LEVELS:
+        seen = saddles(scaled_down(gray, level))
+        for members in groups_of(seen.places, LEAST_SADDLES):
+            for lattice in lattices(seen, members, len(members)):
+                there = np.zeros(lattice.steps.max(axis=0) + 1, dtype=bool)
+                there[tuple(lattice.steps.T)] = True
+                for _ in range(4):  # each side in turn
+                    while len(there) > 2 and there[0].mean() < 0.5:
+                        there = there[1:]
+                    there = np.rot90(there)
+                yield len(there), len(there[0])

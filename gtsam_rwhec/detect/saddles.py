@@ -28,8 +28,10 @@ MOST = 600
 NEAR = 1.8
 #: A group may be a board if it has at least this share of the board's corners.
 SHARE = 0.6
-#: A region reaches beyond its group by this share of the group's size, and by `BEYOND_PX` pixels of the level.
-BEYOND, BEYOND_PX = 0.45, 12.0
+#: Images are halved this often before saddles are looked for: sharp corners first, blurred ones in what is smaller.
+LEVELS = (1, 2)
+#: At most this number of groups of saddles are looked at.
+MOST_GROUPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +41,6 @@ class Saddles:
     places: Array  #: (n, 2): pixels, right to some tenths
     edges: Array  #: (n, 2, 2): unit vectors along the two edges that cross
     light: Array  #: (n, 2): A unit vector towards a light side
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """Rows and columns of an image that may show a board, and which of the saddles of a level (m,) are there."""
-
-    part: tuple[slice, slice]
-    members: np.ndarray
 
 
 def scaled_down(gray: Gray, level: int) -> Gray:
@@ -59,33 +53,13 @@ def scaled_down(gray: Gray, level: int) -> Gray:
     return small
 
 
-def regions(gray: Gray, corners: int, level: int) -> list[tuple[slice, slice]]:
-    """Rows and columns of an image's regions that may show a board of this number of corners (`regions_among`)."""
-    places = saddles(scaled_down(gray, level)).places
-    return [region.part for region in regions_among(gray.shape, places, corners, level)]
-
-
-def regions_among(shape: tuple[int, ...], places: Array, corners: int, level: int) -> list[Region]:
-    """Regions of an image (height, width) that may show a board of this number of corners, the likeliest first.
+def groups_of(places: Array, corners: int) -> list[np.ndarray]:
+    """The members of groups of saddles (n, 2) that may show a board of this number of corners, the likeliest first.
 
     A group of about as many saddles as the board has corners is likelier than a larger one, which may be any clutter.
-    The saddles' places (n, 2) are those in the image that is halved `level` times: this is fast, and finds blurred
-    corners too.
     """
-    boxes = []
-    for members in _groups(places):
-        if len(members) >= SHARE * corners:
-            low, high = places[members].min(axis=0), places[members].max(axis=0)
-            more = BEYOND * float((high - low).max()) + BEYOND_PX
-            boxes.append((abs(float(np.log(len(members) / corners))), low - more, high + more, members))
-    boxes.sort(key=lambda box: box[0])
-    found = []
-    for _, low, high, members in boxes:
-        (left, top), (right, bottom) = (np.rint(side * 2**level).astype(int).tolist() for side in (low, high))
-        height, width = shape[:2]
-        part = slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))
-        found.append(Region(part, members))
-    return found
+    large = [members for members in _groups(places) if len(members) >= SHARE * corners]
+    return sorted(large, key=lambda members: abs(float(np.log(len(members) / corners))))[:MOST_GROUPS]
 
 
 def saddles(gray: Gray) -> Saddles:

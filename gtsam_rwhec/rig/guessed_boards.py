@@ -1,34 +1,34 @@
 """Boards without tags in some images: how many corners or circles they have, found out from the images.
 
-OpenCV's detectors must be told a board's size. Candidates come from its sector-based detector, which can say how far a
-board goes on, and from lattices that saddles or blobs form. Each candidate is then looked for in all the images by the
-detection itself, which tests every square and circle and that nothing goes on beyond the board; a board is what passes
-in at least two images, the one that passes most often.
+Detectors must be told a board's size. Candidates come from lattices that saddles or blobs form. Each candidate is then
+looked for in all the images by the detection itself, which tests every square and circle and that nothing goes on
+beyond the board; a board is what passes in at least two images, the one that passes most often.
 """
 
 from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
+from collections.abc import Iterable
+from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import permutations, product
-
+from itertools import permutations
 import cv2
 import numpy as np
-
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid
+from gtsam_rwhec.cameras.targets import CORNERS
+from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.cameras.targets import CircleGrid
 from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
-from gtsam_rwhec.detect.board_evidence import evidence
 from gtsam_rwhec.detect.checkerboards import find_checkerboard
 from gtsam_rwhec.detect.circle_grids import find_circle_grid
 from gtsam_rwhec.detect.images import Gray
-from gtsam_rwhec.detect.saddles import regions
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.detect.saddle_lattices import lattice_sizes
 
 #: The smallest board that is looked for, in corners or circles a side, and the largest.
 SMALLEST, LARGEST = 3, 30
@@ -37,12 +37,8 @@ LEAST_IMAGES = 2
 #: At most this number of candidates of each kind, the most frequent, are looked for in all images; of this number of
 #: images, those that `LEAST_IMAGES` of them propose.
 MOST_CANDIDATES, ENOUGH_IMAGES = 3, 6
-#: Regions with at least this number of saddles are searched; a region is searched at twice its size below this.
-LEAST_CORNERS, ENLARGED_PX = 9, 250_000
 #: Circles have at least this area, pixels.
 LEAST_AREA_PX = 20.0
-#: At most this number of regions of each image and level are searched.
-MOST_REGIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,37 +80,10 @@ def boards_seen(images: Sequence[Gray]) -> list[BoardSeen]:
 
 
 def _checkerboards(gray: Gray) -> Iterator[tuple[int, int]]:
-    """Numbers of inner corners that an image's checkerboard may have, the larger first.
-
-    The detector may go on beyond a board with a thin margin. So what it found is tested as it is, and with each of the
-    outermost rows and columns left out.
-    """
-    for level in (1, 2):
-        for region in regions(gray, LEAST_CORNERS, level)[:MOST_REGIONS]:
-            part = np.ascontiguousarray(gray[region])
-            corner = np.array([region[1].start, region[0].start], dtype=float)
-            for enlarged in (False, True) if part.size <= ENLARGED_PX else (False,):
-                sizes = list(_passing(gray, part, corner, enlarged=enlarged))
-                yield from sizes
-                if sizes:
-                    break
-
-
-def _passing(gray: Gray, part: Gray, corner: Array, *, enlarged: bool) -> Iterator[tuple[int, int]]:
-    """Sizes that pass the test of squares, of what the detector finds in a part of an image or in the part enlarged."""
-    if enlarged:
-        part = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
-    found, corners, meta = cv2.findChessboardCornersSBWithMeta(part, (SMALLEST, SMALLEST), cv2.CALIB_CB_LARGER)
-    if not found or max(meta.shape) > LARGEST:
-        return
-    grid = np.reshape(corners, (*meta.shape, 2)).astype(float)
-    # Pixel centres are at whole numbers: the first of the enlarged ones is at -1/4.
-    grid = corner + (0.5 * grid - 0.25 if enlarged else grid)
-    rows, columns = meta.shape
-    for top, bottom, left, right in product((0, 1), repeat=4):
-        trimmed = grid[top : rows - bottom, left : columns - right]
-        if min(trimmed.shape[:2]) >= SMALLEST and evidence(gray, trimmed, None).rejection is None:
-            yield _larger_first(*trimmed.shape[:2])
+    """Numbers of inner corners that an image's checkerboard may have, the larger first."""
+    for size in lattice_sizes(gray):
+        if min(size) >= SMALLEST and max(size) <= LARGEST:
+            yield _larger_first(*size)
 
 
 def _circle_grids(gray: Gray, size_of: Callable[[Array, Array], tuple[int, int] | None]) -> Iterator[tuple[int, int]]:

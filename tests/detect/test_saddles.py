@@ -7,7 +7,7 @@ import pytest
 from rendered import PINHOLE, pose, printed, projected, render
 
 from gtsam_rwhec.cameras.targets import Checkerboard, Tag
-from gtsam_rwhec.detect.saddles import regions, saddles
+from gtsam_rwhec.detect.saddles import groups_of, saddles, scaled_down
 
 CHESS = Checkerboard("chess", 5, 4, 0.03)
 
@@ -27,18 +27,16 @@ def test_a_boards_corners_are_saddles(turn: float) -> None:
         assert along.max(axis=1).min() > 0.95
         x, y = found.places[nearest] + 5.0 * found.light[nearest]
         assert image[round(y), round(x)] > 128
-    rows, columns = regions(image, 20, 1)[0]
-    assert (there >= [columns.start, rows.start]).all()
-    assert (there < [columns.stop, rows.stop]).all()
+    assert len(groups_of(found.places, 20)[0]) >= 20
 
 
 def test_tags_noise_and_plain_walls_are_no_regions() -> None:
     plain = render(PINHOLE, [], noise=4.0)
     tag = render(PINHOLE, [(printed(Tag("tag", "tag36h11", 7, 0.1)), pose((10.0, 10.0, 0.0), (0.0, 0.0, 0.4)))])
     for image in (plain, tag):
-        assert regions(image, 20, 1) == []
+        assert groups_of(saddles(scaled_down(image, 1)).places, 20) == []
 
 
 def test_two_boards_are_two_regions() -> None:
     scene = [(printed(Checkerboard("c", 5, 4, 0.012)), pose((0.0, 0.0, 0.0), (x, 0.0, 0.3))) for x in (-0.08, 0.08)]
-    assert len(regions(render(PINHOLE, scene, blur_px=0.5), 20, 1)) == 2
+    assert len(groups_of(saddles(scaled_down(render(PINHOLE, scene, blur_px=0.5), 1)).places, 20)) == 2
