@@ -1,9 +1,8 @@
 """Whether a board's tags are where the rig file has them: each tag's place, turn and size, and the gap of a grid.
 
-All images of a track see one board. What a mistake of the rig file makes is alike in all of them, in the board's frame,
-while errors of corners and intrinsics are not. Each hypothesis moves corners by G theta in that frame; theta is
-estimated with all poses (Gauss-Newton, poses eliminated), and counts by its scatter between the views (Liang and Zeger
-1986; Hotelling's T^2).
+All images of a track see one board: what a mistake of the rig file makes is alike in all of them, in the board's frame.
+Each hypothesis moves corners by G theta in that frame; theta is estimated with all poses, and counts by its scatter
+between the views. And which parts of a board are in no image, though the images have their places.
 """
 
 from __future__ import annotations

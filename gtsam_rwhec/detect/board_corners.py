@@ -1,9 +1,9 @@
-"""Corners where two dark squares meet, from the two edges that cross there, and from nothing beside them.
+"""Corners of boards, the points where two dark squares meet: blur and gamma do not move them.
 
-At a point of an edge the gray value's gradient g is across the edge, so that g . (q - p) = 0 for the corner q (Förstner
-and Gülch 1987; OpenCV's cornerSubPix). OpenCV sums over a square window: with markers nearby it must be so small that
-blur and noise leave nothing in it. Here the sum is over two strips, along the two edges, which are narrow where
-something else is printed nearby, and long.
+The tags that were read say where the board is. All of its corners are looked for at the places which that predicts,
+also those beside tags that could not be read. A corner counts if its four quadrants are dark and light as printed, and
+if it is at its place in the board's plane. At a point p of an edge the gradient g is across the edge, g . (q - p) = 0
+for the corner q (Förstner and Gülch 1987; OpenCV's cornerSubPix): here summed over two strips along the edges.
 """
 
 from __future__ import annotations

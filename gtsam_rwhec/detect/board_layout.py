@@ -1,7 +1,8 @@
-"""Which tags of a board are where the board says: all of them must agree with one homography, or with one pose.
+"""Whether a board's tags are where the board has them, by one homography or one pose, and the layout that fits if not.
 
 A tag that was read wrongly, or a board that is not the stated one, is off by a tag's side and more. Errors of corners
-and of intrinsics are far smaller than that, so that `LARGEST_OFF` tells them apart.
+and of intrinsics are far smaller than that, so that `LARGEST_OFF` tells them apart. Layouts are tried in the order in
+which people take one for another; the first that fits is what the message proposes.
 """
 
 from __future__ import annotations

@@ -1,13 +1,16 @@
-"""Grids of circles: lattices of ellipses, tested against the board, turned by its larger dot.
+"""Grids of circles: lattices of ellipses, tested against the board, turned by its larger dot; and their centres.
 
-A grid with a wrong circle, one circle off, or of another size must not count. So every circle must be there and have
-its size (one at a corner larger, if the board has a larger dot), all lie on one plane's grid but for a few that bent
-paper or dirt moves and that do not count, and no row may go on beyond the board.
+The image of a circle shows how its surroundings are foreshortened. Where a circle's image is round again, its four
+neighbours are equally far and at right angles, at any tilt: from such a circle a lattice grows. A grid with a wrong
+circle, one circle off, or of another size must not count: every circle must be there and have its size, and all but a
+few lie on one plane's grid. The image of a circle's centre is not the centre of its image (Heikkila 2000, section 3.1):
+by how much the projected outline's centroid is off the projected centre is subtracted from the measured centroid.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import cv2
@@ -16,11 +19,331 @@ import numpy as np
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import CircleGrid
 from gtsam_rwhec.detect.board_evidence import BoardPlane, FoundBoard, smallest_step
-from gtsam_rwhec.detect.circle_centres import Circles, measured_circles
-from gtsam_rwhec.detect.circle_lattice import Ellipses, ellipses, grids
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.geometry.poses import Array
+
+#: Blobs have at least this area (pixels).
+LEAST_AREA_PX = 12.0
+#: A blob fills at least this share of its convex hull, and its area is that of its ellipse within this share.
+FILLED, LIKE_ELLIPSE = 0.85, 0.15
+#: The axes of an ellipse: the shorter one is at least this share of the longer one.
+LEAST_ROUND = 0.1
+#: A pixel is dark (light) if it differs from the mean of its surroundings by this many gray values.
+DIFFERS = 6.0
+#: Neighbours on a lattice have areas within this factor; one of them may be a larger dot.
+LIKE_AREA = 4.0
+#: The four nearest of a circle are its neighbours if distances and right angles fit within these shares of a distance.
+SEED_OFF = 0.3
+#: A circle is at its place in the lattice within this share of a step from where its neighbours predict it.
+GROWN_OFF = 0.3
+#: At most this number of circles have the four neighbours from which lattices start: those with the best-fitting ones.
+MOST_SEEDS = 60
+#: Among more blobs than this no lattice is looked for.
+MOST_BLOBS = 1500
+#: At most this share of a board's circles may be missing among the blobs, and less than half of each row and column.
+MOST_MISSING = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipses:
+    """Blobs: places (n, 2), pixels, and shapes S (n, 2, 2), pixels squared: the outline is x' S^-1 x = 1."""
+
+    places: Array
+    shapes: Array
+
+    def with_more(self, others: Ellipses) -> Ellipses:
+        """These, and those of the others that are elsewhere: not within the radii of one of these and of its own."""
+        if not (len(self.places) and len(others.places)):
+            return self if len(self.places) else others
+        apart = np.linalg.norm(others.places[:, None] - self.places, axis=-1)
+        new = (apart > np.sqrt(np.minimum(others.areas[:, None], self.areas))).all(axis=1)
+        return Ellipses(
+            np.concatenate([self.places, others.places[new]]), np.concatenate([self.shapes, others.shapes[new]])
+        )
+
+    @property
+    def areas(self) -> Array:
+        """(n,): over pi, pixels squared."""
+        return np.asarray(np.sqrt(np.linalg.det(self.shapes)))
+
+
+def ellipses(gray: Gray, around_px: int, *, light: bool) -> Ellipses:
+    """Dark or light blobs that look like ellipses, against the mean of a square of `around_px` pixels."""
+    mean = cv2.blur(gray, (around_px, around_px), borderType=cv2.BORDER_REPLICATE)
+    differs = cv2.subtract(gray, mean) if light else cv2.subtract(mean, gray)
+    contours, tree = cv2.findContours((differs > DIFFERS).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    # Of a circle that is larger than its surroundings only the rim differs: the rim's outer outline counts.
+    outer = [contour for contour, node in zip(contours, tree[0] if contours else (), strict=True) if node[3] < 0]
+    largest = gray.size / 9.0
+    places, shapes = [], []
+    for contour in outer:
+        if len(contour) < 8:
+            continue
+        m = cv2.moments(contour)
+        area = m["m00"]
+        if not LEAST_AREA_PX <= area <= largest:
+            continue
+        a, b, c = m["mu20"] / area, m["mu11"] / area, m["mu02"] / area
+        of_ellipse = 4.0 * np.pi * np.sqrt(max(a * c - b * b, 0.0))
+        if abs(area - of_ellipse) > LIKE_ELLIPSE * area or 2.0 * np.sqrt(a * c - b * b) < LEAST_ROUND * (a + c):
+            continue
+        if area < FILLED * cv2.contourArea(cv2.convexHull(contour)):
+            continue
+        places.append((m["m10"] / area, m["m01"] / area))
+        shapes.append(((4.0 * a, 4.0 * b), (4.0 * b, 4.0 * c)))
+    return Ellipses(np.array(places, float).reshape(-1, 2), np.array(shapes, float).reshape(-1, 2, 2))
+
+
+def grids(blobs: Ellipses, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
+    """Places (rows, columns, 2) and mean radii (rows, columns) of grids like the board's among the blobs, pixels.
+
+    They are nan where a circle is missing among the blobs: it may be there all the same. A grid that looks the same
+    turned comes in one of its ways only.
+    """
+    if not (1.0 - MOST_MISSING) * board.columns * board.rows <= len(blobs.places) <= MOST_BLOBS:
+        return
+    taken = np.zeros(len(blobs.places), dtype=bool)
+    for seed, first, second in _seeds(blobs):
+        if taken[seed]:
+            continue
+        members, cells = _grown(blobs, seed, first, second)
+        taken[members] = True
+        for which in _placed(members, cells, board):
+            there = which >= 0
+            yield (
+                np.where(there[..., None], blobs.places[which], np.nan),
+                np.where(there, np.sqrt(blobs.areas[which]), np.nan),
+            )
+
+
+def _seeds(blobs: Ellipses) -> Iterator[tuple[int, Array, Array]]:
+    """Blobs with four neighbours on a lattice, those that fit best first, with the two steps to neighbours, pixels."""
+    n = len(blobs.places)
+    if n < 5:
+        return
+    # Round again: the image of a circle is where |root x| = 1.
+    roots = np.linalg.cholesky(np.linalg.inv(blobs.shapes)).swapaxes(1, 2)
+    areas = blobs.areas
+    between = blobs.places - blobs.places[:, None]
+    near = between @ roots.swapaxes(1, 2)
+    distance = np.linalg.norm(near, axis=-1)
+    distance[(areas > LIKE_AREA * areas[:, None]) | (LIKE_AREA * areas < areas[:, None]) | np.eye(n, dtype=bool)] = (
+        np.inf
+    )
+    four = np.argpartition(distance, 3, axis=1)[:, :4]
+    near = np.take_along_axis(near, four[..., None], axis=1)
+    order = np.argsort(np.arctan2(near[..., 1], near[..., 0]), axis=1)  # a right angle after the other
+    four, near = np.take_along_axis(four, order, axis=1), np.take_along_axis(near, order[..., None], axis=1)
+    v = near / np.take_along_axis(distance, four, axis=1).mean(axis=1)[:, None, None]
+    quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    with np.errstate(invalid="ignore"):
+        off = np.abs(np.concatenate([v[:, :2] + v[:, 2:], v[:, 1:3] - v[:, :2] @ quarter], axis=1)).max(axis=(1, 2))
+    for i in np.argsort(off)[:MOST_SEEDS].tolist():
+        if off[i] < SEED_OFF:
+            a, b, c, d = between[i, four[i]]
+            steps = 0.5 * np.array([a - c, b - d])
+            if np.linalg.det(steps) > 1.0:
+                yield i, steps[0], steps[1]
+
+
+def _grown(blobs: Ellipses, seed: int, first: Array, second: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Blobs (m,) and their cells (m, 2) on the lattice that grows from one of them by two steps, pixels."""
+    cell_of = {seed: (0, 0)}
+    at = {(0, 0): seed}
+    frontier = [(seed, first, second)]
+    areas = blobs.areas
+    while frontier:
+        members = np.array([member for member, _, _ in frontier])
+        bases = np.array([[a, b] for _, a, b in frontier])  # (f, 2, 2): rows are steps
+        # (f, 4, 2): predicted neighbours, and how far each blob is from them in steps.
+        predicted = blobs.places[members][:, None] + np.concatenate([bases, -bases], axis=1)
+        inverse = np.linalg.inv(bases)
+        off = np.linalg.norm((blobs.places - predicted[:, :, None]) @ inverse[:, None], axis=-1)
+        ratio = areas / areas[members][:, None]
+        off[np.broadcast_to(((ratio > LIKE_AREA) | (ratio < 1.0 / LIKE_AREA))[:, None], off.shape)] = np.inf
+        nearest = np.argmin(off, axis=-1)
+        smallest = np.take_along_axis(off, nearest[..., None], axis=-1)[..., 0]
+        grown = []
+        for k, d in sorted(np.argwhere(smallest < GROWN_OFF).tolist(), key=lambda kd: float(smallest[kd[0], kd[1]])):
+            member, new = int(members[k]), int(nearest[k, d])
+            sign, axis = (1, d) if d < 2 else (-1, d - 2)
+            cell = cell_of[member]
+            cell = (cell[0] + sign, cell[1]) if axis == 0 else (cell[0], cell[1] + sign)
+            if new in cell_of or cell in at:
+                continue
+            cell_of[new], at[cell] = cell, new
+            steps = bases[k].copy()
+            steps[axis] = sign * (blobs.places[new] - blobs.places[member])
+            if np.linalg.det(steps) > 1.0:
+                grown.append((new, steps[0], steps[1]))
+        frontier = grown
+    return np.array(list(cell_of)), np.array(list(cell_of.values()))
+
+
+def _placed(members: np.ndarray, cells: np.ndarray, board: CircleGrid) -> Iterator[np.ndarray]:
+    """Which blobs (rows, columns) may be the board's circles, -1 where one is missing; those that miss least first."""
+    steps = board.steps().astype(int)
+    if board.asymmetric:  # in steps to the lower right and to the lower left
+        steps = np.stack([(steps[..., 0] + steps[..., 1]) // 2, (steps[..., 1] - steps[..., 0]) // 2], axis=-1)
+    low = cells.min(axis=0)
+    extent = cells.max(axis=0) - low + 1
+    pad = np.ptp(steps.reshape(-1, 2), axis=0).max() + 1
+    table = np.full(extent + 2 * pad, -1)
+    table[tuple((cells - low + pad).T)] = members
+    found: list[tuple[int, int, np.ndarray]] = []
+    count = board.columns * board.rows
+    turn = np.array([[0, -1], [1, 0]])
+    for quarters in range(4 // replace(board, larger_dot=False).ways):  # the larger dot is looked for later
+        turned = steps @ np.linalg.matrix_power(turn, quarters).T
+        turned = turned - turned.reshape(-1, 2).min(axis=0)
+        span = turned.reshape(-1, 2).max(axis=0) + 1
+        # Cells may be missing at the border.
+        for x in range(pad - 1, pad + extent[0] - span[0] + 2):
+            for y in range(pad - 1, pad + extent[1] - span[1] + 2):
+                which = table[turned[..., 0] + x, turned[..., 1] + y]
+                there = which >= 0
+                missing = count - int(there.sum())
+                if missing <= MOST_MISSING * count and all((there.mean(axis=axis) > 0.5).all() for axis in (0, 1)):
+                    found.append((missing, len(found), which))
+    for _, _, which in sorted(found, key=lambda one: one[:2]):
+        yield which
+
+
+#: A circle's outline is a polygon of this many points: its centroid is exact for an ellipse.
+OUTLINE = 32
+#: The background is seen beyond this share of the way from a circle's edge to half way to its neighbour's.
+RING = 0.5
+#: The part of a circle's radius inside which its contrast is measured.
+MIDDLE = 0.6
+#: Light changes within a circle by 0.3 % a pixel, and noise is 2 % of it: the squared quotient (pixels squared).
+STEADY = 44.0
+#: Light falls to this share of its value in the middle of a circle at most.
+LEAST_LIT = 0.2
+#: A window with a larger half side than this (pixels) is sampled at every second pixel, or third, and so on.
+LARGEST_WINDOW_PX = 32
+#: Pixels further away than this are nowhere near an image.
+FAR_PX = 1e5
+
+
+@dataclass(frozen=True, eq=False)
+class Circles:
+    """Circles (...) as they are in an image."""
+
+    seen_px: Array  #: (..., 2): centroids of the gray values, pixels
+    centres_px: Array  #: (..., 2): images of the circles' centres, pixels
+    radii: Array  #: (...): in steps of the grid, from the areas
+    contrasts: Array  #: (...): (background - circle) / the lighter of the two; negative if that is the circle
+    #: (...): by how much the light on the background around a circle is off a plane: root mean square, as a share of
+    #: it. Where a shadow's edge crosses a circle, its centroid is off.
+    uneven: Array
+    seen: np.ndarray  #: (...): whether a circle is whole in the image and its numbers are finite
+
+
+def measured_circles(gray: Gray, plane: BoardPlane, steps: Array, about_px: Array, radii: Array) -> Circles:
+    """Measure circles at places (..., 2) of the grid, near pixels about_px (..., 2), with about these radii (...).
+
+    Around each, a plane is fitted to the gray values between it and its neighbours: light that changes across a circle
+    would move its centroid.
+    """
+    shape = np.shape(radii)
+    steps, about, r = steps.reshape(-1, 2), about_px.reshape(-1, 2), np.clip(radii.ravel(), 0.02, 0.9)
+    edge = r + 0.5 * _gaps(steps, r)
+    J = plane.jacobians(steps)
+    with np.errstate(invalid="ignore"):
+        usable = np.asarray((np.abs(about) < FAR_PX).all(axis=1) & (np.abs(J) < FAR_PX).all(axis=(1, 2)))
+        usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], J, np.eye(2)))) > 1e-9
+    J, about = np.where(usable[:, None, None], J, np.eye(2)), np.where(usable[:, None], about, 0.0)
+    reach = edge * np.linalg.norm(J, ord=2, axis=(1, 2))
+    moved, whole = np.zeros((len(r), 2)), np.zeros(len(r), bool)
+    total, contrast, uneven = np.zeros((3, len(r)))
+    small = reach <= 1.3 * np.median(reach)
+    for group in (small, ~small):  # the larger dot's window is not everyone's
+        if group.any():
+            seen_here = _shaded(gray, about[group], J[group], r[group], edge[group], float(reach[group].max()))
+            moved[group], total[group], contrast[group], uneven[group], whole[group] = seen_here
+    area, astray = _outlines(plane, steps, r)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = r * np.sqrt(np.maximum(total / contrast, 0.0) / area)
+        # A centroid outside its circle is not one: the shade around it has both signs.
+        seen = whole & usable & (np.linalg.norm(moved, axis=1) < reach) & np.isfinite(found) & np.isfinite(astray[:, 0])
+    centroid = about + moved
+    return Circles(
+        centroid.reshape(*shape, 2), (centroid - astray).reshape(*shape, 2), found.reshape(shape),
+        contrast.reshape(shape), uneven.reshape(shape), seen.reshape(shape),
+    )  # fmt: skip
+
+
+def _shaded(
+    gray: Gray, about: Array, J: Array, r: Array, edge: Array, reach_px: float
+) -> tuple[Array, Array, Array, Array, np.ndarray]:
+    """Centroids (n, 2) from `about`, sums (n,) of shade, contrasts (n,), and whether circles are whole in the image.
+
+    A pixel's shade is (background - gray) / light. How the light falls is seen on the lighter of circle and background:
+    a dark background's values, by which noise would be divided, say little.
+    """
+    stride = int(np.ceil((reach_px + 1.0) / LARGEST_WINDOW_PX))
+    half = int(np.ceil((reach_px + 1.0) / stride))
+    offset = stride * np.stack(np.meshgrid(*2 * [np.arange(-half, half + 1)]), axis=-1).reshape(-1, 2)
+    at = np.rint(about).astype(int)[:, None] + offset
+    limit = np.array(gray.shape[::-1]) - 1
+    inside = ((at >= 0) & (at <= limit)).all(axis=-1)
+    column, row = np.moveaxis(np.clip(at, 0, limit), -1, 0)
+    values = gray[row, column].astype(float)
+    there = at - about[:, None]
+    away = np.linalg.norm(there @ np.linalg.inv(J).swapaxes(1, 2), axis=-1)  # in steps of the grid
+    near = (away <= edge[:, None]) & inside
+    ring = near & (away >= (r + RING * (edge - r))[:, None])
+    whole = (inside | (away > r[:, None])).all(axis=1) & (ring.sum(axis=1) >= 6)
+    core = (away <= MIDDLE * r[:, None]) & inside
+    basis = np.concatenate([np.ones((*there.shape[:2], 1)), there], axis=2)
+    of_ground, of_circle = _light(values, basis, ring, 1e-9), _light(values, basis, core, STEADY)
+    ground = (basis @ of_ground[..., None])[..., 0]
+    lighter = np.where(of_circle[:, :1] > of_ground[:, :1], of_circle, of_ground)
+    lit = np.maximum((basis @ lighter[..., None])[..., 0], np.maximum(LEAST_LIT * lighter[:, :1], 1.0))
+    shade = np.where(near, (ground - values) / lit, 0.0)
+    contrast = (shade * core).sum(axis=1) / np.maximum(core.sum(axis=1), 1)
+    total = shade.sum(axis=1)
+    squared = (((ground - values) / lit) ** 2 * ring).sum(axis=1)
+    uneven = np.sqrt(squared / np.maximum(ring.sum(axis=1), 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = np.nan_to_num((shade[..., None] * there).sum(axis=1) / total[:, None], nan=np.inf)
+    return moved, stride**2 * total, contrast, uneven, whole
+
+
+def _light(values: Array, basis: Array, where: np.ndarray, steady: float) -> Array:
+    """The planes (n, 3) that fit gray values (n, p) best in some of the pixels; basis (n, p, 3) has 1, du, dv."""
+    weighed = (basis * where[..., None]).swapaxes(1, 2)
+    normal = weighed @ basis + np.diag([1e-9, steady, steady])
+    planes: Array = np.linalg.solve(normal, weighed @ values[..., None])[..., 0]
+    return planes
+
+
+def _gaps(steps: Array, radii: Array) -> Array:
+    """From each circle's edge to the nearest one's (n,), in steps; at least a twentieth.
+
+    At most as far as in a symmetric grid: half a step from the outer circles' centres a board may end.
+    """
+    apart = np.linalg.norm(steps[:, None] - steps, axis=-1) - radii[:, None] - radii
+    np.fill_diagonal(apart, np.inf)
+    return np.asarray(np.clip(apart.min(axis=1), 0.05, np.maximum(1.0 - 2.0 * radii, 0.2)))
+
+
+def _outlines(plane: BoardPlane, steps: Array, radii: Array) -> tuple[Array, Array]:
+    """Areas (n,) of the circles' images, px^2, and how far (n, 2) their centroids are off the projected centres."""
+    angle = 2.0 * np.pi * np.arange(OUTLINE) / OUTLINE
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    centre = plane.pixels(steps)
+    here = plane.pixels(steps[:, None] + radii[:, None, None] * unit) - centre[:, None]
+    there = np.roll(here, -1, axis=1)
+    cross = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
+    signed = 0.5 * cross.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        astray: Array = ((here + there) * cross[..., None]).sum(axis=1) / (6.0 * signed[:, None])
+    # A polygon of n corners inscribed in an ellipse has this share of its area.
+    share = np.sin(2.0 * np.pi / OUTLINE) * OUTLINE / (2.0 * np.pi)
+    return np.abs(signed) / share, astray
+
 
 #: At most this number of grids in an image are tested.
 MOST_TESTED = 12

@@ -1,4 +1,9 @@
-"""How sharp and how bright an image is, and the same image made brighter, smaller or larger, with its camera."""
+"""What an image says about a target that was not read in it: another target, or an image that is not good enough.
+
+Each clue was seen: another size or family is a clue where the target so changed is read in the image, too much blur
+where the target is read in a smaller image, too little light where it is read in a brightened one. What cannot be tried
+is no clue.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Sightings of targets with tags: corners of single tags and of boards, before their poses.
+"""Detection of targets in images: corners, poses, and the reason why a detection is not used.
 
-Tags of boards count only where their board has them (`board_tags`). Corners of single tags, of grids of tags and of
-bundles come from the tags' edges, many tags of many images at once; those of ChArUco boards and AprilGrids are points
-where two dark squares meet.
+Tags of boards count only where their board has them (`board_layout`). Corners of single tags, grids of tags and bundles
+come from the tags' edges, many tags of many images at once; those of ChArUco boards and AprilGrids are points where two
+dark squares meet.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Text in pictures, in any script of DejaVu Sans, which comes with matplotlib: OpenCV's own letters are ASCII only."""
+"""Pictures for people: detections drawn in their images, errors of corners, text, JPEG files of a limited size.
+
+Used and rejected detections differ in colour (for colour-blind people too) and in form: what is used has upright
+crosses and solid lines, what is rejected has oblique crosses and dashed lines.
+"""
 
 from __future__ import annotations
 

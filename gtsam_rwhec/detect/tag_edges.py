@@ -1,4 +1,12 @@
-"""Geometry of tags' sides: gray values between pixels, lines through points, homographies from the unit square."""
+"""Corners of tags from their edges.
+
+Blur rounds the right angle in a corner detector's window: all four corners move inwards by tenths of a pixel, and the
+tag looks smaller and further away. A straight edge stays where it is under any symmetric blur. Therefore each side is
+found in profiles across it, a line is fitted to each side in undistorted coordinates, and the lines meet in the
+corners. The area under each profile gives a first place of the edge; then a model of the edge's neighbours, which blur
+into it, gives the place (`fit_profiles`): the code's cell, one module of black border, one module of paper, and what is
+beyond. Last, the border's inner edges tell by how much all edges moved towards black or white, by gamma or by ink.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Shah 2013 and Wang 2022: a linear system for all rotations, then a linear system for all translations.
-
-Methods that descend start from this answer, unless the user gives a start.
-"""
+"""Closed forms: Shah 2013 and Wang 2022, Zhuang 1994, Dornaika 1998, Li 2010; and the start of those that descend."""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""The answers of all methods that can solve a problem: cost, residuals, time, and distance from the lower bound."""
+"""The answers of all methods that can solve a problem: cost, residuals, time, and distance from the lower bound.
+
+Methods for one pair are chained on a problem of many, as people do by hand: each pair of the best tree is solved alone.
+The tree has the pairs with the most measurements (a maximum spanning tree, by Prim's algorithm), without those whose
+own measurements do not determine their frames. A frame takes the pose that it has in the answer of the pair by which
+the tree reaches it. What the other pairs measured counts nowhere: the joint answer's gain is the point of comparing.
+"""
 
 from __future__ import annotations
 

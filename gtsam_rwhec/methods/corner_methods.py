@@ -1,4 +1,4 @@
-"""What methods on corners share: observations as stacks, the plain reprojection cost, where a descent ended."""
+"""Methods on corners: Evangelista et al. 2023 and Tabb and Ahmad Yousef's rp1 (2017); intrinsics are held."""
 
 from __future__ import annotations
 
@@ -111,7 +111,13 @@ class Bordered(Linearised):
 def evangelista_minimum(
     corners: Corners, start: Array, max_iterations: int, carrier: tuple[float, float] | None = None
 ) -> Minimum:
-    """A local minimum of half the cost, from frames (n, 4, 4).
+    """A local minimum of half of Evangelista's cost, from frames (n, 4, 4).
+
+    The graph extends that of Koide and Menegatti (RA-L 2019). Its vertices are all X and Y, and the target's pose B_i
+    in the camera of each image; t is a pose's translation, q its quaternion's vector part::
+
+        sum_corners |u(B_i p) - u|^2 / corner_px^2  +  sum_images |t(D_i) / s_t|^2 + |2 q(D_i) / s_r|^2,
+        D_i = A_i^-1 Y B_i X^-1
 
     `carrier` has the deviations (rad, m) of the robot's poses; None: `IDENTITY` for each pixel of a corner's deviation.
     """
@@ -207,7 +213,11 @@ def weights_of(corners: Corners) -> dict[str, float]:
 def rp1_minimum(
     corners: Corners, start: Array, max_iterations: int, parameterisation: Parameterisation = "axis-angle"
 ) -> Minimum:
-    """A local minimum of half of rp1 over corner_px^2, from frames (n, 4, 4); OptionError for an unknown chart."""
+    """A local minimum of half of rp1 over corner_px^2, from frames (n, 4, 4); OptionError for an unknown chart.
+
+    rp1 = sum_c w_c sum_images sum_corners |u(Y_c^-1 A X p) - u|^2, with w_c = fewest images of a camera / camera c's,
+    as in the authors' released code: a camera with many images does not outvote one with few.
+    """
     if parameterisation not in CHARTS:
         raise OptionError(f"tabb2017_rp1: {parameterisation!r} is not one of {', '.join(map(repr, CHARTS))}")
     to_parameters, _ = CHARTS[parameterisation]

@@ -1,4 +1,4 @@
-"""The DQ paper's analytic approximations: rotation first, the relaxation, expansions about it (Section 3.2, App. A).
+"""The DQ paper's approximations (Section 3.2, Appendix A), and its optimum from an algebraic curve (Appendix B).
 
 Each method finds q. Then q' is the best for that q (eq. 20, ``best_dual``).
 """

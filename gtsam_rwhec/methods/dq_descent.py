@@ -1,9 +1,9 @@
-"""Nonlinear least squares: DQNLOpt and DQNLOptRnd on the cost (8), ChVecOpt and QuatVecOpt on the costs (30).
+"""Dan (Daniilidis 1999), and nonlinear least squares: DQNLOpt and DQNLOptRnd on the cost (8), ChVecOpt and QuatVecOpt
+on the costs (30).
 
-Each cost is a quadratic form y'F y, where the few numbers y are computed from the pose. F does not grow with the number
-of motions. With F = L'L, the residual L y has 8 to 22 rows. Its cost, gradient and Gauss-Newton Hessian are those of
-the residuals of all motions together. The unknowns are a quaternion p of any length (q = p / |p|) and a translation in
-units of 1/alpha, so every start can reach every rotation.
+Each cost is a quadratic form y'F y, where the few numbers y are computed from the pose. With F = L'L, the residual L y
+has 8 to 22 rows, whatever the number of motions. The unknowns are a quaternion p of any length (q = p / |p|) and a
+translation in units of 1/alpha, so every start can reach every rotation.
 """
 
 from __future__ import annotations
@@ -226,6 +226,9 @@ _PRODUCTS = np.einsum("kji,ljm->klim", E[:6, :3], E[:6, :3]).reshape(36, 16)
 
 def daniilidis(request: Request) -> Outcome[Array]:
     """Dan, with translations multiplied by alpha as in Section 4.3.
+
+    Each motion gives six rows [[P, 0], [P', P]] in (q, q'), P = [Skew(v_C + v_H), v_C - v_H] (3 x 4, scalar last) and
+    P' the same of the dual parts: eq. 7 without the scalar parts. Nothing is minimised.
 
     Raises UnderdeterminedError when all axes are parallel, or no motion rotates: the null space then has more than two
     dimensions.

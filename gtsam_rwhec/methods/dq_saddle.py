@@ -1,8 +1,8 @@
-"""The minimum of the DQ paper's cost as the saddle of its two multipliers (Sections 3.1.2 and 3.2.1).
+"""The minimum of the DQ paper's cost as the saddle of its two multipliers (Sections 3.1.2 and 3.2.1), and lower bounds.
 
 lambda_0(mu), the smallest eigenvalue of Z(mu) (eq. 12), is concave. It is the Lagrangian's minimum, so for *every* mu
 no pose costs less. At its maximum q . q' = 0, and a pose has this cost. Newton's method starts at mu = 0, and its first
-step is eq. 34. One eigendecomposition gives the derivatives of lambda_0.
+step is eq. 34.
 """
 
 from __future__ import annotations

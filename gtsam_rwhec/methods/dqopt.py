@@ -1,8 +1,8 @@
-"""The prior's linear form, a |1 - dq|^2 (DQ paper, eq. 25): the 4 x 4 eigenproblem becomes one of 8 x 8.
+"""DQOpt (Section 3.2.1, Algorithm 1): the exact minimum of the DQ paper's cost, with its proof; and alpha.
 
-With |q| = |dq| = 1 the term is 2 a - 2 a q_0 . q. For a given mu, q minimises q'Z(mu) q - 2 a q_0 . q on the sphere:
-(Z(mu) - lambda) q = a q_0, and lambda is the smallest real eigenvalue of [[Z, -1], [-a^2 q_0 q_0', Z]] (Gander,
-Golub and von Matt 1989, eq. 9). Like lambda_0(mu), that minimum is concave in mu and never above the cost.
+With a prior's linear form a |1 - dq|^2 (eq. 25) the term is 2 a - 2 a q_0 . q, and the 4 x 4 eigenproblem becomes
+one of 8 x 8: lambda is the smallest real eigenvalue of [[Z, -1], [-a^2 q_0 q_0', Z]] (Gander, Golub and von Matt
+1989, eq. 9).
 """
 
 from __future__ import annotations

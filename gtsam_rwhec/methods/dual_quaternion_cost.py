@@ -1,7 +1,8 @@
-"""Unit dual quaternions q + epsilon q' of poses, in the DQ paper's order (vector, scalar) = xyzw (Section 2).
+"""The DQ paper's cost (eq. 8) as three 4 x 4 matrices, from one pass over the motions that serves every alpha.
 
-A pose T = (R, t) has q, the quaternion of R, and q' = (t, 0) (x) q / 2 (eq. 2). So |q| = 1 and q . q' = 0, and
--(q, q') is the same pose.
+Poses are unit dual quaternions q + epsilon q' in the paper's order xyzw (Section 2): q' = (t, 0) (x) q / 2 (eq. 2).
+A_i = L(q_C) - R(q_H) is linear in seven numbers of a motion, and B_i in seven numbers of the motion's dual parts
+(``Motions.rows``). So the sums of A'A, B'B and B'A are linear in one 14 x 14 matrix of moments.
 """
 
 from __future__ import annotations

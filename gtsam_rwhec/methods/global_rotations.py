@@ -1,8 +1,9 @@
-"""A X = Y B with all weights 1 as the certified solver's quadratic form, for methods whose cost has no noise model.
+"""Global minima by semidefinite relaxations over rotations: Wise 2020 and Heller 2014, with all weights 1.
 
 A radian weighs as much as a metre (times the square root of two, by the Frobenius norm). Translations and a shared
 scale are eliminated exactly: x'Q'x over x = [vec R_1, ..., vec R_n, 1] is the smallest cost for given rotations (RWHEC
-paper, eq. 48), its 1/2 included.
+paper, eq. 48), its 1/2 included. Wise's relaxation has 21 quadratic constraints a rotation. Heller's first relaxation
+over quaternions, in which the cost has degree four, is Lasserre's of order two (`solve_moments`).
 """
 
 from __future__ import annotations
@@ -184,7 +185,16 @@ def _moment_places(frames: int) -> _MomentPlaces:
 
 
 def solve_moments(Q: Array) -> MomentSolution:
-    """Solve the relaxation of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19)."""
+    """Lasserre's relaxation of order two of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19).
+
+    vec R is linear in the ten products q_a q_b. With y = [1, products of q_1, products of q_2] the cost is y'Cy, and
+    the unknowns are moments, the integrals of the monomials by a measure on pairs of unit quaternions:
+
+        minimise <C, M(y y')>   subject to   M(y y') >= 0,   M(z z') >= 0 for z = q_1 (x) q_2,
+                                             moments of m |q_k|^2 = those of m,   moment of 1 = 1
+
+    The flips q_k -> -q_k change nothing, so moments of odd degree vanish, and these blocks are all.
+    """
     frames = (len(Q) - 1) // 9
     moments = _moment_places(frames)
     to_x = np.roll(block_diag(*[products_to_rotation()] * frames, np.eye(1)), 1, axis=1)  # y has its 1 first

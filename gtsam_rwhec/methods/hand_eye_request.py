@@ -1,4 +1,4 @@
-"""The prior of the DQ paper's cost (Section 3.3): a pose known beforehand, with weights."""
+"""What every AX = XB method gets, the prior of the DQ paper's cost (Section 3.3), and what the motions leave free."""
 
 from __future__ import annotations
 

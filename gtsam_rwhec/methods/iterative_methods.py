@@ -1,11 +1,6 @@
-"""LOM, the RWHEC paper's local on-manifold method (Appendix C): the baseline that needs a good start.
+"""Methods that descend from a start: LOM (RWHEC paper, Appendix C), Strobl 2006, Tabb 2017, Dornaika 1998.
 
-Its residual is not the refinement's: it has rotation and translation as separate terms (eq. 76),
-
-    e_R = log(R_X' R_A' R_Y R_B),    e_t = R_A t_X + alpha t_A - R_Y t_B - t_Y,
-
-and so are its variables, with t_X and t_Y in the measured unit (alpha times metres). Its weights are the paper's:
-sigma_R = 1/sqrt(kappa), where this library's noise model has 1/sqrt(2 kappa).
+LOM is the baseline that needs a good start: rotation and translation are separate terms (eq. 76).
 """
 
 from __future__ import annotations
@@ -267,7 +262,7 @@ class Weighed:
 
 
 def strobl2006(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """Solve for one X and one Y; weights and poses are estimated in turn until the weights rest."""
+    """One X and one Y, with errors of unknown sigma_R (rad an axis) and sigma_t (m an axis), estimated in turn."""
     target, sensor = problem.targets[0], problem.sensors[0]
     of_X, of_Y, _, starts_from = start_of(problem, options)
     X, Y = one_transform(of_X[target], f"start of {target}"), one_transform(of_Y[sensor], f"start of {sensor}")
@@ -336,7 +331,11 @@ def tabb2017(
     mode: Mode = "simultaneous",
     parameterisation: Parameterisation = "axis-angle",
 ) -> Outcome[Poses]:
-    """Solve by a variant of the method, from a start, by Levenberg-Marquardt; OptionError for an unknown variant."""
+    """Minimise c1 = sum |A_i X - Y B_i|_F^2 or c2 = sum |A_i - Y B_i X^-1|_F^2, from a start, by Levenberg-Marquardt.
+
+    c2 is c1 of the inverted equation, since a left multiplication by a pose changes no Frobenius norm. "separable"
+    minimises the rotation part first, then finds the translations. OptionError for an unknown variant.
+    """
     for value, known in ((cost, ("c1", "c2")), (mode, ("simultaneous", "separable")), (parameterisation, CHARTS)):
         if value not in known:
             raise OptionError(f"tabb2017: {value!r} is not one of {', '.join(map(repr, known))}")

@@ -1,4 +1,8 @@
-"""The solution of normal equations whose unknowns have different units."""
+"""Measurements of all pairs in one stack, and the linear systems of A X = Y B that the closed forms share.
+
+The rotations come first (eq. 8a): R_A R_X = R_Y R_B is linear in the matrices' entries. The translations follow
+(eq. 8b) for known rotations: R_A t_X - t_Y + alpha t_A = R_Y t_B. Neither has weights, as in the authors' papers.
+"""
 
 from __future__ import annotations
 

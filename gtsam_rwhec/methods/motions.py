@@ -1,4 +1,9 @@
-"""Checks of the weights of motions: alpha, one weight for each motion, or covariances of the residuals."""
+"""The motions of AX = XB, C_i X = X H_i: checked, with signs of quaternions that agree, and their weights.
+
+The DQ paper's cost depends on the signs of q_C and q_H, and the paper does not say how to choose them. L(q_C) - R(q_H)
+is small for one relative sign only: both quaternions get a scalar part that is not negative. Near half a turn it is
+noise about 0; there the motion takes the sign that agrees with the rotation from the other motions.
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,9 @@
-"""The poses of a hand-eye problem, station by station, and the motions between all pairs of stations.
+"""OpenCV's hand-eye methods over all pairs of stations, in linear time, and its two for A X = Z B.
 
 The motion from station i to a later station j is A = G_j^-1 G_i and B = C_j C_i^-1 with A X = X B. G is the gripper's
-pose in the base, C the target's pose in the camera, X the camera's pose in the gripper. OpenCV uses this direction and
-all pairs i < j: answers on noisy poses show it.
-
-Terms that are bilinear in the two stations (translations, products of rotations) are summed in linear time: the sum
-over i < j of f_i g_j needs g_j and the running sum of f. Other terms (signs of quaternions, logarithms, thresholds) are
-computed for blocks of pairs, one matrix product for each block, so memory is linear too.
+pose in the base, C the target's pose in the camera, X the camera's pose in the gripper. Terms that are bilinear in the
+two stations are summed in linear time: the sum over i < j of f_i g_j needs g_j and the running sum of f. Other terms
+(signs of quaternions, logarithms, thresholds) are computed for blocks of pairs.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from gtsam_rwhec.detect.saddle_fits import fitted_corners
+from gtsam_rwhec.detect.checkerboards import fitted_corners
 
 ROWS, COLUMNS, STEP_PX = 3, 4, 24.0
 #: Pixels of squares, of a board that is turned and sheared.

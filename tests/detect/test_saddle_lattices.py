@@ -7,8 +7,7 @@ import pytest
 from rendered import PINHOLE, pose, printed, projected, render
 
 from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.detect.saddle_lattices import boards_in, lattices
-from gtsam_rwhec.detect.saddles import Saddles, saddles
+from gtsam_rwhec.detect.saddle_lattices import Saddles, boards_in, lattices, saddles
 
 CHESS = Checkerboard("chess", 5, 4, 0.03)
 

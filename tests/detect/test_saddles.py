@@ -7,7 +7,7 @@ import pytest
 from rendered import PINHOLE, pose, printed, projected, render
 
 from gtsam_rwhec.cameras.targets import Checkerboard, Tag
-from gtsam_rwhec.detect.saddles import groups_of, saddles, scaled_down
+from gtsam_rwhec.detect.saddle_lattices import groups_of, saddles, scaled_down
 
 CHESS = Checkerboard("chess", 5, 4, 0.03)
 
