@@ -145,7 +145,7 @@ def expansion(relaxed: RelaxedCost, order: int) -> tuple[list[float], list[Array
     """lambda_k and c_k (4,) of lambda(mu) = sum lambda_k mu^k, q(mu) = sum mu^k sum_a c_ka q_a (eqs. 31 to 33).
 
     Eq. 33 as printed does not solve eq. 12: the middle line's second term must be Z2 q_{k-2}, as in the third line, in
-    place of Z2 q_{k-1} (checked against Z(mu)'s own eigenvalues: tests/methods/test_approximate.py).
+    place of Z2 q_{k-1} (checked against Z(mu)'s own eigenvalues: tests/methods/test_dq_approximations.py).
     """
     gaps = relaxed.values[0] - relaxed.values[1:]  # lambda_0a
     lambdas = [float(relaxed.values[0])]
@@ -178,7 +178,7 @@ def lambda_expansion(relaxed: RelaxedCost) -> Array | None:
     order. As printed, eq. 35 has the wrong sign of mu_1^2 Z2, in mu_2 and in q_2 (Z2 enters eq. 12 with a minus).
     Eq. 36 has the wrong sign of the Z2 terms of q.(mu Z2 - Z1/2).q = 0. Delta lambda's formula divides by 2 in place of
     2 c_2. With the signs below the residual of eq. 12 is of third order; as printed, of second
-    (tests/methods/test_approximate.py).
+    (tests/methods/test_dq_approximations.py).
     """
     Z1, Z2 = relaxed.Z1, relaxed.Z2
     gaps = relaxed.values[0] - relaxed.values[1:]

@@ -11,7 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from intrinsics_samples import CAMCHAIN, ROS
 
-from gtsam_rwhec.cameras.intrinsics_files import read_calibration_yaml, read_cameras, read_kalibr_camchain
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.intrinsics_files import (
+    is_colmap,
+    read_calibration_yaml,
+    read_cameras,
+    read_colmap_cameras,
+    read_kalibr_camchain,
+)
 from gtsam_rwhec.errors import CameraError, FileFormatError, RwhecError
 
 
@@ -306,3 +313,114 @@ def test_names_of_other_programs(path: Path) -> None:
                  "width: 640\nheight: 480\nfx: 500\nfy: 501\nppx: 320\nppy: 240\n"):  # fmt: skip
         path.write_text(text)
         assert read_cameras(path)[""].K.tolist() == [[500.0, 0.0, 320.0], [0.0, 501.0, 240.0], [0.0, 0.0, 1.0]]
+
+
+OMNI = CAMCHAIN.replace("pinhole", "omni", 1).replace("[458.6,", "[1.3, 458.6,")
+K = [[458.6, 0.0, 367.2], [0.0, 457.3, 248.4], [0.0, 0.0, 1.0]]
+D = [-0.28, 0.07, 0.0002, 1.8e-05]
+
+
+def assert_is_sample(camera: Camera) -> None:
+    assert (camera.model, camera.width, camera.height) == ("unified", 752, 480)
+    assert camera.K.tolist() == K
+    assert camera.D.tolist() == [1.3, *D]
+
+
+def test_kalibrs_omni_has_xi_first(path: Path) -> None:
+    path.write_text(OMNI)
+    assert_is_sample(read_kalibr_camchain(path)["cam0"])
+    path.write_text(OMNI.replace("radtan", "none").replace("  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.8e-05]\n", ""))
+    assert read_kalibr_camchain(path)["cam0"].D.tolist() == [1.3, 0.0, 0.0, 0.0, 0.0]
+    path.write_text(OMNI.replace("radtan", "equidistant"))
+    with pytest.raises(FileFormatError, match="'equidistant' is not supported; supported are none, radtan"):
+        read_kalibr_camchain(path)
+
+
+@pytest.mark.parametrize("suffix", ["xml", "yml"])
+@pytest.mark.parametrize("is_matrix", [True, False])
+def test_opencvs_omnidir_has_xi_beside_the_matrix(tmp_path: Path, suffix: str, is_matrix: bool) -> None:
+    path = tmp_path / f"omni.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array(K))
+    storage.write("distortion_coefficients", np.array([D]))
+    storage.write("xi", np.array([[1.3]]) if is_matrix else 1.3)
+    storage.release()
+    assert_is_sample(read_cameras(path, (752, 480))[""])
+
+
+def test_ros_and_plain_numbers(path: Path) -> None:
+    text = ROS.replace("plumb_bob", "unified").replace("640", "752")
+    path.write_text(text.replace("[-0.34, 0.18, 1e-3, -2.e-4, 0]", "[1.3, -0.34, 0.18, 1e-3, -2e-4]"))
+    assert read_calibration_yaml(path).D.tolist() == [1.3, -0.34, 0.18, 1e-3, -2e-4]
+    plain = "width: 752\nheight: 480\nfx: 458.6\nfy: 457.3\ncx: 367.2\ncy: 248.4\nxi: 1.3\n"
+    path.write_text(plain + "k1: -0.28\nk2: 0.07\np1: 0.0002\np2: 1.8e-05\n")
+    assert_is_sample(read_calibration_yaml(path))
+    path.write_text(plain + "k3: 0.1\n")
+    with pytest.raises(CameraError, match="too many for the model unified"):
+        read_calibration_yaml(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("xi: wide", r"xi\[0\]: 'wide'; a finite number was expected"),
+        ("xi: [1, 2]", r"xi: \[1, 2\]; a list of 1 numbers was expected"),
+        ("xi: 1.0\ndistortion_model: fisheye", "distortion_model: 'fisheye', and xi, which only the unified model has"),
+    ],
+)
+def test_faults_have_their_line(path: Path, line: str, words: str) -> None:
+    path.write_text(ROS.replace("distortion_model: plumb_bob\n", "") + f"{line}\n")
+    with pytest.raises(FileFormatError, match=rf"line \d+: {words}"):
+        read_calibration_yaml(path)
+
+
+HEAD = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+LINES = {
+    "SIMPLE_PINHOLE 640 480 500 320 240": ("pinhole", 500.0, []),
+    "PINHOLE 640 480 500 501 320 240": ("pinhole", 501.0, []),
+    "SIMPLE_RADIAL 640 480 500 320 240 0.1": ("radtan", 500.0, [0.1, 0.0, 0.0, 0.0]),
+    "RADIAL 640 480 500 320 240 0.1 0.02": ("radtan", 500.0, [0.1, 0.02, 0.0, 0.0]),
+    "OPENCV 640 480 500 501 320 240 0.1 0.02 3e-3 4e-3": ("radtan", 501.0, [0.1, 0.02, 3e-3, 4e-3]),
+    "FULL_OPENCV 640 480 500 501 320 240 .1 .02 .003 .004 .05 .06 .07 .08": (
+        "radtan", 501.0, [0.1, 0.02, 0.003, 0.004, 0.05, 0.06, 0.07, 0.08],
+    ),
+    "OPENCV_FISHEYE 640 480 500 501 320 240 0.1 0.02 0.3 0.4": ("equidistant", 501.0, [0.1, 0.02, 0.3, 0.4]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("line", sorted(LINES))
+def test_each_model(tmp_path: Path, line: str) -> None:
+    text = f"{HEAD}7 {line}\n"
+    (tmp_path / "cameras.txt").write_text(text)
+    assert is_colmap(text)
+    (camera,) = read_colmap_cameras(tmp_path / "cameras.txt").values()
+    model, fy, D = LINES[line]
+    assert (camera.width, camera.height, camera.model) == (640, 480, model)
+    # The middle of COLMAP's first pixel is at 0.5, and here at 0.
+    assert camera.K.tolist() == [[500.0, 0.0, 319.5], [0.0, fy, 239.5], [0.0, 0.0, 1.0]]
+    assert camera.D.tolist() == D
+
+
+def test_cameras_have_colmaps_numbers(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(f"{HEAD}2 PINHOLE 64 48 50 50 32 24\n1 PINHOLE 64 48 60 60 32 24\n")
+    assert [c.K[0, 0] for c in read_colmap_cameras(tmp_path / "cameras.txt").values()] == [50.0, 60.0]
+    assert list(read_colmap_cameras(tmp_path / "cameras.txt")) == ["2", "1"]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("1 FOV 64 48 50 50 32 24 0.9", "line 3: the model 'FOV' is not supported; supported are SIMPLE_PINHOLE, "),
+        ("1 OPENCV 64 48 50 50 32 24", "line 3: OPENCV has the parameters fx fy cx cy k1 k2 p1 p2, and here are 4"),
+        ("1 PINHOLE 64 48 50 50 32 x", "line 3: a parameter is no number"),
+        ("1 PINHOLE 64 48 50 50 32 inf", "line 3: PINHOLE has the parameters"),
+        ("1 PINHOLE wide 48 50 50 32 24", "line 3: '1 PINHOLE wide 48 50 50 32 24' is no camera of COLMAP"),
+        ("1 PINHOLE 64 48 50 50 32 24\n1 PINHOLE 64 48 50 50 32 24", "line 4: camera 1 is there twice"),
+        ("", "has no cameras"),
+    ],
+)  # fmt: skip
+def test_what_is_no_camera(tmp_path: Path, line: str, words: str) -> None:
+    (tmp_path / "cameras.txt").write_text(f"{HEAD}{line}\n")
+    with pytest.raises(FileFormatError) as caught:
+        read_colmap_cameras(tmp_path / "cameras.txt")
+    assert words in str(caught.value)

@@ -1,4 +1,4 @@
-"""Tabb and Ahmad Yousef's rp1: derivatives by all parameters, one minimum for all of them, the cameras' weights."""
+"""Evangelista's graph of poses: its derivatives, exact data, what the robot's deviations are for."""
 
 from __future__ import annotations
 
@@ -8,15 +8,100 @@ from typing import get_args
 import numpy as np
 import pytest
 from corner_problems import seen
+from method_problems import four_targets, one_pair
 from rwhec_factors import se3
 
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods import MethodOptions, corner_methods
+from gtsam_rwhec.methods import MethodOptions, corner_methods, run
 from gtsam_rwhec.methods import reprojection as methods
 from gtsam_rwhec.methods.corner_methods import Corners
 from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
+from gtsam_rwhec.simulate.simulation import frame_distance
+
+
+def with_noisy_robot(observations: Observations, generator: np.random.Generator, deviations: Array) -> Observations:
+    views = {
+        pair: (view.A @ se3.expmap(generator.standard_normal((len(view.A), 6)) * deviations), view.pixels)
+        for pair, view in observations.views.items()
+    }
+    return Observations.of(observations.cameras, observations.corners, views, observations.corner_px)
+
+
+def test_the_gradient_is_the_derivative_and_the_step_is_newtons() -> None:
+    observations, X, Y = seen(0.3, 0, images=3)
+    corners, generator = Corners.of(observations), np.random.default_rng(1)
+    frames = np.array([*X.values(), *Y.values()]) @ se3.expmap(1e-2 * generator.standard_normal((4, 6)))
+    pairs = [(stack, *corners.frames_of(stack)) for stack in corners.stacks]
+    B = np.concatenate([se3.inverse(frames[j]) @ corners.A[stack.instant] @ frames[i] for stack, i, j in pairs])
+    graph = corner_methods.Graph(frames, B @ se3.expmap(1e-3 * generator.standard_normal((len(B), 6))))
+    deviations = (1e-3, 5e-4)
+
+    def cost(step: Array) -> float:
+        moves = se3.expmap(step.reshape(-1, 6))
+        there = corner_methods.Graph(graph.frames @ moves[:4], graph.B @ moves[4:])
+        return corner_methods.graph_model(corners, there, deviations).cost
+
+    here = corner_methods.graph_model(corners, graph, deviations)
+    assert isinstance(here, corner_methods.Bordered)
+    gradient = np.concatenate([here.g, here.g_B.ravel()])
+    for k in (*range(24), 24, 31, 50):
+        step = np.zeros(len(gradient))
+        step[k] = 1e-6
+        numeric = (cost(step) - cost(-step)) / 2e-6
+        assert gradient[k] == pytest.approx(numeric, rel=1e-5, abs=1e-4 * np.abs(gradient).max())
+    H = np.zeros((len(gradient), len(gradient)))
+    H[:24, :24] = here.H
+    for v, (block, border) in enumerate(zip(here.by_B, here.C, strict=True)):
+        at = slice(24 + 6 * v, 30 + 6 * v)
+        H[at, at], H[at, :24], H[:24, at] = block, border, border.T
+    damped = H + 0.1 * np.diag(np.diagonal(H))
+    np.testing.assert_allclose(damped @ here.step(0.1), -gradient, rtol=1e-6, atol=1e-8 * np.abs(gradient).max())
+
+
+def test_exact_corners_give_the_truth() -> None:
+    observations, X, Y = seen(0.0, 3)
+    answer = methods.run("evangelista2023", observations)
+    assert answer.converged
+    assert answer.rms_px < 1e-5
+    for found, truth in ((answer.X, X), (answer.Y, Y)):
+        for name, T in truth.items():
+            np.testing.assert_allclose(found[name].matrix(), T, atol=1e-6)
+    assert "images' poses" in answer.starts_from
+
+
+def test_deviations_that_the_robot_has_are_better_than_the_identity() -> None:
+    deviations = np.repeat([1e-3, 5e-4], 3)
+    stated, identity = [], []
+    for seed in range(3):
+        observations, _, Y = seen(0.5, 20 + seed, images=8)
+        noisy = with_noisy_robot(observations, np.random.default_rng(seed), deviations)
+        for carrier, errors in ((CarrierNoise(rotation_rad=1e-3, translation_m=5e-4), stated), (None, identity)):
+            answer = methods.run("evangelista2023", noisy, carrier=carrier)
+            errors.append(frame_distance(answer.Y["left"].matrix(), Y["left"]).translation_m)
+    assert np.mean(stated) < np.mean(identity)
+
+
+def test_a_noise_that_the_graph_does_not_have_is_refused_in_words() -> None:
+    observations, X, Y = seen(0.0, 6, images=5)
+    with pytest.raises(OptionError, match="about the target carrier"):
+        methods.run(
+            "evangelista2023",
+            observations,
+            MethodOptions(start=(X, Y, 1.0)),
+            carrier=CarrierNoise(rotation_rad=1e-3, translation_m=1e-3, about="sensorcarrier"),
+        )
+
+
+def test_problems_of_poses_are_refused_in_words() -> None:
+    for problem in (one_pair().problem, four_targets().problem):
+        with pytest.raises(FrameError, match=r"pixels|several"):
+            run("evangelista2023", problem)
+    with pytest.raises(FrameError, match="corners in pixels"):
+        run("evangelista2023", one_pair().problem)
+
 
 EVERY: tuple[Parameterisation, ...] = get_args(Parameterisation)
 
