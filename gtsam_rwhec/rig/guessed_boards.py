@@ -6,29 +6,27 @@ beyond the board; a board is what passes in at least two images, the one that pa
 """
 
 from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Callable
-from collections.abc import Iterable
-from collections.abc import Iterator
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
+
 import cv2
 import numpy as np
+
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import CORNERS
-from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.cameras.targets import CircleGrid
+from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid
 from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
 from gtsam_rwhec.detect.checkerboards import find_checkerboard
 from gtsam_rwhec.detect.circle_grids import find_circle_grid
 from gtsam_rwhec.detect.images import Gray
+from gtsam_rwhec.detect.saddle_lattices import lattice_sizes
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.sections import Intrinsics
-from gtsam_rwhec.detect.saddle_lattices import lattice_sizes
 
 #: The smallest board that is looked for, in corners or circles a side, and the largest.
 SMALLEST, LARGEST = 3, 30
