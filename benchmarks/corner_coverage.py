@@ -25,7 +25,6 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.fitting.observations import first_intrinsics
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 LEVEL, LEAST, MOST = 0.95, 0.935, 0.965
 
@@ -71,8 +70,8 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
         "sensor": ("cam_0", se3.logmap((se3.inverse(result.Y["cam_0"].matrix()) @ given.Y["cam_0"])[None])[0]),
     }
     if kind.told != "exact":
-        found = parameters_of(result.intrinsics["cam_0"].camera)
-        truth = parameters_of(given.cameras["cam_0"])
+        found = result.intrinsics["cam_0"].camera.parameters
+        truth = given.cameras["cam_0"].parameters
         errors["intrinsics"] = ("intrinsics:cam_0", np.pad(truth, (0, len(found) - len(truth))) - found)
     if kind.warp_m:
         errors["board's warp"] = ("shape:board", (given.shape - result.shapes["board"])[1:])

@@ -33,7 +33,6 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NoiseError, RwhecWarning
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
 from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 #: Of the bound.
 MOST = 1.05
@@ -101,7 +100,7 @@ def one(name: str, seed: int) -> dict[str, tuple[float, ...]]:
         for answer in (corners, poses)
     ]
     intrinsics = {
-        ("k", name): parameters_of(corners.intrinsics[name].camera) - parameters_of(given.cameras[name])
+        ("k", name): corners.intrinsics[name].camera.parameters - given.cameras[name].parameters
         for name in (sensors if kind.told != "exact" else ())
     }
     groups = {"target": [("x", "board")], "sensors": [("y", name) for name in sensors], "all frames": list(frames)}
@@ -139,7 +138,7 @@ def bound_at_the_truth(given: simulated_cells.Cell, corners: rw.CornersRefined, 
         X=given.X,
         Y={name: given.Y[name] for name in model.sensors},
         A=model.A,
-        cameras={name: parameters_of(given.cameras[name]) for name in model.camera_priors},
+        cameras={name: given.cameras[name].parameters for name in model.camera_priors},
         shapes={name: np.zeros(3) for name in model.targets},
     )
     information = Reduced.of(replace(model, weights=every), truth).information(noise)

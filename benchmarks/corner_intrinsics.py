@@ -27,7 +27,7 @@ from loky import ProcessPoolExecutor
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
 from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE, parameters_of
+from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def one(name: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     given = simulated_cells.cell(seed, cameras=1, stated="nominal", carrier=kind.carrier, **kind.geometry)
     X, Y = given.near(np.random.default_rng(seed))
     options = rw.CornerOptions(stated=kind.told, carrier_noise="exact" if kind.knows_the_arm else "estimate")
-    ours = parameters_of(rw.refine_corners(given.observations, X, Y, options).intrinsics["cam_0"].camera)
+    ours = (rw.refine_corners(given.observations, X, Y, options).intrinsics["cam_0"].camera).parameters
     return in_pixels(ours), in_pixels(by_opencv(given.observations))
 
 
@@ -89,7 +89,7 @@ def by_opencv(observations: rw.Observations) -> np.ndarray:
 def in_pixels(parameters: np.ndarray) -> np.ndarray:
     """Errors of fx, fy, cx, cy, and of the coefficients as they move the image's corner."""
     camera = simulated_cells.CAMERA
-    error: np.ndarray = parameters - parameters_of(camera)
+    error: np.ndarray = parameters - camera.parameters
     f = camera.K[[0, 1], [0, 1]]
     corner = 0.5 * np.array([camera.width, camera.height]) / f
     moves = np.linalg.norm(coefficient_jacobian(camera.model, camera.D, corner) * f[:, None], axis=0)

@@ -24,7 +24,6 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 LEVEL, LEAST = 0.95, 0.93
 
@@ -78,7 +77,7 @@ def one(name: str, seed: int) -> dict[str, bool]:
         "sensor": ("cam_0", se3.logmap((se3.inverse(result.Y["cam_0"].matrix()) @ given.Y["cam_0"])[None])[0]),
         "intrinsics": (
             "intrinsics:cam_0",
-            parameters_of(simulated_cells.CAMERA) - parameters_of(result.intrinsics["cam_0"].camera),
+            simulated_cells.CAMERA.parameters - result.intrinsics["cam_0"].camera.parameters,
         ),
     }
     for what, (unknown, error) in errors.items():

@@ -31,7 +31,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.corners_refined import RefinedIntrinsics
 from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import PARTS, TOLD, free_model, parameters_of, prior_of
+from gtsam_rwhec.fitting.stated_intrinsics import PARTS, TOLD, free_model, prior_of
 
 LEVEL, LEAST = 0.95, 0.93
 #: Beyond so many innovation deviations a contradiction must be flagged in this share of runs; falsely in so many.
@@ -92,7 +92,7 @@ def cell_of(geometry: str, name: str, seed: int) -> simulated_cells.Cell:
     kind = KINDS[name]
     rng = np.random.default_rng([seed, 1])
     f = simulated_cells.CAMERA.K[0, 0]
-    off = np.zeros(len(parameters_of(simulated_cells.CAMERA)))
+    off = np.zeros(len(simulated_cells.CAMERA.parameters))
     angle = rng.uniform(-np.pi, np.pi)
     off[:2] = kind.focal_share * f * rng.choice([-1.0, 1.0])
     off[2:4] = kind.centre_px * np.array([np.cos(angle), np.sin(angle)])
@@ -151,7 +151,7 @@ def one(geometry: str, name: str, seed: int) -> Found:
 def _told_deviations(refined: RefinedIntrinsics, stated: Camera, told: Stated) -> float:
     """How far off stated intrinsics are, of what the images tell: the worst part's innovation deviations."""
     mean, deviation = prior_of(free_model(stated, told), told)
-    truth = parameters_of(simulated_cells.CAMERA)
+    truth = simulated_cells.CAMERA.parameters
     # the posterior had the prior not been widened
     information = np.linalg.inv(refined.covariance) + np.diag(deviation**-2.0 - refined.stated_deviations**-2.0)
     gain = np.eye(len(mean)) - np.linalg.inv(information) / np.outer(deviation, deviation)

@@ -175,7 +175,7 @@ def check_determined(
 
 def farthest(model: Model, point: Point) -> float:
     """The largest depth of a corner that was seen, metres."""
-    return max(float(model.depths(stack, point)[stack.known].max()) for stack in model.stacks)
+    return max(float(model.seen(stack, point).z[stack.known].max()) for stack in model.stacks)
 
 
 def _frames(model: Model) -> str:
@@ -282,7 +282,7 @@ def findings_of_rays(refined: CornersRefined) -> Iterator[str]:
     for stack, weights in zip(model.stacks, model.weights, strict=True):
         counted = stack.known & (weights > 0.0)
         camera = refined.intrinsics[stack.sensor].camera
-        now = without_rays(camera, _seen(stack), counted, model.off_axis(stack, refined.point) >= camera.ring)
+        now = without_rays(camera, _seen(stack), counted, model.seen(stack, refined.point).radius >= camera.ring)
         before = without_rays(stack.camera, _seen(stack), counted)
         if now:
             yield f"As estimated, {now}: do not use these intrinsics there, and doubt this answer; {LENS_CURE}."

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.fitting.corner_residuals import Linear, Stack, depths, linearised, off_axis, pixel_errors
+from gtsam_rwhec.fitting.corner_residuals import Linear, Seen, Stack, linearised, pixel_errors, seen
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.geometry.poses import Array
 
@@ -90,15 +90,10 @@ class Model:
         rows = linearised(stack, *self._arguments(stack, point))
         return replace(rows, shapes=rows.shapes[..., self.free_shape(stack.target)])
 
-    def depths(self, stack: Stack, point: Point) -> Array:
-        """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
-        X, Y, A, _, shape, offset_s, moved = self._arguments(stack, point)
-        return depths(stack, X, Y, A, shape, offset_s, moved)
-
-    def off_axis(self, stack: Stack, point: Point) -> Array:
-        """Normalised radii (V, n) at which a stack's corners are; 0 where a corner was not seen."""
-        X, Y, A, _, shape, offset_s, moved = self._arguments(stack, point)
-        return off_axis(stack, X, Y, A, shape, offset_s, moved)
+    def seen(self, stack: Stack, point: Point) -> Seen:
+        """A stack's corners on their way to the camera."""
+        X, Y, A, _, *board = self._arguments(stack, point)
+        return seen(stack, X, Y, A, *board)
 
     def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float, Array | None]:
         camera = point.cameras[self.camera_of[stack.sensor]]

@@ -37,15 +37,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions, RefineO
 from gtsam_rwhec.fitting.observations import Observations, first_intrinsics, solved_with_chosen_poses
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.stated_intrinsics import (
-    Innovation,
-    camera_with,
-    free_model,
-    innovation_of,
-    parameters_of,
-    prior_of,
-    wider,
-)
+from gtsam_rwhec.fitting.stated_intrinsics import Innovation, free_model, innovation_of, prior_of, wider
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.problem.measurements import Pair
@@ -145,7 +137,7 @@ def refine_corners(
         Y={name: gtsam.Pose3(T) for name, T in point.Y.items()},
         intrinsics={
             name: RefinedIntrinsics(
-                camera_with(camera, point.cameras[first[name]]),
+                camera.with_parameters(point.cameras[first[name]]),
                 _block(settled, ("k", first[name])),
                 settled.model.camera_priors[first[name]][1],
                 float((settled.model.camera_priors[first[name]][1] / priors[first[name]][1]).max()),
@@ -206,7 +198,7 @@ def _stated(
         {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
         {name: one_transform(Y[name], f"start of {name}") for name in observations.sensors},
         A,
-        {name: parameters_of(cameras[name]) for name in priors},
+        {name: cameras[name].parameters for name in priors},
         {name: np.zeros(SHAPE) for name in observations.targets},
         dict.fromkeys(options.time_offsets, 0.0),
         {name: np.zeros_like(observations.corners[name]) for name in observations.targets if options.corners_m},

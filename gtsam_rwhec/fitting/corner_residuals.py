@@ -16,7 +16,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives, pixels_of
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
 from gtsam_rwhec.geometry.poses import Array
 
 #: The shape of a board: s (a share), w_x and w_y (metres).
@@ -157,7 +157,7 @@ def shaped(points: Array, shape: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class Seen:
     """A stack's corners on their way to the camera."""
 
     #: (n, 3): In the target's frame, shaped; `by_shape` (n, 3, 3) are its derivatives.
@@ -173,13 +173,20 @@ class _Seen:
     #: Seen, and behind the camera.
     behind: np.ndarray
 
+    @property
+    def radius(self) -> Array:
+        """Normalised radii (V, n); 0 for corners that were not seen."""
+        return np.asarray(np.linalg.norm(self.x, axis=2))
+
     def errors(self, stack: Stack, pixels: Array) -> Array:
+        """Errors (V, 2n) of predicted pixels; infinite behind the camera."""
         error = np.where(stack.known[..., None], pixels - stack.pixels, 0.0)
         error[self.behind] = np.inf
         return error.reshape(len(error), -1)
 
 
-def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float, moved: Array | None) -> _Seen:
+def seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float, moved: Array | None) -> Seen:
+    """A stack's corners on their way to the camera, at a point; `linearised` says what its numbers are."""
     p, by_shape = shaped(stack.points, shape)
     if moved is not None:
         p = p + moved
@@ -191,7 +198,7 @@ def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: fl
     behind = stack.known & (P[..., 2] < NEAREST_M)
     z = np.where(stack.known & ~behind, P[..., 2], 1.0)
     x = np.where(stack.known[..., None], P[..., :2] / z[..., None], 0.0)
-    return _Seen(p, by_shape, B, P, z, x, behind)
+    return Seen(p, by_shape, B, P, z, x, behind)
 
 
 def pixel_errors(
@@ -205,23 +212,9 @@ def pixel_errors(
     moved: Array | None = None,
 ) -> Array:
     """Errors (V, 2n) of a stack in pixels: as `linearised`, without derivatives."""
-    seen = _seen(stack, X, Y, A, shape, offset_s, moved)
-    pixels = pixels_of(stack.camera, parameters, seen.x)
-    return seen.errors(stack, pixels)
-
-
-def depths(
-    stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0, moved: Array | None = None
-) -> Array:
-    """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
-    return _seen(stack, X, Y, A, shape, offset_s, moved).z
-
-
-def off_axis(
-    stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0, moved: Array | None = None
-) -> Array:
-    """Normalised radii (V, n) at which a stack's corners are; 0 where a corner was not seen."""
-    return np.asarray(np.linalg.norm(_seen(stack, X, Y, A, shape, offset_s, moved).x, axis=2))
+    at = seen(stack, X, Y, A, shape, offset_s, moved)
+    pixels = stack.camera.with_parameters(parameters).pixels(at.x)
+    return at.errors(stack, pixels)
 
 
 def linearised(
@@ -240,7 +233,7 @@ def linearised(
     their instants.
     """
     V, n = stack.known.shape
-    at = _seen(stack, X, Y, A, shape, offset_s, moved)
+    at = seen(stack, X, Y, A, shape, offset_s, moved)
     x, z = at.x, at.z
     pixels, by_x, by_parameters = pixels_and_derivatives(stack.camera, parameters, x)
     by_P = np.empty((V, n, 2, 3))  # d x / d P = [I, -x] / z

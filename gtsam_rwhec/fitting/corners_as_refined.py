@@ -101,7 +101,7 @@ def _projected(refined: Refined, corners: CornersRefined, sensor: str) -> Intrin
     intrinsics, seen = refined.intrinsics[sensor], []
     for stack in corners.graph.model.stacks:
         if stack.sensor == sensor:
-            z = corners.graph.model.depths(stack, corners.point)[stack.known]
+            z = corners.graph.model.seen(stack, corners.point).z[stack.known]
             x = intrinsics.camera.undistort(stack.pixels[stack.known])
             seen.append(z[:, None] * np.concatenate([x, np.ones((len(x), 1))], axis=1))
     points = np.concatenate(seen)

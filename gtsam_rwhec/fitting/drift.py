@@ -14,8 +14,7 @@ import numpy as np
 from rwhec_factors import se3
 from scipy.linalg import cholesky_banded
 
-from gtsam_rwhec.fitting.fit_options import Walk
-from gtsam_rwhec.fitting.noise_components import C
+from gtsam_rwhec.fitting.fit_options import C, Walk
 from gtsam_rwhec.fitting.noise_rows import Rows
 from gtsam_rwhec.geometry.poses import Array
 

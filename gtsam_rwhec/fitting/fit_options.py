@@ -195,6 +195,12 @@ class Component(StrEnum):
     SYSTEMATIC_TRANSLATION = "systematic translation of A"
 
 
+C = Component
+WHITE = (C.ROTATION, C.TRANSLATION, C.DEPTH)
+CARRIER = (C.CARRIER_ROTATION, C.CARRIER_TRANSLATION)
+DRIFT = (C.DRIFT_ROTATION, C.DRIFT_TRANSLATION, C.DRIFT_SCALE)
+SYSTEMATIC = (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)
+
 #: Whose frame an error is made in; "detection": rotations in the target's axes, translations along the sensor's.
 DriftFrame = Literal["sensor", "target", "detection"]
 

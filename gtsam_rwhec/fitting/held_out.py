@@ -136,7 +136,7 @@ def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, 
     seen, point = replace(stack, camera=camera), replace(refined.point, A=A)
     rows = model.linearised(seen, point)
     length = np.linalg.norm(rows.residual.reshape(*known.shape, 2), axis=2)[known]
-    on_target = length * model.depths(seen, point)[known] / camera.focal_px
+    on_target = length * model.seen(seen, point).z[known] / camera.focal_px
     blocks = {
         ("x", stack.target): rows.by_X,
         ("y", stack.sensor): rows.by_Y,

@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from gtsam_rwhec.fitting.drift import lower_inverse
-from gtsam_rwhec.fitting.fit_options import About
-from gtsam_rwhec.fitting.noise_components import C
+from gtsam_rwhec.fitting.fit_options import About, C
 from gtsam_rwhec.fitting.noise_rows import Instants, Rows, summed
 from gtsam_rwhec.geometry.poses import Array
 

@@ -23,15 +23,14 @@ from rwhec_factors.batch import robot_world_hand_eye_effects_factors
 
 from gtsam_rwhec.errors import NotConvergedWarning
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.fit_options import C, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.noise_components import C
 from gtsam_rwhec.fitting.noise_likelihood import Estimate, NoiseModel
 from gtsam_rwhec.fitting.noise_rows import prior_terms
 from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
 from gtsam_rwhec.fitting.pair_data import PairData, square_root_information
+from gtsam_rwhec.fitting.pose_fit import linearized
 from gtsam_rwhec.fitting.pose_graph import add_fixed, add_priors, optimise
-from gtsam_rwhec.fitting.pose_models import linearized
 from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements, scale_of
 from gtsam_rwhec.fitting.unknowns import State, Variables

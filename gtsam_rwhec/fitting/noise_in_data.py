@@ -3,11 +3,30 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import gtsam
+import numpy as np
+from scipy.special import expit
+
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, Component, DriftFrame
-from gtsam_rwhec.fitting.noise_components import CARRIER, DRIFT, SYSTEMATIC
+from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
+from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.noise_search import (
+    INSTANTS,
+    MOST_TRACKS,
+    Settled,
+    Task,
+    is_correlated,
+    moved,
+    thinned,
+    why_no_drift,
+    with_drift,
+)
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind
+from gtsam_rwhec.geometry.poses import Array
 
 C = Component
 #: A kind of noise is found where it raises twice the log likelihood by more than this, a parameter.
@@ -148,3 +167,190 @@ class NoiseInData:
         _, factor = _UNITS[component]
         of = self.deviations[component]
         return f"{self._size(component)} ({rounded(of.low * factor)} to {rounded(of.high * factor)})"
+
+
+#: A dense log has fewer samples of the components, which are known well.
+FEWER_SAMPLES = 16
+#: Where no drift can be tried, the verdict says so beyond this many deviations of the residuals' lag-1 correlation.
+SURELY_CORRELATED = 8.0
+#: Before the data, the hand is the carrier that is nearer to its frames: this times log of the ratio of distances.
+NEARER = 4.0
+#: An arm's constant error, over what varies with the configuration: in 300 simulated arms 1.4 to 3.1 (rotation) and
+#: 0.9 to 1.9 (translation), by the spread of the configurations.
+CONSTANT = 2.0
+#: Before the data, the odds that an arm has errors that matter beside the noise of detections: one in seven.
+LOG_ODDS = -2.0
+
+
+def settled(task: Task, start: State, tell: Progress, before: Settled | None = None) -> Settled:
+    """The side of A's errors, the drift, and the optimum under them.
+
+    ``before`` is the optimum for nearly the same measurements, whose side and drift are kept.
+    """
+    options = task.options
+    if before is not None:
+        tell("estimating the noise again")
+        drift = before.model.drift
+        again = task.settle(
+            start, before.model.side, None if drift is None else drift.walk, systematic=options.systematic,
+            near=before.fit,
+        )  # fmt: skip
+        return replace(before, state=again.state, model=again.model, fit=again.fit)
+    sides: tuple[About, ...] = ("targetcarrier", "sensorcarrier") if options.side is None else (options.side,)
+    tell("estimating the noise of A and B")
+    tried = {side: task.settle(start, side, None, systematic=False) for side in sides}
+    lengths = {"targetcarrier": start.X, "sensorcarrier": start.Y}
+    nearer = NEARER if all(lengths.values()) else 0.0  # motions alone have frames on one side only
+    score = {side: found.fit.objective + nearer * np.log(_distance(lengths[side])) for side, found in tried.items()}
+    side = min(score, key=lambda each: score[each])
+    white = steady = tried[side]
+    if options.systematic:
+        steady = task.settle(white.state, side, None, systematic=True, near=white.fit)
+    best = with_drift(task, steady, tell)
+    drift_evidence, systematic_evidence = steady.fit.objective - best.fit.objective, 0.0
+    if options.systematic:
+        systematic_evidence = white.fit.objective - steady.fit.objective
+        if best is not steady and systematic_evidence > 0.0:  # drift may explain the same
+            kind = None if best.model.drift is None else best.model.drift.walk
+            without = task.settle(best.state, side, kind, systematic=False, near=best.fit)
+            systematic_evidence = without.fit.objective - best.fit.objective
+    return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
+
+
+def noise_in(task: Task, found: Settled, mixture: Mixture, constant: tuple[Array, Array]) -> NoiseInData:
+    """What the data say of their noise; `constant` are the variances of `constant_variances`."""
+    white = found.white or found
+    middle, low, high = mixture.quantiles((0.5, 0.05, 0.95))
+    active = found.fit.sizes.active
+    given = np.sqrt(np.einsum("nii->i", found.model.rows.given) / len(found.model.rows.given))
+    stated = {C.ROTATION: float(given[:3].mean()), C.TRANSLATION: float(given[3:].mean())}
+    simple = white.model.evaluate(white.fit.sizes.values(white.fit.logs)).covariance
+    ratios = [0.0]
+    for unknown, place in task.layout.slots.items():
+        if unknown.kind is UnknownKind.FRAME and not task.layout.free[place].any():
+            rows = found.model.basis[place]
+            independent, real = (np.linalg.slogdet(rows @ C_all @ rows.T)[1] for C_all in (simple, mixture.covariance))
+            ratios.append((independent - real) / 6.0)
+    return NoiseInData(
+        deviations={
+            c: Deviation(*(stated.get(c, 1.0) * float(x) for x in of))
+            for c, of in zip(active, zip(middle, low, high, strict=True), strict=True)
+        },
+        instants=task.instants.count,
+        worth=task.instants.count * float(np.exp(min(ratios))),
+        hand=found.model.side,
+        correlation=None if found.model.drift is None else found.model.drift.walk.correlation,
+        frame=None if found.model.drift is None else found.model.drift.walk.frame,
+        drift_evidence=found.drift_evidence,
+        systematic_evidence=found.systematic_evidence,
+        drift_not_sought=why_no_drift(task),
+        has_stamps=task.instants.seconds is not None,
+        is_drift_untried=is_drift_untried(task, found),
+        arms_assumed=C.SYSTEMATIC_ROTATION in active,
+        systematic_probability=_probability(task, found),
+        constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
+    )
+
+
+def mixed(task: Task, found: Settled) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
+    """The covariance, with the components' uncertainty mixed in, and the arm's constant error added; and its parts."""
+    is_dense = task.instants.count > INSTANTS
+    mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
+    basis = found.model.basis
+    state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
+    constant = constant_variances(task, found, state, mixture)
+    finite = basis @ mixture.covariance @ basis.T
+    for poses, variances in zip((state.X, state.Y), constant, strict=True):
+        shift = _shifts(task, poses)
+        finite += (shift * variances) @ shift.T
+    if is_drift_untried(task, found):
+        wider = widening(task, found)
+        finite = finite * wider[:, None] * wider
+    return replace(task.layout, finite=finite), mixture, constant
+
+
+def is_drift_untried(task: Task, found: Settled) -> bool:
+    """Whether errors of neighbours are alike, and there are too many tracks for a model of that."""
+    return task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED)
+
+
+def constant_variances(task: Task, found: Settled, state: State, mixture: Mixture) -> tuple[Array, Array]:
+    """Variances (6,) of constant errors of A: c of the hand, A Expmap(c), and of the base, Expmap(c) A.
+
+    A Expmap(c) X = A X Expmap(Ad(X^-1) c), and Expmap(c) A X = Y B the same for Y: no residual shows c, since X or Y
+    takes it up. It is tied to the part that varies with the configuration: `CONSTANT` times its deviations. (It is an
+    assumption about arms: the first links' errors move with the base, the last links' with the hand.) Where the data
+    hardly show the part that varies, it may not be there: the ellipsoid is that of the average over both models.
+    """
+    active = found.fit.sizes.active
+    if C.SYSTEMATIC_ROTATION not in active:
+        return np.zeros(6), np.zeros(6)
+    places = [active.index(c) for c in (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)]
+    deviations = CONSTANT * np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)
+    probability = _probability(task, found)
+
+    def of(poses: dict[str, gtsam.Pose3]) -> Array:
+        shift, shares = _shifts(task, poses), [0.0]
+        for name in poses:
+            rows = task.layout.slots.get(Unknown(UnknownKind.FRAME, name))
+            if rows is not None and shift[rows].any() and not task.layout.free[rows].any():
+                roots = shift[rows] * deviations[:, None, :]
+                shares.append(mixture.share_of(found.model.basis[rows], roots, probability))
+        variances: Array = max(shares) * (mixture.weights @ deviations**2)
+        return variances
+
+    return of(state.X), of(state.Y)
+
+
+def _shifts(task: Task, poses: dict[str, gtsam.Pose3]) -> Array:
+    """How a constant error of A moves the frames (d, 6) of one carrier."""
+    shift = np.zeros((len(task.layout.unit), 6))
+    for name, pose in poses.items():
+        unknown = Unknown(UnknownKind.FRAME, name)
+        if unknown in task.layout.slots and name not in task.problem.priors:  # a prior is of the true pose
+            shift[task.layout.slots[unknown]] = pose.inverse().AdjointMap()
+    return shift
+
+
+def _probability(task: Task, found: Settled) -> float:
+    """That errors which vary with the configuration are there, by the likelihoods' ratio."""
+    is_stated = any(component in task.options.stated for component in SYSTEMATIC)
+    return 1.0 if is_stated else float(expit(0.5 * found.systematic_evidence + LOG_ODDS))
+
+
+def _distance(poses: dict[str, gtsam.Pose3]) -> float:
+    """The typical distance of frames from their carrier, m; without frames, the smallest."""
+    return max(float(np.median([float(np.linalg.norm(pose.translation())) for pose in poses.values()] or [0.0])), 1e-6)
+
+
+#: So many blocks, and one instant in each at least.
+BLOCKS = 10
+
+
+def widening(task: Task, found: Settled) -> Array:
+    """By how much (d,) the standard deviations of the unknowns are too small, as blocks of time say; 1 at least."""
+    rows, basis, count = found.model.rows, found.model.basis, task.instants.count
+    wider = np.ones(len(task.layout.unit))
+    if count < 2 * BLOCKS:
+        return wider
+    sigma = found.fit.sizes.values(found.fit.logs)
+    carrier = np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
+    E = rows.twist[found.model.side] * carrier
+    root = np.linalg.cholesky(found.model.white(sigma) + E @ E.transpose(0, 2, 1))
+    J = np.linalg.solve(root, rows.by_unknowns.by(basis).whole)
+    r = np.linalg.solve(root, rows.residual[:, :, None])[:, :, 0]
+    p = J.shape[2]
+    H = np.linalg.inv(np.einsum("nip,niq->pq", J, J, optimize=True) + found.model.prior_information)
+    scores = np.zeros((BLOCKS, p))
+    np.add.at(scores, rows.instants.index * BLOCKS // count, np.einsum("nip,ni->np", J, r))
+    scores -= scores.mean(axis=0)
+    by_blocks = basis @ (H @ (scores.T @ scores) @ H) @ basis.T * (BLOCKS / (BLOCKS - 1.0))
+    independent = basis @ H @ basis.T
+    for place in task.layout.slots.values():
+        whole = np.arange(len(wider))[place]
+        for part in np.array_split(whole, max(len(whole) // 3, 1)):
+            variance = float(np.trace(independent[np.ix_(part, part)]))
+            if variance > 0.0:
+                ratio = float(np.trace(by_blocks[np.ix_(part, part)])) / variance
+                wider[part] = np.sqrt(max(ratio, 1.0))
+    return wider

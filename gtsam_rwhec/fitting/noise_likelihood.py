@@ -17,10 +17,9 @@ from functools import cached_property
 import numpy as np
 
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, EliminatedDrift, own_directions
-from gtsam_rwhec.fitting.fit_options import About
+from gtsam_rwhec.fitting.fit_options import About, C
 from gtsam_rwhec.fitting.instant_products import Measurements, Reduced, white_terms
 from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
-from gtsam_rwhec.fitting.noise_components import C
 from gtsam_rwhec.fitting.noise_rows import Rows
 from gtsam_rwhec.geometry.poses import Array
 

@@ -11,15 +11,12 @@ from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.component_posterior import FEWEST
 from gtsam_rwhec.fitting.drift import drift_columns
-from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
-from gtsam_rwhec.fitting.free_space import free_space_of
-from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.noise_components import C
+from gtsam_rwhec.fitting.fit_options import C, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
 from gtsam_rwhec.fitting.noise_graph import refined_of
-from gtsam_rwhec.fitting.noise_in_data import NoiseInData
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData, mixed, noise_in, settled
 from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
-from gtsam_rwhec.fitting.noise_summary import mixed, noise_in, settled
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables

@@ -18,7 +18,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.pair_data import PairData
-from gtsam_rwhec.fitting.pose_models import linearized
+from gtsam_rwhec.fitting.pose_fit import linearized
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.fitting.variance_components import jacobian_of
 from gtsam_rwhec.geometry.poses import Array

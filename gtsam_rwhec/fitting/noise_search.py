@@ -10,11 +10,22 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.fitting.component_posterior import ENOUGH, Fitted, fitted
+from gtsam_rwhec.fitting.component_posterior import ENOUGH, Fitted, Sizes, fitted
 from gtsam_rwhec.fitting.drift import DriftPrior
-from gtsam_rwhec.fitting.fit_options import About, Component, Drift, DriftFrame, NoiseOptions, Walk
+from gtsam_rwhec.fitting.fit_options import (
+    CARRIER,
+    DRIFT,
+    SYSTEMATIC,
+    WHITE,
+    About,
+    C,
+    Component,
+    Drift,
+    DriftFrame,
+    NoiseOptions,
+    Walk,
+)
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.noise_components import CARRIER, DRIFT, SYSTEMATIC, WHITE, C, Sizes
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
 from gtsam_rwhec.fitting.noise_rows import Instants, Rows, prior_terms
 from gtsam_rwhec.fitting.pair_data import PairData

@@ -3,23 +3,282 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from rwhec_factors.batch import Linearization
+from scipy.special import chdtr, chdtri
 
-from gtsam_rwhec.errors import NotConvergedWarning
+from gtsam_rwhec.errors import NoiseError, NotConvergedWarning, WeightsWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting import pose_graph as graphs
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.admission import inlier_threshold
+from gtsam_rwhec.fitting.fit_options import NoiseGroups, RefineOptions, Robust
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.pair_data import FactorsByPair, Group, group_label, largest_change
-from gtsam_rwhec.fitting.pose_graph import Optimum, information_of, optimise
-from gtsam_rwhec.fitting.pose_models import ChordalModel, GeodesicModel
-from gtsam_rwhec.fitting.unknowns import State, Variables
-from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.fitting.pair_data import (
+    COMPONENTS,
+    FactorsByPair,
+    Group,
+    PairData,
+    check_carriers,
+    group_label,
+    group_of,
+    largest_change,
+    residual_covariance,
+    square_root_information,
+)
+from gtsam_rwhec.fitting.pose_graph import Optimum, add_summary, information_of, optimise, summary_of
+from gtsam_rwhec.fitting.unknowns import State, Variables, carrier_key
+from gtsam_rwhec.fitting.variance_components import SMALLEST, VarianceComponents, from_measurements, from_moments
+from gtsam_rwhec.geometry.poses import Array, to_pose3
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
+from gtsam_rwhec.solver.parts import Part
+
+
+@dataclass(frozen=True)
+class GeodesicModel:
+    """The geodesic residuals of the raw measurements."""
+
+    data: list[PairData]
+    variables: Variables
+    options: RefineOptions
+    #: The carrier poses, where they are variables.
+    carriers: graphs.CarrierVariables | None
+    #: Share of its variance that a squared residual keeps when residuals beyond the inlier threshold are left out.
+    inlier_share: float
+
+    @staticmethod
+    def of(data: list[PairData], variables: Variables, options: RefineOptions) -> GeodesicModel:
+        """The model; it decides whether carrier poses are variables."""
+        check_carriers(data, options)
+        carriers = None
+        if options.carrier_noise is not None:
+            candidates = graphs.CarrierVariables.of(data)
+            if options.carrier_model == "variables" or (options.carrier_model == "auto" and candidates.is_shared):
+                carriers = candidates
+            elif candidates.is_shared:
+                warnings.warn(
+                    "some measurements share a carrier pose, but carrier_model='propagated' treats its noise as "
+                    "independent for each measurement. The error of a shared pose does not average out, so standard "
+                    "deviations are too small; take carrier_model='variables'",
+                    WeightsWarning,
+                    stacklevel=5,
+                )
+        share = 1.0
+        if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile
+            cut = inlier_threshold(options.inlier_confidence, sum(item.count for item in data))
+            share = float(chdtr(8, cut) / chdtr(6, cut))
+        return GeodesicModel(data, variables, options, carriers, share)
+
+    @property
+    def is_m_estimate(self) -> bool:
+        """Whether one of GTSAM's losses weighs each measurement."""
+        return self.options.robust in graphs.LOSSES
+
+    @property
+    def reweighs(self) -> bool:
+        """Whether the weights depend on the estimate: they do if A's noise is propagated into the residual."""
+        return self.options.carrier_noise is not None and self.carriers is None
+
+    @property
+    def has_constant_weights(self) -> bool:
+        """Whether a graph's factors are the same wherever it is optimised."""
+        return not (self.is_m_estimate or self.reweighs or self.variables.offsets)
+
+    @property
+    def given_noise(self) -> dict[Pair, tuple[float, float]]:
+        """Given standard deviations of each pair's median measurement, root mean square over axes: rad and metres.
+
+        A root mean square over measurements would be that of the few farthest ones, which count least.
+        """
+        result = {}
+        for item in self.data:
+            variances = np.einsum("nii->ni", item.covariance).reshape(-1, 2, 3).mean(axis=2)
+            rotation, translation = np.sqrt(np.median(variances, axis=0)).tolist()
+            result[item.pair] = (rotation, translation)
+        return result
+
+    def covariances(self, at: dict[Pair, Linearization], factors: FactorsByPair) -> dict[Pair, Array]:
+        """The covariances (N, 6, 6) of every pair's residuals."""
+        return {item.pair: residual_covariance(item, at[item.pair], factors[item.pair]) for item in self.data}
+
+    def graph(self, state: State, factors: FactorsByPair, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
+        """The measurements' factors, weighted at an estimate; ``robust`` replaces the loss of the options."""
+        loss = self.options.robust if robust is None else robust
+        graph = gtsam.NonlinearFactorGraph()
+        rest = [replace(item, residuals=item.at(state.offsets_s.get(item.pair.sensor, 0.0))) for item in self.data]
+        if self.carriers is not None:
+            graphs.add_with_carriers(graph, self.variables, rest, self.carriers, factors, loss)
+            rest = [item for item in rest if item.pair not in self.carriers.index]
+        if rest:
+            covariances = self.covariances(linearized(self.data, self.variables, state), factors)
+            if loss in graphs.LOSSES:
+                graphs.add_single(graph, self.variables, rest, covariances, loss)
+            else:
+                roots = {item.pair: square_root_information(covariances[item.pair]) for item in rest}
+                graphs.add_batches(graph, self.variables, rest, roots)
+        return graph
+
+    @property
+    def first_loss(self) -> Robust | None:
+        """The loss that is minimised first, because it has no local minima; the loss of the options follows."""
+        return "huber" if self.is_m_estimate and self.options.robust != "huber" else None
+
+    def values(self, state: State) -> gtsam.Values:
+        """An estimate as GTSAM's values, with the measured carrier poses where they are variables."""
+        values = self.variables.values(state)
+        if self.carriers is not None:
+            for i, A in enumerate(self.carriers.A):
+                values.insert(carrier_key(i), to_pose3(A[:3, :3], A[:3, 3]))
+        return values
+
+    def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
+        """The measurements' factors without a loss: the unknowns' information, up to ``inefficiency``."""
+        return self.graph(state, factors, "none")
+
+    def inefficiency(self, state: State, factors: FactorsByPair) -> float:
+        """The factor by which a loss widens least squares' covariance: Huber's E psi^2 / (E psi')^2, 6 dimensions.
+
+        (Huber and Ronchetti, Robust Statistics, eq. 7.87, whose psi' is here the divergence of w(|u|) u over 6.)
+        """
+        if not self.is_m_estimate:
+            return 1.0
+        loss = graphs.loss_of(self.options.robust)
+        at = linearized(self.data, self.variables, state)
+        whitened = [
+            np.einsum("nij,nj->ni", square_root_information(covariance), at[pair].residual)
+            for pair, covariance in self.covariances(at, factors).items()
+        ]
+        lengths = np.linalg.norm(np.concatenate(whitened), axis=1)
+        weight = np.array([loss.weight(d) for d in lengths])
+        step = 1e-5
+        slope = np.array([(loss.weight(d + step) - loss.weight(max(d - step, 0.0))) for d in lengths]) / (
+            step + np.minimum(lengths, step)
+        )
+        unknowns = sum(unknown.dimension for unknown in self.variables.unknowns)
+        degrees_of_freedom = max(6 * len(lengths) - unknowns, 1)
+        square = float(np.sum((weight * lengths) ** 2)) / degrees_of_freedom
+        gain = float(np.mean(weight + slope * lengths / 6.0))
+        if not gain > 0.05:
+            raise NoiseError(
+                f"robust={self.options.robust!r} gives the measurements a mean weight of only {weight.mean():.2g}: "
+                f"half of the residuals are beyond {np.median(lengths):.3g} standard deviations. Either the noise is "
+                "larger than given (take noise='estimate'), or outliers have pulled the certified solution away (take "
+                "robust='gnc', which needs no good start)"
+            )
+        return square / gain**2
+
+    def next_factors(
+        self, state: State, joint: JointCovariance, factors: FactorsByPair, groups: NoiseGroups
+    ) -> VarianceComponents:
+        """Variance factors from the residuals at an estimate."""
+        at = linearized(self.data, self.variables, state)
+        components = from_measurements(
+            self.data, at, self.variables, joint, factors, groups, consistency=self.inlier_share
+        )
+        if self.is_m_estimate:
+            components = replace(components, factors=self._median_factors(at, factors, groups, components))
+        return components
+
+    def _median_factors(
+        self, at: dict[Pair, Linearization], factors: FactorsByPair, groups: NoiseGroups, components: VarianceComponents
+    ) -> FactorsByPair:
+        """Variance factors that withstand outliers: medians of squared residuals over a chi-square's, 3 dimensions."""
+        squares: dict[tuple[Group, int], list[Array]] = {}
+        for pair, covariance in self.covariances(at, factors).items():
+            for i, block in enumerate((slice(0, 3), slice(3, 6))):
+                r = at[pair].residual[:, block]
+                square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance[:, block, block]), r)
+                squares.setdefault((group_of(pair, groups), i), []).append(square)
+        ratios = {}
+        for (group, i), values in squares.items():
+            all_squares = np.concatenate(values)
+            degrees_of_freedom = components.degrees_of_freedom[group, COMPONENTS[i]] / (3.0 * len(all_squares))
+            ratios[group, i] = max(float(np.median(all_squares)) / float(chdtri(3, 0.5)) / degrees_of_freedom, SMALLEST)
+        return {
+            pair: VarianceFactors(*(factor * ratios[group_of(pair, groups), i] for i, factor in enumerate(old)))
+            for pair, old in factors.items()
+        }
+
+
+def linearized(data: list[PairData], variables: Variables, state: State) -> dict[Pair, Linearization]:
+    """Residuals and Jacobians of pairs at an estimate."""
+    frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
+    result = {}
+    for item in data:
+        target, sensor = item.pair
+        scale = variables.scale_of_pair.get(item.pair)
+        alpha = 1.0 if scale is None else state.scales[scale]
+        offset_s = state.offsets_s.get(sensor, 0.0)
+        result[item.pair] = item.at(offset_s).linearize(frames[target], frames[sensor], alpha, offset_s)
+    return result
+
+
+@dataclass(frozen=True)
+class ChordalModel:
+    """The chordal residuals: one edge summary for each pair."""
+
+    parts: list[Part]
+    variables: Variables
+
+    #: The weights do not depend on the estimate.
+    reweighs = False
+    has_constant_weights = True
+
+    @property
+    def given_noise(self) -> dict[Pair, tuple[float, float]]:
+        """Given standard deviations, averaged over each pair's measurements: rad and (measured) metres per axis."""
+        return {
+            pair: (
+                float(np.sqrt(0.5 * part.moments.count[e] / part.moments.kappa[e])),
+                float(np.sqrt(part.moments.count[e] / part.moments.weight[e])),
+            )
+            for part in self.parts
+            for e, pair in enumerate(part.pairs)
+        }
+
+    def graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
+        """The measurements' factors."""
+        graph = gtsam.NonlinearFactorGraph()
+        for part in self.parts:
+            for e, pair in enumerate(part.pairs):
+                add_summary(graph, self.variables, pair, summary_of(part, e, factors[pair]))
+        return graph
+
+    def values(self, state: State) -> gtsam.Values:
+        """An estimate as GTSAM's values."""
+        return self.variables.values(state)
+
+    def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
+        """The graph itself, which has no loss."""
+        return self.graph(state, factors)
+
+    def inefficiency(self, state: State, factors: FactorsByPair) -> float:
+        """1: least squares has no loss."""
+        return 1.0
+
+    def next_factors(
+        self, state: State, joint: JointCovariance, factors: FactorsByPair, groups: NoiseGroups
+    ) -> VarianceComponents:
+        """Variance factors from the residuals at an estimate."""
+        values = self.variables.values(state)
+        costs: dict[Pair, tuple[float, float]] = {}
+        fitted: dict[Pair, tuple[float, float]] = {}
+        for part in self.parts:
+            for e, pair in enumerate(part.pairs):
+                cost, used = [], []
+                for i, component in enumerate(COMPONENTS):
+                    alone = gtsam.NonlinearFactorGraph()
+                    add_summary(alone, self.variables, pair, summary_of(part, e, AS_STATED, component))
+                    cost.append(alone.error(values))
+                    information = information_of(alone, values, self.variables)
+                    used.append(float(np.sum(joint.finite * information)) / factors[pair][i])
+                costs[pair], fitted[pair] = (cost[0], cost[1]), (used[0], used[1])
+        return from_moments(self.parts, costs, fitted, groups)
+
 
 Model = GeodesicModel | ChordalModel
 

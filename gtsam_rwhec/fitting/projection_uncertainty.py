@@ -21,7 +21,7 @@ from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.held_out import REGIONS
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import Regions
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of, pixels_and_derivatives
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 
@@ -167,7 +167,7 @@ def _derivatives(camera: Camera, P: Array) -> tuple[Array, Array]:
     at = np.where(known[..., None], P, [0.0, 0.0, 1.0])
     z = at[..., 2, None]
     x = at[..., :2] / z
-    _, by_x, by_camera = pixels_and_derivatives(camera, parameters_of(camera), x)
+    _, by_x, by_camera = pixels_and_derivatives(camera, camera.parameters, x)
     to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None]
     hat = se3.hat(at.reshape(-1, 3)).reshape(*at.shape, 3)
     by_xi = np.concatenate([hat, np.broadcast_to(-np.eye(3), hat.shape)], axis=-1)

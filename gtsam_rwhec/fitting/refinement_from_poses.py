@@ -24,11 +24,9 @@ from gtsam_rwhec.errors import (
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.fitting.admission import inlier_threshold
 from gtsam_rwhec.fitting.fit_options import RefineOptions
-from gtsam_rwhec.fitting.free_space import FreeSpace, free_space_of
-from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.joint_covariance import FreeSpace, JointCovariance, free_space_of
 from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, group_of, local_paths, residual_covariance
-from gtsam_rwhec.fitting.pose_fit import Model, SettledFit, fit
-from gtsam_rwhec.fitting.pose_models import ChordalModel, GeodesicModel, linearized
+from gtsam_rwhec.fitting.pose_fit import ChordalModel, GeodesicModel, Model, SettledFit, fit, linearized
 from gtsam_rwhec.fitting.refined import FactorGraph, Movement, PairNoise, Refined
 from gtsam_rwhec.fitting.robust_solution import Inliers, robust_solution, until_inliers_stay
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables

@@ -44,7 +44,7 @@ def free_model(camera: Camera, stated: Stated) -> Camera:
 
 def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
     """Mean (m,) and standard deviation (m,) of a camera's parameters."""
-    mean = parameters_of(camera)
+    mean = camera.parameters
     f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
     lens_px = LENS_PX[stated] if stated in LENS_PX else LENS_OF_FOCAL[stated] * float(f.mean())
     corner = 0.5 * np.array([camera.width, camera.height]) / f
@@ -153,24 +153,9 @@ def held_by_prior(prior: Array, posterior: Array) -> np.ndarray:
     return np.asarray(of_directions | (np.diagonal(scaled) > HELD**2))
 
 
-def parameters_of(camera: Camera) -> Array:
-    """The parameters (4 + n,) of a camera with n coefficients."""
-    return camera.parameters
-
-
-def camera_with(camera: Camera, parameters: Array) -> Camera:
-    """The camera with other parameters, and the same model and size of images."""
-    return camera.with_parameters(parameters)
-
-
-def pixels_of(camera: Camera, parameters: Array, x: Array) -> Array:
-    """Pixels (..., 2) of normalised coordinates (..., 2)."""
-    return camera_with(camera, parameters).pixels(x)
-
-
 def pixels_and_derivatives(camera: Camera, parameters: Array, x: Array) -> tuple[Array, Array, Array]:
     """Pixels (..., 2) of normalised coordinates (..., 2), with derivatives (..., 2, 2) by x and by the parameters."""
-    camera = camera_with(camera, parameters)
+    camera = camera.with_parameters(parameters)
     f, c, D = np.diagonal(camera.K)[:2], camera.K[:2, 2], camera.D
     bent, by_x = distorted(camera.model, D, x)
     by_parameters = np.zeros((*x.shape[:-1], 2, len(parameters)))

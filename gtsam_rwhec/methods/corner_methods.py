@@ -1,21 +1,25 @@
 """Methods on corners: Evangelista et al. 2023 and Tabb and Ahmad Yousef's rp1 (2017); intrinsics are held."""
 
 from __future__ import annotations
-
 from collections import Counter
-from dataclasses import dataclass, replace
-
+from dataclasses import dataclass
+from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
-
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.corner_residuals import SHAPE, Linear, Stack, linearised, pixel_errors, stacks_of
+from gtsam_rwhec.fitting.corner_residuals import SHAPE
+from gtsam_rwhec.fitting.corner_residuals import Linear
+from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.corner_residuals import linearised
+from gtsam_rwhec.fitting.corner_residuals import pixel_errors
+from gtsam_rwhec.fitting.corner_residuals import stacks_of
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
-from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
+from gtsam_rwhec.methods.iterative_methods import CHARTS
+from gtsam_rwhec.methods.iterative_methods import Parameterisation
+from gtsam_rwhec.methods.levenberg_marquardt import Linearised
+from gtsam_rwhec.methods.levenberg_marquardt import descend
 
 #: Boards are as stated.
 FLAT = np.zeros(SHAPE)
@@ -52,14 +56,14 @@ class Corners:
     def rows(self, stack: Stack, frames: Array) -> Linear:
         """Errors of a stack in pixels, with derivatives, by the measured A; infinite behind the camera."""
         i, j = self.frames_of(stack)
-        return linearised(stack, frames[i], frames[j], self.A, parameters_of(stack.camera), FLAT)
+        return linearised(stack, frames[i], frames[j], self.A, stack.camera.parameters, FLAT)
 
     def cost(self, frames: Array) -> float:
         """Half the sum of squared reprojection errors over corner_px^2, by the measured A; infinite behind a camera."""
         total = 0.0
         for stack in self.stacks:
             i, j = self.frames_of(stack)
-            error = pixel_errors(stack, frames[i], frames[j], self.A, parameters_of(stack.camera), FLAT)
+            error = pixel_errors(stack, frames[i], frames[j], self.A, stack.camera.parameters, FLAT)
             total += 0.5 * float((error**2).sum()) / self.corner_px**2
         return total
 
@@ -181,7 +185,7 @@ def graph_model(corners: Corners, graph: Graph, deviations: tuple[float, float])
         begin += V
         # with X and Y the identity, B takes the place of A
         own = replace(stack, instant=np.arange(V))
-        alone = linearised(own, np.eye(4), np.eye(4), B, parameters_of(stack.camera), FLAT)
+        alone = linearised(own, np.eye(4), np.eye(4), B, stack.camera.parameters, FLAT)
         if not np.isfinite(alone.residual).all():
             return Linearised(np.inf, g, H)
         r, J = alone.residual / corners.corner_px, alone.by_A / corners.corner_px

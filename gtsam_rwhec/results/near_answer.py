@@ -18,12 +18,11 @@ from gtsam_rwhec.errors import CountError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.component_posterior import FEWEST, SAMPLES, mixture_of
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
-from gtsam_rwhec.fitting.free_space import free_space_of
-from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
+from gtsam_rwhec.fitting.noise_in_data import FEWER_SAMPLES, is_drift_untried, settled, widening
 from gtsam_rwhec.fitting.noise_refinement import SPARE_EQUATIONS, agreeing
 from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import INSTANTS, Settled, Task, moved, thinned
-from gtsam_rwhec.fitting.noise_summary import FEWER_SAMPLES, is_drift_untried, settled, widening
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import data_of, scale_of, sensors_with_offset
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics

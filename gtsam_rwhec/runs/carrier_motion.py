@@ -11,7 +11,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import LogError, StampError, TransformError
 from gtsam_rwhec.fitting.fit_options import About, CarrierNoise
-from gtsam_rwhec.fitting.free_space import MOVED
+from gtsam_rwhec.fitting.joint_covariance import MOVED
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import WINDOW_S, SmoothPath, Trajectory
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic

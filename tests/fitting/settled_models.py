@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.component_posterior import Fitted
+from gtsam_rwhec.fitting.component_posterior import Fitted, Sizes
 from gtsam_rwhec.fitting.fit_options import About, Component, NoiseOptions, RefineOptions, Walk
-from gtsam_rwhec.fitting.free_space import free_space_of
-from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.noise_components import Sizes
+from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
 from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
 from gtsam_rwhec.fitting.pair_data import PairData, local_paths

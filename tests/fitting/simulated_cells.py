@@ -14,7 +14,7 @@ from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.corner_residuals import shaped
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import camera_with, parameters_of, pixels_of, prior_of
+from gtsam_rwhec.fitting.stated_intrinsics import prior_of
 
 Array = NDArray[np.float64]
 BOARD = Checkerboard("board", 7, 5, 0.04)
@@ -97,13 +97,13 @@ def cell(
                 seen[name][1].append(pixels + rng.normal(scale=corner_px, size=pixels.shape))
                 any_seen = True
         done += any_seen
-    truth = parameters_of(camera)
+    truth = camera.parameters
     as_stated = {}
     for name in Y:
         off = np.zeros(len(truth)) if stated_off is None else stated_off
         if stated is not None:
             off = off + rng.normal(size=len(truth)) * prior_of(camera, stated)[1]
-        as_stated[name] = camera_with(camera, truth + off)
+        as_stated[name] = camera.with_parameters(truth + off)
     observations = Observations.of(
         as_stated,
         {"board": board.corners()},
@@ -137,5 +137,5 @@ def _pixels(T_camera_board: Array, points: Array, camera: Camera) -> Array | Non
     t = T_camera_board[:3, 3]
     if seen[:, 2].min() < 0.2 or -(T_camera_board[:3, 2] @ t) / np.linalg.norm(t) < 0.35:
         return None
-    pixels = pixels_of(camera, parameters_of(camera), seen[:, :2] / seen[:, 2:])
+    pixels = camera.with_parameters(camera.parameters).pixels(seen[:, :2] / seen[:, 2:])
     return pixels if camera.inside(pixels).all() else None

@@ -8,7 +8,7 @@ from simulated_cells import Cell
 
 from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.fitting.corner_residuals import stacks_of
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of, prior_of
+from gtsam_rwhec.fitting.stated_intrinsics import prior_of
 
 A_NOISE = np.repeat([1e-3, 5e-4], 3)
 CORNER_PX = 0.1
@@ -26,5 +26,5 @@ def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = 
     rng = np.random.default_rng(7)
     moved = A if exact else A @ se3.expmap(rng.normal(size=(len(A), 6)) * A_NOISE)
     X, Y = small.near(rng, 1e-3)
-    cameras_at = {name: parameters_of(cameras[name]) * (1.0 + 1e-3) for name in names}
+    cameras_at = {name: cameras[name].parameters * (1.0 + 1e-3) for name in names}
     return model, Point(X, Y, moved, cameras_at, {"board": np.full(3, 5e-4)})

@@ -9,8 +9,8 @@ from rwhec_factors import se3
 from settled_models import C, task_of
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.fitting.noise_in_data import BLOCKS, widening
 from gtsam_rwhec.fitting.noise_search import MOST_TRACKS
-from gtsam_rwhec.fitting.noise_summary import BLOCKS, widening
 
 TAGS, FRAMES = MOST_TRACKS + 1, 100
 
@@ -69,7 +69,7 @@ def test_the_verdict_says_that_no_model_holds_the_drift(monkeypatch: pytest.Monk
     assert calibration.verdict is rw.Verdict.CARE
     assert rw.Ground.CORRELATED in calibration.judgement.grounds
     assert "widened as blocks of time show" in calibration.verdict_reason
-    monkeypatch.setattr("gtsam_rwhec.fitting.noise_summary.widening", lambda task, _: np.ones(len(task.layout.unit)))
+    monkeypatch.setattr("gtsam_rwhec.fitting.noise_in_data.widening", lambda task, _: np.ones(len(task.layout.unit)))
     before = rw.calibrate(problem, options)
     for name in ("camera", "tag_0"):
         assert (np.diagonal(calibration.covariance(name)) >= np.diagonal(before.covariance(name))).all()

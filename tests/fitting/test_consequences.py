@@ -13,7 +13,6 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corners_as_refined import OF_CARRIERS, consequences_of
 from gtsam_rwhec.fitting.pose_graph import optimise
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 EXACT = rw.CornerOptions(stated="calibration", carrier_noise="exact")
 
@@ -22,7 +21,7 @@ def test_a_pixel_of_the_centre_moves_the_extrinsics_as_said() -> None:
     given = cell(1, images=25, cameras=1)
     refined = rw.refine_corners(given.observations, given.X, given.Y, EXACT)
     said = {(one.frame, one.cause): one for one in consequences_of(refined)}
-    kept = parameters_of(refined.intrinsics["cam_0"].camera) + np.eye(8)[2]
+    kept = refined.intrinsics["cam_0"].camera.parameters + np.eye(8)[2]
     model = refined.graph.model
     held = replace(model, camera_priors={"cam_0": (kept, np.full(8, 1e-7))})
     graph = CornerGraph(held, replace(refined.point, cameras={"cam_0": kept}))

@@ -23,7 +23,6 @@ from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.fitting.corner_residuals import linearised, pixel_errors, stacks_of
 from gtsam_rwhec.fitting.held_out import held_out_errors
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 LATE = {"cam_0": 4e-3, "cam_1": -2e-3}
 OPTIONS = rw.CornerOptions(stated="calibration", time_offsets=("cam_0", "cam_1"))
@@ -49,7 +48,7 @@ def model_with_clocks(small: Cell, about: str) -> tuple[Model, Point]:
 def test_derivatives_by_the_offset_and_by_the_pose_at_the_instant(offset_s: float) -> None:
     small = moving(cell(3, images=6), 1, LATE)
     (stack, *_), A = stacks_of(small.observations)
-    p, shape = parameters_of(CAMERA), np.zeros(3)
+    p, shape = CAMERA.parameters, np.zeros(3)
     X, Y = small.X["board"], small.Y["cam_0"]
     rows = linearised(stack, X, Y, A, p, shape, offset_s)
     for by, analytic in (("time", rows.by_time), ("A", rows.by_A)):

@@ -13,7 +13,6 @@ from simulated_cells import BOARD, CAMERA, Cell, cell
 
 from gtsam_rwhec.fitting.corner_residuals import Stack, linearised, pixel_errors, shaped, stacks_of
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 Array = NDArray[np.float64]
 SHAPE = np.array([2e-3, 1e-3, -2e-3])
@@ -32,7 +31,7 @@ def stack(small: Cell) -> Stack:
 def test_pixels_of_the_truth_are_opencvs(small: Cell) -> None:
     stacks, A = stacks_of(small.observations)
     for stack in stacks:
-        errors = pixel_errors(stack, small.X["board"], small.Y[stack.sensor], A, parameters_of(CAMERA), np.zeros(3))
+        errors = pixel_errors(stack, small.X["board"], small.Y[stack.sensor], A, CAMERA.parameters, np.zeros(3))
         for v, i in enumerate(stack.instant):
             T = se3.inverse(small.Y[stack.sensor]) @ A[i] @ small.X["board"]
             seen, _ = cv2.projectPoints(BOARD.corners(), cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], CAMERA.K, CAMERA.D)
@@ -56,7 +55,7 @@ def test_a_warped_board_is_higher_at_its_edge_and_larger() -> None:
 
 def test_derivatives(small: Cell, stack: Stack) -> None:
     _, A = stacks_of(small.observations)
-    X, Y, p = small.X["board"], small.Y[stack.sensor], parameters_of(CAMERA)
+    X, Y, p = small.X["board"], small.Y[stack.sensor], CAMERA.parameters
     rows = linearised(stack, X, Y, A, p, SHAPE)
     assert rows.residual == pytest.approx(pixel_errors(stack, X, Y, A, p, SHAPE))
 
@@ -84,7 +83,7 @@ def test_a_corner_that_was_not_seen_says_nothing(small: Cell) -> None:
     }
     hidden = Observations.of(small.observations.cameras, small.observations.corners, views)
     (stack, *_), A = stacks_of(hidden)
-    rows = linearised(stack, small.X["board"], small.Y[stack.sensor], A, parameters_of(CAMERA), np.zeros(3))
+    rows = linearised(stack, small.X["board"], small.Y[stack.sensor], A, CAMERA.parameters, np.zeros(3))
     for name in ("residual", "by_X", "by_Y", "by_A", "by_camera", "by_shape"):
         assert not getattr(rows, name)[:, :12].any()
         assert getattr(rows, name)[:, 12:].all(axis=0).any()
@@ -93,4 +92,4 @@ def test_a_corner_that_was_not_seen_says_nothing(small: Cell) -> None:
 def test_a_corner_behind_its_camera_is_infinitely_wrong(small: Cell, stack: Stack) -> None:
     _, A = stacks_of(small.observations)
     turned = small.Y[stack.sensor] @ np.diag([1.0, -1.0, -1.0, 1.0])
-    assert np.isinf(pixel_errors(stack, small.X["board"], turned, A, parameters_of(CAMERA), np.zeros(3))).all()
+    assert np.isinf(pixel_errors(stack, small.X["board"], turned, A, CAMERA.parameters, np.zeros(3))).all()

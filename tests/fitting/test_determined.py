@@ -13,7 +13,6 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, FrameError, OptionError, OutlierError, UnderdeterminedError
 from gtsam_rwhec.fitting.corner_checks import told_where_it_fails
 from gtsam_rwhec.fitting.observations import Views
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of, pixels_of
 
 OPTIONS = [rw.CornerOptions(), rw.CornerOptions(carrier_noise="exact")]
 IDS = ["estimated", "exact"]
@@ -72,7 +71,7 @@ def test_turns_about_one_axis_leave_the_place_along_it_free(given: Cell) -> None
     T = np.linalg.inv(given.Y["cam_0"]) @ A @ given.X["board"]
     points = given.observations.corners["board"]
     seen = np.einsum("vij,nj->vni", T[:, :3, :3], points) + T[:, None, :3, 3]
-    pixels = pixels_of(camera, parameters_of(camera), seen[..., :2] / seen[..., 2:])
+    pixels = camera.with_parameters(camera.parameters).pixels(seen[..., :2] / seen[..., 2:])
     pixels = pixels + np.random.default_rng(0).normal(scale=0.1, size=pixels.shape)
     observations = rw.Observations.of(
         {"cam_0": given.observations.cameras["cam_0"]}, {"board": points}, {("board", "cam_0"): (A, pixels)}

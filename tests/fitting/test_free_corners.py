@@ -22,7 +22,6 @@ from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.fitting.corner_residuals import linearised, pixel_errors, stacks_of
 from gtsam_rwhec.fitting.held_out import held_out_errors
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 
 MISPRINT_M = 2e-4
 #: Covariances of poses are those of corners alone: the noise of A is more.
@@ -44,7 +43,7 @@ def model_with_corners(small: Cell) -> tuple[Model, Point]:
 
 def test_derivatives_by_a_corners_place(small: Cell) -> None:
     (stack, *_), A = stacks_of(small.observations)
-    at = small.X["board"], small.Y["cam_0"], A, parameters_of(CAMERA), np.full(3, 1e-3), 0.0
+    at = small.X["board"], small.Y["cam_0"], A, CAMERA.parameters, np.full(3, 1e-3), 0.0
     off = np.random.default_rng(2).normal(scale=1e-3, size=(35, 3))
     by_corners = linearised(stack, *at, off).by_corners
     for i, step in enumerate(1e-7 * np.eye(3)):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.fitting.stated_intrinsics import camera_with, parameters_of, pixels_and_derivatives, pixels_of
+from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
 
 K = [[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]
 LENSES = {
@@ -29,7 +29,7 @@ def camera(request: pytest.FixtureRequest) -> Camera:
 
 
 def test_parameters_are_those_of_the_camera(camera: Camera) -> None:
-    again = camera_with(camera, parameters_of(camera))
+    again = camera.with_parameters(camera.parameters)
     np.testing.assert_allclose(again.K, camera.K, rtol=1e-15)
     assert np.array_equal(again.D, camera.D)
     assert again.model == camera.model
@@ -47,18 +47,18 @@ def test_pixels_are_opencvs_and_gtsams(camera: Camera) -> None:
         expected = np.array([[model.uncalibrate(each)] for each in x])
     else:
         expected, _ = cv2.projectPoints(points, zero, zero, camera.K, camera.D)
-    assert pixels_of(camera, parameters_of(camera), x) == pytest.approx(expected[:, 0], abs=1e-9)
+    assert camera.with_parameters(camera.parameters).pixels(x) == pytest.approx(expected[:, 0], abs=1e-9)
 
 
 def test_derivatives_are_right_in_the_middle_too(camera: Camera) -> None:
     x = np.vstack([np.random.default_rng(1).uniform(-0.4, 0.4, size=(9, 2)), np.zeros((1, 2))])
-    p = parameters_of(camera)
+    p = camera.parameters
     pixels, by_x, by_p = pixels_and_derivatives(camera, p, x)
-    assert pixels == pytest.approx(pixels_of(camera, p, x))
+    assert pixels == pytest.approx(camera.with_parameters(p).pixels(x))
     e = 1e-6
     for i, step in enumerate(e * np.eye(len(p))):
-        numeric = (pixels_of(camera, p + step, x) - pixels_of(camera, p - step, x)) / (2 * e)
+        numeric = (camera.with_parameters(p + step).pixels(x) - camera.with_parameters(p - step).pixels(x)) / (2 * e)
         assert by_p[..., i] == pytest.approx(numeric, abs=1e-6)
     for i, step in enumerate(e * np.eye(2)):
-        numeric = (pixels_of(camera, p, x + step) - pixels_of(camera, p, x - step)) / (2 * e)
+        numeric = (camera.with_parameters(p).pixels(x + step) - camera.with_parameters(p).pixels(x - step)) / (2 * e)
         assert by_x[..., i] == pytest.approx(numeric, abs=1e-5)

@@ -49,7 +49,7 @@ def test_a_nominal_lens_without_rays_is_replaced_and_named(given: Cell, result: 
         assert xi @ np.linalg.solve(result.covariance(name), xi) < chi2.ppf(0.999, 6)
     stack = result.graph.model.stacks[0]
     seen = np.linalg.norm(result.intrinsics["cam_0"].camera.undistort(stack.pixels), axis=2)[stack.known]
-    assert result.graph.model.off_axis(stack, result.point)[stack.known] == pytest.approx(seen, abs=3e-3)
+    assert result.graph.model.seen(stack, result.point).radius[stack.known] == pytest.approx(seen, abs=3e-3)
     (words,) = (words for words in result.findings if "has no ray" in words and "cam_0" in words)
     assert words.startswith("As stated, the lens model of cam_0 (radtan) has no ray for ")
     assert "folds back 440 pixels from the centre. The estimated one has rays there: check D, its order" in words

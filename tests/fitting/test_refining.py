@@ -10,9 +10,8 @@ from settled_models import task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting import Component, NoiseOptions, refine_under_noise, under_noise
-from gtsam_rwhec.fitting.component_posterior import DRAWS, SAMPLES, Mixture, fitted, value_and_gradient
+from gtsam_rwhec.fitting.component_posterior import DRAWS, SAMPLES, SMALLEST, Mixture, Sizes, fitted, value_and_gradient
 from gtsam_rwhec.fitting.fit_options import Walk
-from gtsam_rwhec.fitting.noise_components import SMALLEST, Sizes
 from gtsam_rwhec.fitting.noise_likelihood import Estimate
 
 C = Component

@@ -14,7 +14,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, FrameError, OptionError
-from gtsam_rwhec.fitting.stated_intrinsics import innovation_of, parameters_of, wider
+from gtsam_rwhec.fitting.stated_intrinsics import innovation_of, wider
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ def off(given: Cell, result: rw.CornersRefined, name: str) -> Array:
 def squared_deviations(given: Cell, result: rw.CornersRefined) -> tuple[float, int]:
     """Of all unknowns together: chi-square of their number."""
     errors = [off(given, result, name) for name in (*result.X, *result.Y)]
-    errors += [parameters_of(given.cameras[name]) - parameters_of(result.intrinsics[name].camera) for name in result.Y]
+    errors += [given.cameras[name].parameters - result.intrinsics[name].camera.parameters for name in result.Y]
     names = [*result.X, *result.Y, *(f"intrinsics:{name}" for name in result.Y)]
     if "shape:board" in result.names:
         errors.append(given.shape - result.shapes["board"])
@@ -48,7 +48,7 @@ def test_exact_corners_give_the_truth() -> None:
     result = refined(given, rw.CornerOptions(carrier_noise="exact"))
     for name in ("board", "cam_0", "cam_1"):
         assert np.abs(off(given, result, name)).max() < 1e-6
-    assert parameters_of(result.intrinsics["cam_0"].camera) == pytest.approx(parameters_of(CAMERA), abs=1e-4)
+    assert result.intrinsics["cam_0"].camera.parameters == pytest.approx(CAMERA.parameters, abs=1e-4)
 
 
 @pytest.mark.parametrize("about", ["targetcarrier", "sensorcarrier"])
@@ -118,7 +118,7 @@ def test_cameras_of_one_model_may_share_their_intrinsics() -> None:
     given = cell(8, images=30, stated="calibration")
     options = rw.CornerOptions(stated="calibration", carrier_noise="exact", shared=(("cam_0", "cam_1"),))
     shared, apart = refined(given, options), refined(given, replace(options, shared=()))
-    first, second = (parameters_of(shared.intrinsics[name].camera) for name in ("cam_0", "cam_1"))
+    first, second = (shared.intrinsics[name].camera.parameters for name in ("cam_0", "cam_1"))
     assert np.array_equal(first, second)
     better = np.diagonal(shared.intrinsics["cam_0"].covariance) < np.diagonal(apart.intrinsics["cam_0"].covariance)
     assert better.all()
@@ -164,8 +164,8 @@ def test_intrinsics_are_no_worse_than_opencvs_and_better_with_the_arm_known() ->
             np.pad(stated.D, (0, 1)),
             flags=flags,
         )
-        truth = parameters_of(CAMERA)[:4]
-        ours.append(parameters_of(result.intrinsics["cam_0"].camera)[:4] - truth)
+        truth = CAMERA.parameters[:4]
+        ours.append(result.intrinsics["cam_0"].camera.parameters[:4] - truth)
         theirs.append(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) - truth)
     assert np.square(ours).mean() < 0.7 * np.square(theirs).mean()
 

@@ -10,7 +10,7 @@ from refinement_problems import copied, distance, refined, rig
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.pose_models import GeodesicModel
+from gtsam_rwhec.fitting.pose_fit import GeodesicModel
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.simulate import Noise, Simulation, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses

@@ -11,7 +11,7 @@ from simulated_cells import CAMERA, Cell, cell
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.fitting.fit_options import Stated
-from gtsam_rwhec.fitting.stated_intrinsics import held_by_prior, parameters_of, pixels_of
+from gtsam_rwhec.fitting.stated_intrinsics import held_by_prior
 
 
 def refined(given: Cell, stated: Stated) -> rw.CornersRefined:
@@ -36,7 +36,7 @@ def test_what_the_images_do_not_tell_is_named_and_no_more_is_claimed(
         assert set(names) <= set(camera.held_by_prior)
         deviations = np.sqrt(np.diagonal(camera.covariance))
         assert (deviations <= camera.stated_deviations * (1.0 + 1e-9)).all()
-        off = parameters_of(CAMERA) - parameters_of(camera.camera)
+        off = CAMERA.parameters - camera.camera.parameters
         squared = off @ np.linalg.solve(camera.covariance, off)
         assert squared < result.squared_radius(f"intrinsics:{sensor}", 0.999)
         said = ", ".join(camera.held_by_prior)
@@ -54,7 +54,7 @@ def test_a_carrier_that_only_translates_determines_no_pose() -> None:
     A = moves @ start
     seen = np.linalg.inv(given.Y["cam_0"]) @ A @ given.X["board"]
     points = given.observations.corners["board"] @ seen[:, :3, :3].transpose(0, 2, 1) + seen[:, None, :3, 3]
-    pixels = pixels_of(CAMERA, parameters_of(CAMERA), points[..., :2] / points[..., 2:])
+    pixels = CAMERA.with_parameters(CAMERA.parameters).pixels(points[..., :2] / points[..., 2:])
     observations = rw.Observations.of({"cam_0": CAMERA}, {"board": given.observations.corners["board"]},
                                       {("board", "cam_0"): (A, pixels)})  # fmt: skip
     for noise in ("exact", "estimate"):

@@ -10,7 +10,6 @@ from refined_corners import two_cameras
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.corner_residuals import pixel_errors
 from gtsam_rwhec.fitting.reprojection_record import BoardShape, Reprojection
-from gtsam_rwhec.fitting.stated_intrinsics import parameters_of
 from gtsam_rwhec.results.image_errors import CornerErrors, SeenView, board_of, errors_at_optimum
 
 
@@ -41,7 +40,7 @@ def test_errors_are_those_of_the_optimum_where_A_is_a_variable() -> None:
         errors_px = np.concatenate([of.px for of in found])
         camera = corners.intrinsics[sensor].camera
         X, Y = corners.X["board"].matrix(), corners.Y[sensor].matrix()
-        optimum = pixel_errors(stack, X, Y, corners.point.A, parameters_of(camera), corners.shapes["board"])
+        optimum = pixel_errors(stack, X, Y, corners.point.A, camera.parameters, corners.shapes["board"])
         assert errors_px.shape == stack.pixels.reshape(-1, 2).shape
         apart = np.abs(errors_px) - np.abs(optimum.reshape(-1, 2))  # whichever is taken from the other
         assert np.abs(apart).max() < 0.05
