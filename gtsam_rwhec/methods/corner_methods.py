@@ -1,25 +1,20 @@
 """Methods on corners: Evangelista et al. 2023 and Tabb and Ahmad Yousef's rp1 (2017); intrinsics are held."""
 
 from __future__ import annotations
+
 from collections import Counter
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
 import numpy as np
 from rwhec_factors import se3
+
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.corner_residuals import SHAPE
-from gtsam_rwhec.fitting.corner_residuals import Linear
-from gtsam_rwhec.fitting.corner_residuals import Stack
-from gtsam_rwhec.fitting.corner_residuals import linearised
-from gtsam_rwhec.fitting.corner_residuals import pixel_errors
-from gtsam_rwhec.fitting.corner_residuals import stacks_of
+from gtsam_rwhec.fitting.corner_residuals import SHAPE, Linear, Stack, linearised, pixel_errors, stacks_of
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.methods.iterative_methods import CHARTS
-from gtsam_rwhec.methods.iterative_methods import Parameterisation
-from gtsam_rwhec.methods.levenberg_marquardt import Linearised
-from gtsam_rwhec.methods.levenberg_marquardt import descend
+from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
+from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
 
 #: Boards are as stated.
 FLAT = np.zeros(SHAPE)
