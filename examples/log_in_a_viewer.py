@@ -1,4 +1,4 @@
-"""A robot's log, calibrated; then what any MCAP viewer shows of ``clean.mcap``: frames in their places, tags in images.
+"""A log, calibrated; then what any MCAP viewer shows of ``calibration.mcap``: frames in their places, tags in images.
 
     python examples/log_in_a_viewer.py
 
@@ -44,7 +44,7 @@ def main() -> None:
         out = Path(folder)
         calibrated = calibrate_log(CELL / "eye_to_hand.mcap", read_rig(CELL / "eye_to_hand.yaml"), out, images="copy")
         print(calibrated.refined.solution.certificate)
-        figure = draw(out / "clean.mcap")
+        figure = draw(out / "calibration.mcap")
     save(figure, arguments.save, "log_in_a_viewer.png")
 
 

@@ -171,7 +171,7 @@ def calibrate(
 ) -> ExitStatus:
     """Calibrate from a log or from a folder of CSV files; print the verdict, what to do, and the poses.
 
-    A log needs a rig file, which states the sizes of the targets. Its calibration writes clean.mcap, result.json,
+    A log needs a rig file, which states the sizes of the targets. Its calibration writes calibration.mcap, result.json,
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, and the cameras for Kalibr, ROS, OpenCV and COLMAP.
     """
     if rig is not None or is_log(source):

@@ -113,7 +113,7 @@ def clean(
 
 def solve(
     cleaned: Annotated[Path, typer.Argument(help="The log that clean wrote.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for result.json and clean.mcap.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for result.json and calibration.mcap.")],
     rig: RigOption = None,
     verbose: VerboseOption = False,
 ) -> ExitStatus:
@@ -126,14 +126,14 @@ def solve(
     with StageDisplay() as stage, said_in_the_report():
         calibrated = rw.runs.solve_into(cleaned, described, output, progress=stage)
     messages = (
-        f"Written: {shown_path(output / rw.runs.RESULT_FILE)}, {shown_path(output / rw.runs.CLEAN_LOG)}.",
-        f"Next: gtsam-rwhec export {shown_path(output / rw.runs.CLEAN_LOG)} -o FOLDER",
+        f"Written: {shown_path(output / rw.runs.RESULT_FILE)}, {shown_path(output / rw.runs.CALIBRATION_LOG)}.",
+        f"Next: gtsam-rwhec export {shown_path(output / rw.runs.CALIBRATION_LOG)} -o FOLDER",
     )
     return show(calibrated, messages, verbose=verbose)
 
 
 def export(
-    solved: Annotated[Path, typer.Argument(help="The clean.mcap that solve or calibrate wrote.")],
+    solved: Annotated[Path, typer.Argument(help="The calibration.mcap that solve or calibrate wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
     anyway: AnywayOption = False,
 ) -> ExitStatus:

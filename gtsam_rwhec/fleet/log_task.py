@@ -34,7 +34,7 @@ from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_agai
 from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, read_pairs
-from gtsam_rwhec.runs.run_log import CLEAN_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata
+from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata
 from gtsam_rwhec.runs.topics_of_rig import wanted_topics
 
 #: The folder of partial results, below the output.
@@ -85,7 +85,7 @@ def _partial(task: LogTask, folder: Path) -> PartialResult:
     """The partial result of a log. What is said of files of the worker is said of the log."""
     rig = task.rig.rig(folder)
     _refuse_odometry(rig)
-    detected, cleaned = folder / DETECTED_LOG, folder / CLEAN_LOG
+    detected, cleaned = folder / DETECTED_LOG, folder / CALIBRATION_LOG
     places = [str(detected), str(cleaned)]
 
     def in_words(said: object) -> str:

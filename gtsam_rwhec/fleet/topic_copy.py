@@ -37,7 +37,7 @@ REQUEST, TOGETHER = 8 << 20, 32 << 20
 #: This library's own metadata begin with this word; others are not read.
 _OWN = "gtsam_rwhec."
 #: These files are written beside the log by the stages.
-_OF_STAGES = ("detected.mcap", "clean.mcap")
+_OF_STAGES = ("detected.mcap", "calibration.mcap")
 
 
 class LocalCopy(NamedTuple):

@@ -47,7 +47,7 @@ from gtsam_rwhec.runs.output_folder import (
     output_folder,
 )
 from gtsam_rwhec.runs.run_log import (
-    CLEAN_LOG,
+    CALIBRATION_LOG,
     CLEANING_METADATA,
     DETECTED_LOG,
     RECORDED_LOG,
@@ -88,7 +88,7 @@ def solve_odometries(
             raise OptionError(f"{clean_path}: its rig file has sensors that see targets; solve it with solve_log")
         metadata = read_metadata(log)
         if metadata.cleaning is None:
-            raise LogError(f"{clean_path} was not cleaned: gtsam-rwhec clean {clean_path} -o clean.mcap")
+            raise LogError(f"{clean_path} was not cleaned: gtsam-rwhec clean {clean_path} -o cleaned.mcap")
         tracks = [_on_reference_clock(read_odometry(log, rig, name), rig) for name in rig.odometries]
     assert rig.reference is not None
     found = calibrate_odometries(
@@ -141,12 +141,12 @@ def options_of(rig: Rig) -> OdometryOptions:
 def solve_odometries_into(
     clean_path: str | Path, rig: Rig | None, out: str | Path, *, progress: Progress | None = None
 ) -> OdometrySolved:
-    """Solve; write ``result.json``, ``report.html``, and ``clean.mcap`` with the solution, into a folder."""
+    """Solve; write ``result.json``, ``report.html``, and ``calibration.mcap`` with the solution, into a folder."""
     out = made_output_folder(out)
     solved = solve_odometries(clean_path, rig, progress=progress)
     write_odometry_result(solved.result, out / RESULT_FILE)
     write_odometry_page(solved.result, out / REPORT_FILE)
-    with open_log(clean_path) as log, LogWriter(out / CLEAN_LOG) as writer:
+    with open_log(clean_path) as log, LogWriter(out / CALIBRATION_LOG) as writer:
         writer.copy(log, topics_up_to_detection(log), "leave_out")
         pairs = read_pairs(log, solved.rig)
         write_pairs(writer, pairs.values())
@@ -156,7 +156,7 @@ def solve_odometries_into(
         named = [(parent, child, np.asarray(T, dtype=np.float64)) for parent, child, T in frames.sensor_frames()]
         writer.transforms(SOLUTION_TOPIC, first_ns, named)
         writer.attachment(RESULT_FILE, "application/json", result_json(solved.result), first_ns)
-    list_written(out, solved.result.sources, [out / name for name in (RESULT_FILE, REPORT_FILE, CLEAN_LOG)])
+    list_written(out, solved.result.sources, [out / name for name in (RESULT_FILE, REPORT_FILE, CALIBRATION_LOG)])
     return solved
 
 
@@ -214,7 +214,7 @@ def calibrate_odometry_log(
 ) -> OdometrySolved:
     """Calibrate sensors that know only their own motion, from a log and a rig file to a folder of files.
 
-    The folder gets ``clean.mcap``, ``result.json``, ``report.html``, and the frames for ROS and URDF.
+    The folder gets ``calibration.mcap``, ``result.json``, ``report.html``, and the frames for ROS and URDF.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def calibrate_odometry_log(
         if is_raw and rig is None:
             raise LogError(f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
         if is_raw:
-            for name in (DETECTED_LOG, CLEAN_LOG):
+            for name in (DETECTED_LOG, CALIBRATION_LOG):
                 check_is_not_read(log, Path(out) / name)
         is_cleaned = CLEANING_METADATA in log.metadata() and (
             rig is None or not changes(read_embedded_rig(log), rig).cleaning
@@ -298,10 +298,10 @@ def _stages(
         detect_log(list(files), rig, out / DETECTED_LOG, progress=progress)
         files = [out / DETECTED_LOG]
     if not is_cleaned:
-        clean_log(files[0], out / CLEAN_LOG, rig, images="leave_out", progress=progress)
-        files = [out / CLEAN_LOG]
+        clean_log(files[0], out / CALIBRATION_LOG, rig, images="leave_out", progress=progress)
+        files = [out / CALIBRATION_LOG]
     solved = solve_odometries_into(files[0], rig, out, progress=progress)
-    export_odometries(out / CLEAN_LOG, out, anyway=anyway, progress=progress)
+    export_odometries(out / CALIBRATION_LOG, out, anyway=anyway, progress=progress)
     return solved
 
 

@@ -129,7 +129,7 @@ def _removed(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
         rest = Table("Removed measurements: the others", headings, tuple(rows[MOST_ROWS:]))
         yield Folded(f"{len(rows) - MOST_ROWS} more rows", (rest,))
     if seen.removed_list:
-        where = "the topics /calibration/SENSOR/pairs of clean.mcap have them" if "log" in shown.tree else ""
+        where = "the topics /calibration/SENSOR/pairs of calibration.mcap have them" if "log" in shown.tree else ""
         more = seen.removed - len(seen.removed_list) if len(seen.removed_list) == MOST_LISTED else 0
         blocks: list[Block] = [
             Table(

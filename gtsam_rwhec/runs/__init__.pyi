@@ -31,7 +31,7 @@ from .odometry_tracks import read_odometry as read_odometry
 
 # What comes out, and what a log that a stage wrote holds.
 from .output_folder import earlier_run as earlier_run
-from .run_log import CLEAN_LOG as CLEAN_LOG
+from .run_log import CALIBRATION_LOG as CALIBRATION_LOG
 from .run_log import REPORT_FILE as REPORT_FILE
 from .run_log import RESULT_FILE as RESULT_FILE
 from .log_corners import read_corners as read_corners

@@ -109,8 +109,8 @@ def read_corners(path: str | Path) -> Observations:
     Parameters
     ----------
     path
-        The log that ``clean_log`` or ``solve_log`` wrote, such as ``clean.mcap``. Of a solved log, A is at the time
-        offsets of the answer, and outliers are left out.
+        The log that ``clean_log`` or ``solve_into`` wrote, such as ``calibration.mcap``. Of a solved log, A is at the
+        time offsets of the answer, and outliers are left out.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.results.result_file import Result, parse_result, read_result, result_path
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.sections import Intrinsics
-from gtsam_rwhec.runs.run_log import CLEAN_LOG, RESULT_FILE, read_cameras, read_embedded_rig
+from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, RESULT_FILE, read_cameras, read_embedded_rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class OldCalibration:
 
     @staticmethod
     def read(path: str | Path) -> OldCalibration:
-        """From an output folder, its ``clean.mcap``, or a result file, beside which the solved log may be.
+        """From an output folder, its ``calibration.mcap``, or a result file, beside which the solved log may be.
 
         Raises
         ------
@@ -50,7 +50,7 @@ class OldCalibration:
             result, solved = parse_result(content, f"{path}, attachment {RESULT_FILE}"), path
         else:
             file = result_path(path)
-            result, solved = read_result(file), file.with_name(CLEAN_LOG)
+            result, solved = read_result(file), file.with_name(CALIBRATION_LOG)
         rig, cameras = None, {}
         if solved.is_file():
             with open_log(solved) as log:

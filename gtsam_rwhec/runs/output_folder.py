@@ -18,7 +18,7 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.runs.kept_detections import KeptDetections, differences, kept_inputs
 from gtsam_rwhec.runs.run_log import (
-    CLEAN_LOG,
+    CALIBRATION_LOG,
     DETECTED_LOG,
     EVIDENCE_FILE,
     RECORDED_LOG,
@@ -28,7 +28,7 @@ from gtsam_rwhec.runs.run_log import (
 )
 
 #: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
-LEFT = (CLEAN_LOG, REPORT_FILE, RESULT_FILE, EVIDENCE_FILE, *FILES, SEEN_SHEET)
+LEFT = (CALIBRATION_LOG, REPORT_FILE, RESULT_FILE, EVIDENCE_FILE, *FILES, SEEN_SHEET)
 #: With the log that it has during the work.
 WRITTEN = (*LEFT, DETECTED_LOG)
 
@@ -59,7 +59,7 @@ def made_folder(path: str | Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(f"{path} cannot be made a folder: {error.strerror}.") from error
-    check_writable(path / CLEAN_LOG)
+    check_writable(path / CALIBRATION_LOG)
     return path
 
 
@@ -71,7 +71,7 @@ def made_output_folder(path: str | Path) -> Path:
             check_writable(path / name)
     for inside in (path / name for name in FOLDERS):
         if inside.is_dir():
-            check_writable(inside / CLEAN_LOG)
+            check_writable(inside / CALIBRATION_LOG)
         elif os.path.lexists(inside):
             raise LogError(f"{inside} cannot be made a folder: it is a file.")
     return path

@@ -56,10 +56,10 @@ CERTIFICATE_METADATA = "gtsam_rwhec.certificate"
 RECORDED_LOG = ".images.mcap"
 #: This metadata has the names of the files that a folder's images were, by topic and stamp (`image_key`).
 IMAGES_METADATA = "gtsam_rwhec.images"
-#: Detection writes this file in the output folder. It is removed at the end.
+#: A log of detections on the way to one that is calibrated. It is removed at the end.
 DETECTED_LOG = "detected.mcap"
-#: Cleaning writes this file in the output folder. Solving adds its solution to it.
-CLEAN_LOG = "clean.mcap"
+#: The log of a run in the output folder: what was recorded, detected, cleaned and solved.
+CALIBRATION_LOG = "calibration.mcap"
 #: The result's file in the output folder has this name, and so has its copy attached to the solved log.
 RESULT_FILE = "result.json"
 #: What the report shows beside the result, in the output folder.

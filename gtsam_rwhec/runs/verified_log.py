@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import gtsam
 import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -18,7 +17,7 @@ from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.results.change_test import LEVEL, checked_level
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.results.result_file import Result
@@ -26,18 +25,18 @@ from gtsam_rwhec.results.verification import Verification, verify
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning, rig_for_solving
-from gtsam_rwhec.runs.cleaning_stage import clean_log
+from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.corner_answer import with_intrinsics
-from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.detection_stage import detected
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
 from gtsam_rwhec.runs.old_calibration import OldCalibration, with_cameras
 from gtsam_rwhec.runs.recorded_logs import is_file_of_samples, is_folder_of_images, write_folder_log, write_samples_log
 from gtsam_rwhec.runs.run_log import (
-    CLEAN_LOG,
+    CALIBRATION_LOG,
     CLEANING_METADATA,
-    DETECTED_LOG,
     RECORDED_LOG,
+    RunLog,
     is_from_stage,
     read_cleaning_report,
     read_metadata,
@@ -68,7 +67,7 @@ def verify_log(
     Parameters
     ----------
     old
-        The output folder of a calibration, its ``clean.mcap`` or its ``result.json``.
+        The output folder of a calibration, its ``calibration.mcap`` or its ``result.json``.
     log_path
         As for ``calibrate_log``; of a log that a stage wrote, only the stages after it run.
     rig : Rig, optional
@@ -88,82 +87,63 @@ def verify_log(
     checked_level(level)
     tell = progress or silent
     calibration = OldCalibration.read(old)
+    given = rig
+    rig = rig or calibration.rig
     with TemporaryDirectory(prefix="gtsam-rwhec-verify-") as folder:
-        cleaned, rig = _cleaned(log_path, rig, calibration, Path(folder), workers, tell)
-        return _verified(calibration, cleaned, rig, level=level, targets_may_move=targets_may_move, tell=tell)
+        if rig is not None and not isinstance(log_path, list):
+            source, recorded = Path(log_path), Path(folder) / f"new{RECORDED_LOG}"
+            if is_folder_of_images(source, rig):
+                rig = rig.model_copy(update={"folder": source})
+                write_folder_log(source, rig, recorded, progress=tell)
+                log_path = recorded
+            elif is_file_of_samples(source, rig):
+                tell(write_samples_log(source, rig, recorded))
+                log_path = recorded
+        with open_log(log_path) as log:
+            found: Log = log
+            if not is_from_stage(log):
+                if rig is None:
+                    raise LogError(
+                        f"{log.files[0].path}: a raw log needs a rig file, and the old calibration has no "
+                        f"{CALIBRATION_LOG} that holds one: give --rig FILE"
+                    )
+                found = detected(log, with_cameras(rig, calibration.cameras), workers=workers, progress=tell)
+                given = None
+            if CLEANING_METADATA not in found.metadata():
+                found, given = _cleaned(found, given, calibration, tell), None
+            return _verified(calibration, found, given, level=level, targets_may_move=targets_may_move, tell=tell)
 
 
-def _cleaned(
-    log_path: str | Path | list[str | Path],
-    given: Rig | None,
-    old: OldCalibration,
-    folder: Path,
-    workers: int | None,
-    tell: Progress,
-) -> tuple[Path, Rig | None]:
-    """The new log after detection and cleaning, and the rig file for what comes after, if it is not the log's own."""
-    rig = given or old.rig
-    if rig is not None and not isinstance(log_path, list):
-        source = Path(log_path)
-        if is_folder_of_images(source, rig):
-            recorded = folder / f"new{RECORDED_LOG}"
-            rig = rig.model_copy(update={"folder": source})
-            write_folder_log(source, rig, recorded, progress=tell)
-            log_path = recorded
-        elif is_file_of_samples(source, rig):
-            recorded = folder / f"new{RECORDED_LOG}"
-            tell(write_samples_log(source, rig, recorded))
-            log_path = recorded
-    with open_log(log_path) as log:
-        files = [file.path for file in log.files]
-        is_raw = not is_from_stage(log)
-        is_cleaned = CLEANING_METADATA in log.metadata()
-    if is_cleaned:
-        return files[0], given
-    detected = files[0]
-    if is_raw:
-        if rig is None:
-            raise LogError(
-                f"{files[0]}: a raw log needs a rig file, and the old calibration has no {CLEAN_LOG} that holds one: "
-                "give --rig FILE"
-            )
-        detected = folder / DETECTED_LOG
-        detect_log(list(files), with_cameras(rig, old.cameras), detected, workers=workers, progress=tell)
-    _clean(detected, folder / CLEAN_LOG, None if is_raw else given, old, tell)
-    return folder / CLEAN_LOG, None
-
-
-def _clean(detected: Path, cleaned: Path, rig: Rig | None, old: OldCalibration, tell: Progress) -> None:
-    """Clean a log; where its motion does not tell the time offset of a sensor, the old one is taken as stated."""
+def _cleaned(detections: Log, given: Rig | None, old: OldCalibration, tell: Progress) -> RunLog:
+    """A cleaned log; where its motion does not tell the time offset of a sensor, the old one is taken as stated."""
     before = {} if old.result.log is None else {one.sensor: one.offset_s for one in old.result.log.time_offsets}
-    with open_log(detected) as log:
-        rig = rig_for_cleaning(log, rig)
+    rig = rig_for_cleaning(detections, given)
     free = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in before]
+    found: RunLog | None = None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LogWarning)
-            found = clean_log(detected, cleaned, rig, images="leave_out", progress=tell).time_offsets_s
+            found = cleaned(detections, rig, tell)
     except StampError:
         if not free:
             raise
-        found = {}
-    untold = [name for name in free if name not in found]
-    if untold:
-        sensors = {
-            name: sensor.model_copy(update={"time_offset": before[name]}) if name in untold else sensor
-            for name, sensor in rig.sensors.items()
-        }
-        rig = rig.model_copy(update={"sensors": sensors})
-        clean_log(detected, cleaned, rig, images="leave_out", progress=tell)
+    offsets_s = {} if found is None else read_cleaning_report(found).time_offsets_s
+    untold = [name for name in free if name not in offsets_s]
+    if found is not None and not untold:
+        return found
+    sensors = {
+        name: sensor.model_copy(update={"time_offset": before[name]}) if name in untold else sensor
+        for name, sensor in rig.sensors.items()
+    }
+    return cleaned(detections, rig.model_copy(update={"sensors": sensors}), tell)
 
 
 def _verified(
-    old: OldCalibration, cleaned: Path, given: Rig | None, *, level: float, targets_may_move: bool, tell: Progress
+    old: OldCalibration, log: Log, given: Rig | None, *, level: float, targets_may_move: bool, tell: Progress
 ) -> Verification:
-    with open_log(cleaned) as log:
-        rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
-        pairs, motion = without_outlier_marks(read_pairs(log, rig)), read_carrier_motion(log, rig)
-        corners = LogCorners.of(log, rig, metadata.cameras)
+    rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
+    pairs, motion = without_outlier_marks(read_pairs(log, rig)), read_carrier_motion(log, rig)
+    corners = LogCorners.of(log, rig, metadata.cameras)
     _check_carriers(old.result, rig)
     used = {measured.sensor for measured in pairs.values() if measured.used.any()}
     free = tuple(name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used)
@@ -244,17 +224,12 @@ def pixel_errors(
         if not len(seen):
             continue
         scale = answer.scale[pair.target] if isinstance(answer.scale, dict) else answer.scale
-        T = _inverse(answer.Y[sensor]) @ measured.A[seen] @ answer.X[pair.target].matrix()
+        T = answer.Y[sensor].inverse().matrix() @ measured.A[seen] @ answer.X[pair.target].matrix()
         points = np.einsum("nij,kj->nki", T[:, :3, :3], corners.targets[pair.target] / scale) + T[:, None, :3, 3]
         projected = cameras[sensor].project(points.reshape(-1, 3)).reshape(pixels.shape)
         lengths = np.linalg.norm(projected - pixels, axis=2)
         found.append(lengths[np.isfinite(lengths)])
     return np.concatenate(found) if found else np.zeros(0)
-
-
-def _inverse(pose: gtsam.Pose3) -> Array:
-    inverse: Array = pose.inverse().matrix()
-    return inverse
 
 
 def _median(errors: Array | None) -> float | None:

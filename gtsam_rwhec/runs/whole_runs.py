@@ -41,7 +41,7 @@ from gtsam_rwhec.runs.recorded_logs import (
     write_samples_log,
 )
 from gtsam_rwhec.runs.run_log import (
-    CLEAN_LOG,
+    CALIBRATION_LOG,
     CLEANING_METADATA,
     RECORDED_LOG,
     RESULT_FILE,
@@ -85,7 +85,7 @@ def calibrate_log(
 ) -> Calibrated:
     """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
 
-    The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
+    The folder gets ``calibration.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
     ``camchain.yaml``, ``cameras.opencv.yaml``, ``cameras.txt`` (COLMAP's), ``camera_info/`` (ROS's, one file a camera),
     ``seen.png`` (a contact sheet of the images), and ``report.html`` with its ``evidence.json``. For a log
     that a stage wrote, only the stages after it run. A cleaned log is cleaned again if the settings for cleaning in
@@ -105,7 +105,7 @@ def calibrate_log(
     out
         The folder; it is made if it does not exist.
     images : "copy" or "leave_out"
-        Whether ``clean.mcap`` has the images too.
+        Whether ``calibration.mcap`` has the images too.
     workers : int, optional
         Threads, and for long logs processes, for detection; by default one for each core.
     anyway : bool
@@ -146,7 +146,7 @@ def calibrate_log(
                 raise LogError(
                     f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one"
                 )
-            check_is_not_read(log, Path(out) / CLEAN_LOG)
+            check_is_not_read(log, Path(out) / CALIBRATION_LOG)
             sources = tuple(file.name for file in files)
         else:
             _check_is_alone(log)
@@ -239,7 +239,7 @@ def solve_into(
     images: Images = "copy",
     progress: Progress | None = None,
 ) -> Calibrated:
-    """Solve from a cleaned log; write ``result.json``, and ``clean.mcap`` with the solution, into a folder.
+    """Solve from a cleaned log; write ``result.json``, and ``calibration.mcap`` with the solution, into a folder.
 
     Raises
     ------
@@ -250,7 +250,7 @@ def solve_into(
     with open_log(clean_path) as log:
         calibrated = solve_log(log, rig, progress=progress)
         _write_solution(log, calibrated, out, images)
-    list_written(out, calibrated.log.detection.sources, [out / RESULT_FILE, out / CLEAN_LOG])
+    list_written(out, calibrated.log.detection.sources, [out / RESULT_FILE, out / CALIBRATION_LOG])
     return calibrated
 
 
@@ -258,7 +258,7 @@ def _write_solution(log: Log, calibrated: Calibrated, out: Path, images: Images)
     """Write the result, and the log with all that was found; return the result's content."""
     content = result_json(calibrated.calibration, calibrated.log, out / RESULT_FILE)
     write_atomically(out / RESULT_FILE, content)
-    write_solved(log, calibrated, out / CLEAN_LOG, result=content, images=images)
+    write_solved(log, calibrated, out / CALIBRATION_LOG, result=content, images=images)
     return content
 
 

@@ -314,7 +314,7 @@ def test_one_bad_image_costs_one_image_and_is_named(cell: Path, tmp_path: Path) 
     assert status == 2
     assert "thesis.tex" in foreign
     assert [path.name for path in out.iterdir()] == ["thesis.tex"]
-    assert command("export", tmp_path / "out" / "clean.mcap", "-o", tmp_path / "files", "--anyway")[0] == 0
+    assert command("export", tmp_path / "out" / "calibration.mcap", "-o", tmp_path / "files", "--anyway")[0] == 0
 
 
 def test_images_without_a_rig_file(cell: Path, tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
     out = tmp_path / "gtsam-rwhec-demo"
     files = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     assert files == {
-        "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
+        "calibration.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
         ".written.json", "seen.png", "cameras.opencv.yaml", "cameras.txt",
         "report.html", "evidence.json",
         "camera_info/cam_left.yaml", "camera_info/cam_wide.yaml",

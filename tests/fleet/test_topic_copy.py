@@ -101,11 +101,11 @@ def test_logs_without_a_good_index_are_read_whole(kind: str, server: S3Server, l
         assert isinstance(needed, Needed)
         content[needed.chunks[0].chunk_start_offset] ^= 0x40  # no chunk begins there
         path.write_bytes(content)
-    url = f"s3://{BUCKET}/{kind}/clean.mcap"
+    url = f"s3://{BUCKET}/{kind}/calibration.mcap"
     stores.write_once(url, path.read_bytes())
     with pytest.warns(LogWarning, match=rf"{url}: .*; all of its {path.stat().st_size} bytes are read"):
         copy = local_copy_of_topics(url, TOPICS, tmp_path)
-    assert copy.path == tmp_path / "log_clean.mcap"  # the stages write a clean.mcap beside it
+    assert copy.path == tmp_path / "log_calibration.mcap"  # the stages write a calibration.mcap beside it
     assert copy.path.read_bytes() == path.read_bytes()
 
 

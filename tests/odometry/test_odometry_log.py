@@ -118,11 +118,11 @@ def test_what_a_stage_writes_the_next_reads(
 ) -> None:
     _, folder, _ = six
     first = read_odometry_result(folder / "out" / "result.json")
-    solved = rw.odometry.solve_odometries_into(folder / "out" / "clean.mcap", None, tmp_path)
+    solved = rw.odometry.solve_odometries_into(folder / "out" / "calibration.mcap", None, tmp_path)
     assert solved.result == first
-    assert rw.odometry.read_odometries(tmp_path / "clean.mcap").result == first
-    assert {path.name for path in rw.odometry.export_odometries(tmp_path / "clean.mcap", tmp_path)} >= {"tf.yaml"}
-    with rw.logs.open_log(tmp_path / "clean.mcap") as log:
+    assert rw.odometry.read_odometries(tmp_path / "calibration.mcap").result == first
+    assert {path.name for path in rw.odometry.export_odometries(tmp_path / "calibration.mcap", tmp_path)} >= {"tf.yaml"}
+    with rw.logs.open_log(tmp_path / "calibration.mcap") as log:
         pairs = rw.runs.read_pairs(log, solved.rig)
     assert {pair.sensor for pair in pairs} == set(MOUNTS)
     assert all(one.used.sum() > 50 for one in pairs.values())
@@ -149,7 +149,7 @@ def test_a_plane_leaves_heights_free_until_they_are_given(tmp_path: Path) -> Non
     assert not (tmp_path / "free" / "tf.yaml").exists()
     for cells in pose_table(free.result).rows.values():  # no number in the place of a height that is not known
         assert [cell == "free" for cell in cells[:6]] == [False, False, True, False, False, False]
-    assert {path.name for path in (tmp_path / "free").iterdir()} >= {"result.json", "report.html", "clean.mcap"}
+    assert {path.name for path in (tmp_path / "free").iterdir()} >= {"result.json", "report.html", "calibration.mcap"}
     given = "given: {heights_m: {lidar_front: 0.6, lidar_rear: 0.9, lidar_roof: 1.9}}\n"
     known = rw.odometry.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text + given, "rig.yaml"), tmp_path / "known")
     assert known.result.not_determined == ()

@@ -28,7 +28,7 @@ WITH_IMAGES = {
 }
 #: What there is of a calibration.
 WRITTEN = {
-    "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
+    "calibration.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
     "cameras.opencv.yaml", "cameras.txt", "report.html", "evidence.json",
 }  # fmt: skip
 

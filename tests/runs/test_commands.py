@@ -68,10 +68,10 @@ def test_stage_by_stage(log: Path, tmp_path: Path) -> None:
     assert "measurements to use" in run("clean", detected, "-o", cleaned).stdout
     said = run("solve", cleaned, "-o", out, "--verbose").stdout
     assert "Certified globally optimal" in said
-    assert sorted(path.name for path in out.iterdir()) == [".written.json", "clean.mcap", "result.json"]
-    written = run("export", out / "clean.mcap", "-o", out).stdout.splitlines()
+    assert sorted(path.name for path in out.iterdir()) == [".written.json", "calibration.mcap", "result.json"]
+    written = run("export", out / "calibration.mcap", "-o", out).stdout.splitlines()
     assert all(Path(path).is_file() for path in written)
-    assert {"camchain.yaml", "tf.yaml", "frames.png"} <= {Path(path).name for path in written}
+    assert {"camchain.yaml", "tf.yaml"} <= {Path(path).name for path in written}
     assert set(rw.read_refined(out / "result.json").Y) == {"cam_left", "cam_wide"}
 
 

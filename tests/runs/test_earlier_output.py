@@ -19,8 +19,8 @@ from gtsam_rwhec.runs.output_folder import (
 
 LOG = "run.mcap"
 ALL = (
-    "result.json", "clean.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
-    "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_0.yaml",
+    "result.json", "calibration.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro",
+    "camchain.yaml", "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_0.yaml",
 )  # fmt: skip
 
 
@@ -128,11 +128,11 @@ def test_an_unfinished_run_is_gone_on_with(tmp_path: Path) -> None:
     interrupted(tmp_path, "tf.yaml")
     (tmp_path / "result.json").write_bytes(b"written just before the end")
     (tmp_path / "camera_info").mkdir(exist_ok=True)
-    for part in (".clean.mcap.123.part", "camera_info/.cam_0.yaml.123.part"):
+    for part in (".calibration.mcap.123.part", "camera_info/.cam_0.yaml.123.part"):
         (tmp_path / part).write_bytes(b"half")
     with pytest.raises(LogError, match=rf"unfinished run on {LOG}, which is not other\.mcap.*Give {LOG}.*--force"):
         run(tmp_path, *ALL, log="other.mcap")
-    assert (tmp_path / ".clean.mcap.123.part").exists()
+    assert (tmp_path / ".calibration.mcap.123.part").exists()
     run(tmp_path, *ALL)
     assert earlier_run(tmp_path) == (LOG, "finished")
     assert not list(tmp_path.rglob("*.part"))

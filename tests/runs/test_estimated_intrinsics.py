@@ -117,7 +117,7 @@ def test_a_workcell_of_other_people_from_images_and_poses_alone(workcell_camera2
     x, y, z = calibrated.refined.Y["camera2"].translation()
     assert (x, y, z) == pytest.approx((1.767, 2.062, 1.156), abs=0.02)
     refined = rw.calibrate_corners(
-        rw.runs.read_corners(tmp_path / "out" / "clean.mcap"), rw.CornerOptions(stated="unknown")
+        rw.runs.read_corners(tmp_path / "out" / "calibration.mcap"), rw.CornerOptions(stated="unknown")
     ).refined
     K = refined.intrinsics["camera2"].camera.K
     # as the people who made the set state them, half a pixel off

@@ -72,7 +72,7 @@ def test_one_that_nothing_was_seen_of_is_named_and_files_are_written_only_on_req
     frames = yaml.safe_load((out / "tf.yaml").read_text(encoding="utf-8"))["transforms"]
     assert {frame["child_frame_id"] for frame in frames} == {"cam_0", "tag_0", "tag_1"}
 
-    again = command("export", out / "clean.mcap", "-o", out)
+    again = command("export", out / "calibration.mcap", "-o", out)
     assert again.exit_code == 6
     assert not FILES & {path.name for path in out.iterdir()}  # those of before are not left as if they were of now
     assert "Not written, as the poses are not to be used: static_tf.launch.py" in words(again.stderr)

@@ -33,8 +33,8 @@ except ImportError:  # Windows
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 #: Where a calibration ends, and how. Most files and both ways are there without a mark.
 STOPS = [
-    *((name, KeyboardInterrupt()) for name in ("clean.mcap", "tf.yaml")),
-    *((name, NO_SPACE) for name in ("clean.mcap", "result.json")),
+    *((name, KeyboardInterrupt()) for name in ("calibration.mcap", "tf.yaml")),
+    *((name, NO_SPACE) for name in ("calibration.mcap", "result.json")),
     *(pytest.param(name, NO_SPACE, marks=pytest.mark.slow) for name in ("tf.yaml", "evidence.json")),
     *(pytest.param(name, KeyboardInterrupt(), marks=pytest.mark.slow) for name in ("result.json", "report.html")),
 ]
@@ -72,24 +72,27 @@ def largest_file(size: int) -> Iterator[None]:
 
 @pytest.mark.skipif(resource is None, reason="no limits of files here")
 def test_stages_that_cannot_write_to_the_end(tmp_path: Path) -> None:
-    raw, detected, clean, out = (tmp_path / name for name in ("raw.mcap", "detected.mcap", "clean.mcap", "out"))
+    raw, detected, clean, out = (tmp_path / name for name in ("raw.mcap", "detected.mcap", "calibration.mcap", "out"))
     made.write(raw, RECORDED)
     with largest_file(20_000), pytest.raises(LogError, match=r"detected\.mcap cannot be written: File too large"):
         detect_log(raw, made.rig(), detected)
     assert set(tmp_path.iterdir()) == {raw}
     detect_log(raw, made.rig(), detected)
-    with largest_file(20_000), pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"):
+    with largest_file(20_000), pytest.raises(LogError, match=r"calibration\.mcap cannot be written: File too large"):
         clean_log(detected, clean)
     assert set(tmp_path.iterdir()) == {raw, detected}
     clean_log(detected, clean)
     content = clean.read_bytes()
-    with largest_file(20_000), pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"):
+    with largest_file(20_000), pytest.raises(LogError, match=r"calibration\.mcap cannot be written: File too large"):
         clean_log(clean, clean)
     assert clean.read_bytes() == content  # onto itself: the one before stays
     with largest_file(1000), pytest.raises(FileFormatError, match=r"result\.json cannot be written: File too large"):
         solve_into(clean, None, out)
     assert list(out.iterdir()) == []
-    with largest_file(len(content)), pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"):
+    with (
+        largest_file(len(content)),
+        pytest.raises(LogError, match=r"calibration\.mcap cannot be written: File too large"),
+    ):
         solve_into(clean, None, out)
     assert {path.name for path in out.iterdir()} == {"result.json"}
     check_whole(out)
@@ -118,7 +121,7 @@ def test_a_calibration_that_ends_early_leaves_whole_files(
         give_name(source, target)
 
     # What takes long is the same each time: only some begin with the raw log.
-    log = calibrated_before / ("raw.mcap" if name == "clean.mcap" else "out/clean.mcap")
+    log = calibrated_before / ("raw.mcap" if name == "calibration.mcap" else "out/calibration.mcap")
     rig = made.rig()
     with monkeypatch.context() as patched:
         patched.setattr(os, "replace", stopped)

@@ -117,7 +117,7 @@ def interrupted(
 def test_a_run_that_is_killed_again_and_again(cell: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "rig.yaml").write_text(WORKCELL, encoding="utf-8")
-    moments = (f"detecting: image {TOGETHER} of {IMAGES}", "clean.mcap")
+    moments = (f"detecting: image {TOGETHER} of {IMAGES}", "calibration.mcap")
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", SCRIPT, cell, tmp_path / "rig.yaml", out, *moments],
         capture_output=True,
@@ -127,7 +127,7 @@ def test_a_run_that_is_killed_again_and_again(cell: Path, tmp_path: Path) -> Non
     assert [number for _, number in killed] == [signal.SIGKILL] * 2, done.stderr
     assert killed[1][0] == IMAGES - TOGETHER  # the rest only
     assert {DETECTIONS, LIST_FILE} <= {path.name for path in out.iterdir()}
-    assert [path.name for path in out.iterdir() if path.name.startswith(".clean.mcap.")]
+    assert [path.name for path in out.iterdir() if path.name.startswith(".calibration.mcap.")]
 
     # The result is there before files are exported, which takes longer than all else.
     stages, _ = interrupted(cell, out, "exporting", replace=False)

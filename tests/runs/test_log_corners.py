@@ -31,8 +31,8 @@ def corners_of(folder: Path, text: str, out: Path) -> rw.Observations:
     rig = parse_rig(text, "rig.yaml", folder)
     write_folder_log(folder, rig, out / "raw.mcap")
     detect_log(out / "raw.mcap", rig, out / "detected.mcap")
-    clean_log(out / "detected.mcap", out / "clean.mcap", rig)
-    return read_corners(out / "clean.mcap")
+    clean_log(out / "detected.mcap", out / "calibration.mcap", rig)
+    return read_corners(out / "calibration.mcap")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def workcell_log(workcell_camera2: Path, tmp_path_factory: pytest.TempPathFactor
     """The cleaned log of the workcell."""
     folder = tmp_path_factory.mktemp("workcell")
     corners_of(workcell_camera2, WORKCELL, folder)
-    return folder / "clean.mcap"
+    return folder / "calibration.mcap"
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def circles_log(circle_grid_10x10: Path, tmp_path_factory: pytest.TempPathFactor
     """The cleaned log of the grid of circles."""
     folder = tmp_path_factory.mktemp("circles")
     corners_of(circle_grid_10x10, CIRCLES, folder)
-    return folder / "clean.mcap"
+    return folder / "calibration.mcap"
 
 
 def test_a_workcell_of_other_people(workcell_log: Path) -> None:
@@ -115,7 +115,7 @@ def test_intrinsics_of_half_the_resolution_are_replaced_by_what_the_images_tell(
     half = "{K: [685.5, 685.5, 480, 270], size: [1920, 1080], stated: calibration}"
     with pytest.warns(LogWarning, match="poses have no image"):
         corners_of(folder, WORKCELL.replace("intrinsic_pars_file.yaml", half), tmp_path)
-    solved = solve_log(tmp_path / "clean.mcap")
+    solved = solve_log(tmp_path / "calibration.mcap")
     assert solved.judgement.grounds[0] is rw.Ground.INTRINSICS_ESTIMATED
     assert solved.judgement.verdict is rw.Verdict.CARE
     assert "like those of images of half the resolution" in solved.judgement.reason

@@ -114,7 +114,7 @@ def test_two_clocks_that_are_both_late_are_named(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_told_before_anything_is_computed(tmp_path: Path) -> None:
     log = made.write(tmp_path / "raw.mcap", made.recording(1.0))
     (tmp_path / "rig.yaml").write_text(made.RIG, encoding="utf-8")
-    for number, name in enumerate(("result.json", "clean.mcap", "tf.yaml", "camera_info")):
+    for number, name in enumerate(("result.json", "calibration.mcap", "tf.yaml", "camera_info")):
         out = tmp_path / f"out_{number}"
         out.mkdir()
         if name == "camera_info":

@@ -89,10 +89,10 @@ def test_cameras_and_odometries_are_one_problem(tmp_path: Path) -> None:
     rig = rw.rig.parse_rig(RIG.replace("scale: estimate", "max_turn_deg_s: 300"), "rig.yaml")
     detect_log(log, rig, tmp_path / "detected.mcap")
     (count,) = (
-        one for one in clean_log(tmp_path / "detected.mcap", tmp_path / "clean.mcap").tracks if one.target == "vo"
+        one for one in clean_log(tmp_path / "detected.mcap", tmp_path / "calibration.mcap").tracks if one.target == "vo"
     )
     assert count.removed == {"step of the odometry that nothing drives (lost tracking)": 1}
-    with open_log(tmp_path / "clean.mcap") as cleaned:
+    with open_log(tmp_path / "calibration.mcap") as cleaned:
         pairs = read_pairs(cleaned, rig)
     assert pairs[Pair("vo", "vo")].count == count
 
@@ -122,4 +122,4 @@ def test_the_whole_road_writes_all_files(tmp_path: Path) -> None:
     assert "tracker" in (tmp_path / "out" / "rig.urdf.xacro").read_text(encoding="utf-8")
     assert (tmp_path / "out" / "report.html").exists()
     assert set(rw.read_solution(tmp_path / "out" / "result.json").Y) == {"cam_0", "tracker", "vo"}
-    check(read_solved(tmp_path / "out" / "clean.mcap"))
+    check(read_solved(tmp_path / "out" / "calibration.mcap"))

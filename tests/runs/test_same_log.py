@@ -62,12 +62,12 @@ def test_foxglove_json_at_once_and_a_ros2_bag_stage_by_stage(tmp_path: Path) -> 
     calibrate_log(tmp_path / "json.mcap", rig, tmp_path / "from_json", workers=2)
     out.mkdir()
     by_stage(tmp_path / "ros2.mcap", rig, out)
-    export_solved(out / "clean.mcap", out)
+    export_solved(out / "calibration.mcap", out)
     assert numbers(out) == numbers(tmp_path / "from_json")
     assert numbers(out)["certified"]["certificate"]["status"] == "certified"
     check_files(out, tmp_path / "from_json")
     # Solved again in place: nothing of the solution before counts.
-    solve_into(out / "clean.mcap", None, out)
+    solve_into(out / "calibration.mcap", None, out)
     assert numbers(out) == numbers(tmp_path / "from_json")
 
 
@@ -82,8 +82,8 @@ def test_each_encoding_at_once_and_stage_by_stage_with_estimated_clocks(tmp_path
     assert numbers(tmp_path / "from_json")["certified"]["certificate"]["status"] == "certified"
     out.mkdir()
     by_stage(tmp_path / "json.mcap", rig, out)
-    export_solved(out / "clean.mcap", out)
+    export_solved(out / "calibration.mcap", out)
     assert numbers(out) == numbers(tmp_path / "from_json")
     check_files(out, tmp_path / "from_json")
-    calibrate_log(out / "clean.mcap", None, out)
+    calibrate_log(out / "calibration.mcap", None, out)
     assert numbers(out) == numbers(tmp_path / "from_json")

@@ -64,6 +64,6 @@ def test_what_contradicts_is_named_with_its_exit_status_and_no_file_for_others_i
     grounds = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["verdict_grounds"]
     assert set(grounds) & {"late_clock", "contradicted"}
     written = sorted(path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith("."))
-    assert written == ["clean.mcap", "evidence.json", "report.html", "result.json"]
+    assert written == ["calibration.mcap", "evidence.json", "report.html", "result.json"]
     assert "Written to " in done.stderr
     assert "tf.yaml" not in done.stderr.split("Not written, as the poses are not to be used: ")[0]

@@ -96,6 +96,6 @@ def test_a_type_that_cannot_be_read_is_named_with_those_that_can(tmp_path: Path)
 def test_joint_states_stay_in_the_logs_that_are_written(tmp_path: Path) -> None:
     paths = [made.write(tmp_path / "raw.mcap", made.recording(4.0)), joint_states(tmp_path / "joints.mcap")]
     detect_log(paths, made.rig(), tmp_path / "detected.mcap")
-    clean_log(tmp_path / "detected.mcap", tmp_path / "clean.mcap")
+    clean_log(tmp_path / "detected.mcap", tmp_path / "calibration.mcap")
     assert len(raw(paths[1])) == 20
-    assert raw(tmp_path / "detected.mcap") == raw(tmp_path / "clean.mcap") == raw(paths[1])
+    assert raw(tmp_path / "detected.mcap") == raw(tmp_path / "calibration.mcap") == raw(paths[1])

@@ -28,8 +28,8 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("old")
     log = made.write(folder / "raw.mcap", made.recording(SECONDS))
     rw.runs.detect_log(log, made.rig(), folder / "detected.mcap")
-    rw.runs.clean_log(folder / "detected.mcap", folder / "clean.mcap")
-    rw.runs.solve_into(folder / "clean.mcap", None, folder / "out")
+    rw.runs.clean_log(folder / "detected.mcap", folder / "calibration.mcap")
+    rw.runs.solve_into(folder / "calibration.mcap", None, folder / "out")
     return folder / "out"
 
 
@@ -79,10 +79,10 @@ def test_a_clock_that_the_new_motion_does_not_tell_is_as_it_was(old: Path, tmp_p
 
 
 def test_the_log_of_the_calibration_itself_is_told(old: Path) -> None:
-    calibration = OldCalibration.read(old / "clean.mcap")
+    calibration = OldCalibration.read(old / "calibration.mcap")
     assert calibration.rig is not None
     assert calibration.result.log is not None
-    found = verify_log(old / "clean.mcap", old / "clean.mcap")
+    found = verify_log(old / "calibration.mcap", old / "calibration.mcap")
     assert found.holds
     assert found.test.chance > 0.999
 
@@ -90,7 +90,7 @@ def test_the_log_of_the_calibration_itself_is_told(old: Path) -> None:
 def test_a_rig_file_that_a_cleaned_log_was_not_made_with_is_refused(old: Path) -> None:
     other = made.rig(tag_0=f"{{type: tag, family: tag36h11, id: 7, size_m: {made.SIZE_M}}}")
     with pytest.raises(LogError, match="was made with another rig file"):
-        verify_log(old, old / "clean.mcap", other)
+        verify_log(old, old / "calibration.mcap", other)
 
 
 def test_intrinsics_of_the_old_calibration_become_numbers() -> None:

@@ -17,11 +17,11 @@ from gtsam_rwhec.logs import ImageRecord, Log, LogWriter, open_log
 from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, solve_into
 
 
-@pytest.fixture(scope="module", params=["detected.mcap", "clean.mcap"])
+@pytest.fixture(scope="module", params=["detected.mcap", "calibration.mcap"])
 def stage_log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of detections, or a cleaned log."""
     folder = tmp_path_factory.mktemp("stages")
-    detected, clean = folder / "detected.mcap", folder / "clean.mcap"
+    detected, clean = folder / "detected.mcap", folder / "calibration.mcap"
     detect_log(made.write(folder / "raw.mcap", made.recording(4.0)), made.rig(), detected)
     clean_log(detected, clean)
     path: Path = folder / request.param
@@ -47,7 +47,7 @@ def test_images_are_copied_where_the_log_has_them(tmp_path: Path) -> None:
         out.compressed_image("/cam_0/image", made.BEGIN_NS, "cam_0", "png", b"an image")
     detect_log([raw, tmp_path / "image.mcap"], made.rig(), tmp_path / "detected.mcap", images="copy")
     calibrate_log(tmp_path / "detected.mcap", None, tmp_path / "out", images="copy")
-    with open_log(tmp_path / "out" / "clean.mcap") as log:
+    with open_log(tmp_path / "out" / "calibration.mcap") as log:
         (image,) = (record for record in log.records(["/cam_0/image"]) if isinstance(record, ImageRecord))
     assert bytes(image.data) == b"an image"
 
@@ -97,12 +97,12 @@ def test_a_run_opens_its_log_once_and_writes_one(tmp_path: Path, monkeypatch: py
         counting.setattr(Log, "__init__", reading)
         counting.setattr(LogWriter, "__init__", writing)
         calibrate_log(raw, made.rig(), tmp_path / "out")
-    assert (opened, written) == ([raw], [tmp_path / "out" / "clean.mcap"])
+    assert (opened, written) == ([raw], [tmp_path / "out" / "calibration.mcap"])
 
     detect_log(raw, made.rig(), tmp_path / "one.mcap")
     clean_log(tmp_path / "one.mcap", tmp_path / "one.mcap")
     solve_into(tmp_path / "one.mcap", None, tmp_path / "stages")
-    assert messages_of(tmp_path / "stages" / "clean.mcap") == messages_of(tmp_path / "out" / "clean.mcap")
+    assert messages_of(tmp_path / "stages" / "calibration.mcap") == messages_of(tmp_path / "out" / "calibration.mcap")
 
 
 def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
