@@ -34,26 +34,10 @@ ROTATION_ROUNDING = 1e-13
 
 
 def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -> Array:
-    """Poses as an (N, 4, 4) array. The values of matrices are not checked.
+    """Poses as an (N, 4, 4) array; the input itself where it has this form already. Matrices' values are not checked.
 
-    Parameters
-    ----------
-    poses : (N, 4, 4) array, sequence of N gtsam.Pose3, or (N, 7) array
-        Rows of 7 are quaternion then translation in metres.
-    order : "wxyz" or "xyzw" or None
-        Order of the quaternion's entries; needed for rows of 7 only.
-    where : str
-        For errors: which argument of which pair.
-
-    Returns
-    -------
-    (N, 4, 4) array
-        The input itself, not a copy, where it has this form already.
-
-    Raises
-    ------
-    PoseError
-        For any other shape, a missing order, a zero or non-finite quaternion.
+    Poses may be an (N, 4, 4) array, N gtsam.Pose3, or (N, 7) rows of a quaternion of ``order`` and a translation in
+    metres; ``where`` names the argument and the pair. A PoseError says what else is given.
     """
     if isinstance(poses, gtsam.Pose3):
         return poses.matrix()[None]
@@ -119,31 +103,11 @@ class CheckedRows(NamedTuple):
 
 
 def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> CheckedRows:
-    """Check a block of transforms and write it as the rows from which moments are computed.
+    """Check transforms (b, 4, 4), and write them as the rows (12, b) from which moments are computed: vec(R), then t.
 
-    Parameters
-    ----------
-    block : (b, 4, 4) array
-    first : int
-        Index of the block's first measurement, for errors.
-    where : str
-        For errors: which argument of which pair.
-    out : (12, b) array, optional
-        The rows are written into this array, which saves a copy.
-
-    Returns
-    -------
-    rows : (12, b) array
-        vec(R), column after column, then t: each entry is a contiguous row.
-    projected : int
-        Number of rotations that were off by more than rounding and were projected to SO(3).
-    deviation : float
-        Largest entry of |R'R - I| of all rotations of the block, projected ones after the projection.
-
-    Raises
-    ------
-    PoseError
-        For NaN or infinite entries, a last row other than 0 0 0 1, or a block that is not a right-handed rotation.
+    ``first`` is the index of the first one and ``where`` the argument and pair, for messages. The rows are written to
+    ``out`` where it is given. A PoseError names an entry that is NaN, infinite or too large, a last row that is not 0 0
+    0 1, or a block that is not a right-handed rotation.
     """
     rows = np.empty((12, len(block))) if out is None else out
     for column in range(4):

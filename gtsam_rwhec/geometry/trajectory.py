@@ -32,24 +32,10 @@ class Trajectory:
     def of(
         stamps_ns: ArrayLike, poses: PosesLike, where: str = "the trajectory", order: QuaternionOrder | None = None
     ) -> Trajectory:
-        """A trajectory from checked stamps and poses.
+        """A trajectory from checked stamps (N,), strictly increasing, and poses; ``where`` is its topic or file.
 
-        Parameters
-        ----------
-        stamps_ns : (N,) integers
-            Strictly increasing.
-        poses : (N, 4, 4) array, list of gtsam.Pose3, or (N, 7) rows
-        where : str
-            Topic or file, for messages.
-        order : "wxyz" or "xyzw", optional
-            Order of the quaternions in rows.
-
-        Raises
-        ------
-        PoseError
-            If there is no pose, or a pose is not valid.
-        StampError
-            If the stamps are all zero, not increasing, not integers, or not as many as the poses.
+        A PoseError names a pose that is not valid, a StampError stamps that are all zero, not increasing, not integers,
+        or not as many as the poses.
         """
         transforms = as_transforms(poses, order, where)
         stamps = increasing_stamps(stamps_ns, len(transforms), where)
@@ -146,42 +132,21 @@ MOST_IN_WINDOW = 400
 
 @dataclass(frozen=True)
 class SmoothPath:
-    """A smooth path T_a_b over time.
+    """A smooth path T_a_b over time: at each knot a cubic in the tangent space of a pose."""
 
-    Attributes
-    ----------
-    knots_ns : (K,) integers
-        Stamps of the knots.
-    T : (K, 4, 4) array
-        Poses that the tangent spaces belong to, metres.
-    coefficients : (K, 4, 6) array
-        c_0 (rad, m), c_1 (rad/s, m/s), c_2, c_3.
-    velocity_variance : (K, 6) array
-        Variance of c_1, from the poses' scatter.
-    scatter : (6,) array
-        Variance of a logged pose about the path, rad^2 and m^2.
-    degrees_of_freedom : float
-        Of the scatter.
-    half_window_s : float
-        Half of the window's length.
-    """
-
-    knots_ns: np.ndarray
-    T: Array
-    coefficients: Array
-    velocity_variance: Array
-    scatter: Array
-    degrees_of_freedom: float
+    knots_ns: np.ndarray  #: (K,)
+    T: Array  #: (K, 4, 4): the poses that the tangent spaces belong to, metres
+    coefficients: Array  #: (K, 4, 6): c_0 (rad, m), c_1 (rad/s, m/s), c_2, c_3
+    velocity_variance: Array  #: (K, 6): of c_1, from the poses' scatter
+    scatter: Array  #: (6,): variance of a logged pose about the path, rad^2 and m^2
+    degrees_of_freedom: float  #: of the scatter
     half_window_s: float
 
     @staticmethod
     def of(path: Trajectory, longest_s: float = LONGEST_S) -> SmoothPath:
         """The smooth path of logged poses; the window is as long as it can be without a lack of fit.
 
-        Raises
-        ------
-        StampError
-            The path has fewer than eight poses.
+        A StampError says that the path has fewer than eight poses.
         """
         if len(path.T) < 8:
             raise StampError(
@@ -310,23 +275,14 @@ SAME_POSE = 1e-6
 class LocalPaths:
     """The motion about each of N stamps.
 
-    Attributes
-    ----------
-    coefficients : (N, 3, 6) array
-        c_1 (rad/s, m/s), c_2, c_3.
-    leverage : (N,) array
-        Variance of c_1 over the variance of a pose's noise, 1/s^2.
-    scatter : (6,) array
-        Variance of the poses about the cubics, rad^2 and m^2.
-    velocity_variance : (6,) array
-        Mean square error of c_1, (rad/s)^2 and (m/s)^2, from the poses' scatter; where poses are too few to scatter,
-        from how well their neighbours predict them: between stations nothing is known of the path.
+    Where poses are too few to scatter, ``velocity_variance`` comes from how well their neighbours predict them: between
+    stations nothing is known of the path.
     """
 
-    coefficients: Array
-    leverage: Array
-    scatter: Array
-    velocity_variance: Array
+    coefficients: Array  #: (N, 3, 6): c_1 (rad/s, m/s), c_2, c_3
+    leverage: Array  #: (N,): variance of c_1 over the variance of a pose's noise, 1/s^2
+    scatter: Array  #: (6,): variance of the poses about the cubics, rad^2 and m^2
+    velocity_variance: Array  #: (6,): mean square error of c_1
 
     def motion(self, offset_s: float) -> Array:
         """Expmap(c_1 d + c_2 d^2 + c_3 d^3), (N, 4, 4); d is limited to the window of the fit."""
@@ -346,20 +302,10 @@ class LocalPaths:
 
     @staticmethod
     def of(A: Array, stamps_ns: np.ndarray, where: str) -> LocalPaths:
-        """The motion about the stamps of measured poses, fitted to the poses themselves.
+        """The motion about the stamps of measured poses A (N, 4, 4) in any order, fitted to the poses themselves.
 
-        Parameters
-        ----------
-        A : (N, 4, 4) array
-            T_sensorcarrier_targetcarrier, in any order. Poses of one stamp must be equal.
-        stamps_ns : (N,) integers
-        where : str
-            The name of the poses in messages.
-
-        Raises
-        ------
-        CountError
-            If there are fewer than two stamps, two poses at one stamp, or a pose without a neighbour within a second.
+        A CountError says that there are fewer than two stamps, two poses at one stamp, or a pose without a neighbour
+        within a second.
         """
         stamps, first, place = np.unique(stamps_ns, return_index=True, return_inverse=True)
         poses = A[first]
@@ -386,16 +332,7 @@ class LocalPaths:
     def along(path: Trajectory, stamps_ns: np.ndarray) -> LocalPaths:
         """The motion about the stamps, fitted to a path that was logged faster than the measurements were made.
 
-        Parameters
-        ----------
-        path : Trajectory
-            T_sensorcarrier_targetcarrier over time.
-        stamps_ns : (N,) integers
-
-        Raises
-        ------
-        CountError
-            If the path has fewer than four poses within half a second of a stamp.
+        A CountError says that the path has fewer than four poses within half a second of a stamp.
         """
         stamps, place = np.unique(stamps_ns, return_inverse=True)
         poses, _ = path.at(stamps)

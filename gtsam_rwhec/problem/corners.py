@@ -46,12 +46,8 @@ def seen_corners(
 ) -> SeenCorners:
     """Corners as arrays, in the order of the board that is known already, if there is one.
 
-    Raises
-    ------
-    CountError
-        An image has fewer than four corners, one of them twice, or pixels and corners are not as many.
-    TargetError
-        There is no board, or it is not that of the corners before.
+    A CountError says that an image has fewer than four corners, one of them twice, or that pixels and corners are not
+    as many; a TargetError that there is no board, or that it is not that of the corners before.
     """
     views = [_rows(view, 2, f"{where}: image_points of image {i}") for i, view in enumerate(_each(image_points, where))]
     if not views:
@@ -327,12 +323,8 @@ class Candidates:
 def candidates_of(camera: Camera, board: Array, pixels: Array, corner_px: float, where: str) -> Candidates:
     """Both poses of each image from corners (N, n, 2) of a board (n, 3).
 
-    Raises
-    ------
-    CameraError
-        The lens model has no ray for a corner, or an image has no pose.
-    TargetError
-        The corners do not belong to the board.
+    A CameraError says that the lens model has no ray for a corner, or that an image has no pose; a TargetError that the
+    corners do not belong to the board.
     """
     from gtsam_rwhec.cameras.target_poses import plane_poses
 

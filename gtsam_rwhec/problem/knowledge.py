@@ -27,16 +27,10 @@ CONTRADICTION_SIGMAS = 6.0
 
 @dataclass(frozen=True)
 class Prior:
-    """A Gaussian prior: |t - t_0|^2 / sigma^2 and kappa |R - R_0|_F^2 (design fact 11).
+    """A Gaussian prior: |t - t_0|^2 / sigma^2 and kappa |R - R_0|_F^2 (design fact 11); None leaves that part free.
 
-    Attributes
-    ----------
-    transform : (4, 4) array
-        The expected pose of the frame on its carrier, metres.
-    sigma : float or None
-        Standard deviation of the translation along each axis, in metres; None leaves the translation free.
-    kappa : float or None
-        Concentration of the rotation, 1 / (2 s^2) for s rad about each axis; None leaves the rotation free.
+    ``transform`` (4, 4) is the expected pose of the frame on its carrier, metres; sigma and kappa are as of
+    measurements.
     """
 
     transform: Array

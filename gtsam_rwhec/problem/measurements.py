@@ -66,21 +66,11 @@ LARGEST_WEIGHT = 1e15
 
 @dataclass(frozen=True)
 class Measurements:
-    """Raw measurements of one pair.
+    """Raw measurements of one pair: A = T_sensorcarrier_targetcarrier and B = T_sensor_target (N, 4, 4), metres.
 
-    Attributes
-    ----------
-    A, B : (N, 4, 4) arrays
-        T_sensorcarrier_targetcarrier and T_sensor_target, metres.
-    sigma, kappa : (N,) arrays
-        Standard deviation of B's translation in metres; concentration of B's rotation, 1 / rad^2.
-    stamps_ns : (N,) array or None
-        Integer nanoseconds.
-    covariances : (N, 6, 6) array or None
-        Covariances of B, rotation first, right perturbation.
-    pixels : (N, n, 2) array or None
-        The target's corners in the images that B is from; nan where one was not seen. None, or all nan, where B was
-        given as a pose.
+    sigma and kappa (N,) are the standard deviation of B's translation in metres and the concentration of B's rotation;
+    stamps_ns (N,) integer nanoseconds; covariances (N, 6, 6) those of B, rotation first, right perturbation. pixels (N,
+    n, 2) are the target's corners in the images that B is from, nan where one was not seen or B was given as a pose.
     """
 
     A: Array

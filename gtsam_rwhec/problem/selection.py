@@ -44,23 +44,9 @@ def problem_of_moments(
     sensor_carrier: str | None = None,
     target_carrier: str | None = None,
 ) -> Problem:
-    """The problem of some moments; it has no raw measurements.
+    """The problem of moments about ``gauge``, without raw measurements; the other arguments are as for ``Problem``.
 
-    Parameters
-    ----------
-    moments : dict of Pair to Moments
-        About `gauge`.
-    gauge : Gauge
-    scale : "known", "shared" or "per_target"
-    is_relative : bool
-        Whether the noise of some measurements was not stated.
-    sensor_carrier, target_carrier : str, optional
-        As for ``Problem``.
-
-    Raises
-    ------
-    FrameError
-        A name is that of a target and of a sensor.
+    A FrameError says which name is that of a target and of a sensor.
     """
     problem = Problem(scale, keep_measurements=False, sensor_carrier=sensor_carrier, target_carrier=target_carrier)
     for pair in moments:
@@ -88,22 +74,11 @@ def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
 
 
 def reweighted(problem: Problem, weights: ByPair[ArrayLike], factors: VarianceFactors = AS_STATED) -> Problem:
-    """The problem with each measurement's squared residual multiplied by a weight.
+    """The problem with each measurement's squared residual multiplied by a weight; the problem itself is not changed.
 
-    Parameters
-    ----------
-    problem : Problem
-        With its raw measurements; it is not changed.
-    weights : dict of (target, sensor) to (N,) array
-        At least zero. A measurement of weight w > 0 gets sigma / sqrt(w) and w kappa; weight 0 leaves it out. A pair
-        without an entry keeps its weights.
-    factors : VarianceFactors
-        Each kappa is divided by ``factors.rotation``, each sigma^2 multiplied by ``factors.translation``.
-
-    Returns
-    -------
-    Problem
-        Frames in the same order, without the pairs and frames that have no measurement left.
+    A measurement of weight w > 0 gets sigma / sqrt(w) and w kappa; weight 0 leaves it out, and a pair without an entry
+    keeps its ``weights`` (N,). Each kappa is divided by ``factors.rotation``, each sigma^2 multiplied by
+    ``factors.translation``. Pairs and frames without a measurement left are not in the result.
 
     Raises
     ------
@@ -158,15 +133,9 @@ def nearer_poses(
 ) -> tuple[Problem, int]:
     """The problem in which each image has the pose that is nearer to an answer's, and how many images changed.
 
-    Parameters
-    ----------
-    problem : Problem
-        Measurements that were added as poses stay, and so do those of frames that the answer lacks.
-    X, Y : dict of str to gtsam.Pose3
-        The answer's T_targetcarrier_target and T_sensorcarrier_sensor.
-    cameras : dict of str to Camera, optional
-        Other intrinsics by sensor, by which the poses of all their images are computed; the problem's own stay as
-        they were stated.
+    X and Y are the answer's T_targetcarrier_target and T_sensorcarrier_sensor. Measurements that were added as poses
+    stay, and so do those of frames that the answer lacks. ``cameras`` are other intrinsics by sensor, by which the
+    poses of all their images are computed; the problem's own stay as they were stated.
     """
     if not problem.boards or not problem.has_measurements:
         return problem, 0

@@ -188,13 +188,8 @@ def _scale_of(name: str, scale: float | Mapping[str, float]) -> float:
 class Residual:
     """Root mean squares of a pair's residuals, weighted as in the cost.
 
-    Attributes
-    ----------
-    number_of_measurements : int
-    translation_rms_m : float
-        Of |R_A t_X + t_A - t_Y - R_Y t_B / scale|, in true metres.
-    rotation_rms_rad : float
-        Of the angle between R_A R_X and R_Y R_B, in rad.
+    ``translation_rms_m`` is of |R_A t_X + t_A - t_Y - R_Y t_B / scale|, in true metres; ``rotation_rms_rad`` of the
+    angle between R_A R_X and R_Y R_B.
     """
 
     number_of_measurements: int

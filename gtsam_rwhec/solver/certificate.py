@@ -46,12 +46,7 @@ class Multipliers(StrEnum):
 class SearchPath:
     """How the answer and its bound were found; ``str()`` is "spectral start, dual" and the like.
 
-    Attributes
-    ----------
-    start : Start
-    multipliers : Multipliers
-    is_mirrored : bool
-        Whether the answer is the mirror image of the one first found, which had a negative scale.
+    ``is_mirrored``: the answer is the mirror image of the one first found, which had a negative scale.
     """
 
     start: Start
@@ -235,22 +230,13 @@ class Basis(StrEnum):
 class Objective:
     """Which cost a certificate is about.
 
-    Attributes
-    ----------
-    form : "direct" or "inverse"
-        "direct" is the cost of A X = Y B (eq. 18). "inverse" is the cost of B X^-1 = Y^-1 A. A scale for each target
-        needs it, and so do priors on translations with an unknown scale (design facts 7 and 11). The inverse cost is
-        not half a chi-square; ``refine`` finds the optimum of the exact model from its answer. Of several unconnected
-        parts it is "inverse" if any part's is.
-    has_priors : bool
-        Whether the cost has terms for priors.
-    origin_m : (x, y, z) or None
-        The inverse cost depends on the target carrier's origin: there the rotation residual acts on the lever arm
-        t_X. It is taken about this point of the target carrier's frame, in metres: A becomes A T(origin_m) and X
-        becomes T(-origin_m) X. None for the direct cost, which no origin changes, in files of format version 4 and
-        older, and where unconnected parts have different ones: each part's own is in ``Solution.parts``.
-    motion_origin_m : (x, y, z) or None
-        The same for the motions of a sensor, in its carrier's frame.
+    ``form`` "direct" is the cost of A X = Y B (eq. 18), "inverse" that of B X^-1 = Y^-1 A, which a scale for each
+    target needs, and priors on translations with an unknown scale (design facts 7 and 11). The inverse cost is not half
+    a chi-square; ``refine`` finds the optimum of the exact model from its answer. It depends on the target carrier's
+    origin, as its rotation residual acts on the lever arm t_X: it is about ``origin_m`` in the target carrier's frame,
+    metres (A becomes A T(origin_m), X becomes T(-origin_m) X), and for motions about ``motion_origin_m`` in the
+    sensor's carrier. Both are None for the direct cost, and where unconnected parts differ: ``Solution.parts`` has each
+    part's own.
     """
 
     form: Kind
@@ -308,22 +294,16 @@ class Certificate:
 
     Attributes
     ----------
-    status : Status
-    cause : Cause
-        Why it is proven, or why not.
-    figures : dict of str to float
-        The numbers in the sentence of the cause, by name.
-    objective : Objective
-        Which cost the certificate is about.
-    path : SearchPath
+    status, cause, figures
+        Whether it is proven, why or why not, and the numbers in the cause's sentence, by name.
+    objective, basis
+        Which cost it is about, and whether cost and bound are true of the measurements or of their moments as stored.
+    path
         The start of the descent to the answer, and the multipliers of the bound.
-    cost : float
-        The cost of ``objective`` at the answer as it is returned. The exact value is at most this, for what ``basis``
-        names. In the direct form it is half a chi-square when the weights are true.
-    lower_bound : float
-        No answer (of the region) costs less in exact arithmetic. Rotations may be off by the rounding of doubles.
-    float_bound : float
-        The lower bound without the allowance for rounding.
+    cost, lower_bound : float
+        The exact cost of the answer as it is returned is at most ``cost``, and no answer (of the ``region``) costs less
+        than ``lower_bound``, for rotations up to the rounding of doubles. ``float_bound`` has no allowance for
+        rounding.
     min_eigenvalue : float
         A lower bound on the certificate matrix Z's smallest eigenvalue. In exact arithmetic it is 0 when certified.
     tolerance : float
@@ -331,16 +311,10 @@ class Certificate:
     is_relative : bool
         Whether all weights are 1: the cost then has no statistical meaning.
     seconds : dict of str to float
-        Time of each stage, in s.
-    words : str
-        The reason in a file of format version 3 or older, which has no cause; empty otherwise.
-    basis : Basis
-        Whether cost and bound are true of the measurements as they were given, of their stored moments, or of the
-        reduced form of an older file.
+        Time of each stage, s.
     region : Region or None
-        The answers that the lower bound is about; None: all answers. It is named where the measurements leave a
-        translation or a scale free up to the rounding of their doubles. What is free up to noise only needs none, so
-        an answer that is not unique may have none.
+        The answers that the bound is about; None: all. It is named where the measurements leave a translation or a
+        scale free up to the rounding of their doubles. What is free up to noise only needs none.
     """
 
     status: Status

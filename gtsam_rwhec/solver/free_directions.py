@@ -72,29 +72,18 @@ class FreeReason(StrEnum):
 class FreeDirection:
     """A direction in which the answer can move without a change of the residuals larger than the noise.
 
-    The direction has length 1, where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time
-    offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` is a sentence. The hash is of
-    the fields that are not dicts.
+    It has length 1, where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time offset of 1 s
+    each count as 1. Its sign is arbitrary. ``str()`` is a sentence. The hash is of the fields that are not dicts.
 
     Attributes
     ----------
-    kind : FreeKind
     frames : dict of str to (omega_x, omega_y, omega_z, v_x, v_y, v_z)
-        How each frame that takes part moves. It is the right perturbation T Expmap(xi) in GTSAM's order, in rad and m,
-        in the frame's own axes. A frame takes no part if its turn and its shift are at most ``SHARE`` of the largest
-        turn, shift or change.
-    scale : float
-        Change of the logarithm of the shared scale.
-    own_scales : dict of str to float
-        Change of the logarithm of each own scale that takes part.
-    time_offsets_s : dict of str to float
-        Change of each sensor's time offset, in s.
-    length_m : float
-        How many metres count as one radian.
-    reason : FreeReason or None
-        None only for ``FreeKind.WORDS``.
-    words : str
-        The sentence in a file of format version 3 or older, which has nothing else; empty otherwise.
+        The right perturbation T Expmap(xi) of each frame that takes part, GTSAM's order, rad and m, in its own axes. A
+        frame takes no part if its turn and its shift are at most ``SHARE`` of the largest turn, shift or change.
+    scale, own_scales
+        Change of the logarithm of the shared scale, and of each own scale that takes part.
+    time_offsets_s
+        Change of each sensor's time offset, s.
     """
 
     kind: FreeKind

@@ -42,17 +42,9 @@ TESTED_AT_ONCE = 256
 class PairIdentifiability:
     """What one pair determines alone.
 
-    Attributes
-    ----------
-    is_unique : bool
-    free_directions : tuple of FreeDirection
-    rotation_axes : int
-        Number of axes about which its motion turned: 0, 1, or 2 for two and more (Corollary 2).
-    number_of_measurements : int
-    weakest : float
-        Information of the weakest direction, in units of the information that noise alone would create.
-    threshold : float
-        Up to this value of ``weakest`` the direction is free.
+    ``rotation_axes``: about how many axes its motion turned, 0, 1, or 2 for two and more (Corollary 2). ``weakest`` is
+    the information of the weakest direction, in units of the information that noise alone would create; up to
+    ``threshold`` the direction is free.
     """
 
     is_unique: bool
@@ -67,18 +59,9 @@ class PairIdentifiability:
 class Identifiability:
     """What a problem's measurements determine. ``str()`` is a sentence about the pairs and the whole problem.
 
-    Attributes
-    ----------
-    is_unique : bool
-        Whether every frame and scale is determined.
-    free_directions : tuple of FreeDirection
-        They span all that is free.
-    weakest, threshold : float
-        As in ``PairIdentifiability``, for the whole problem.
-    pairs : mapping of (target, sensor) to PairIdentifiability
-        Each pair alone: the grid of the paper's Figure 8; tested when it is asked for.
-    parts : tuple of tuple of str
-        Frames of each unconnected part.
+    ``free_directions`` span all that is free; ``weakest`` and ``threshold`` are as in `PairIdentifiability`, of the
+    whole. ``pairs`` has each pair alone, the grid of the paper's Figure 8, tested when it is asked for; ``parts`` the
+    frames of each unconnected part.
     """
 
     is_unique: bool

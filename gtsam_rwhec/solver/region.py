@@ -27,13 +27,8 @@ LARGER = (1e4, 1e3, 1e2, 1e1)
 class Region:
     """The answers that a lower bound is about: all rotations, and translations and scales as below; ``str()`` says it.
 
-    Attributes
-    ----------
-    radius_m : float
-        The translation of each frame differs from that of the returned pose by at most this much, in metres.
-    scale_factor : float
-        Each unknown scale is at most this many times the returned scale, and at least the returned scale over this.
-        Known scales do not vary: then it says nothing.
+    The translation of each frame differs from that of the returned pose by at most ``radius_m``, and each unknown scale
+    from the returned one by at most a ``scale_factor``, either way.
     """
 
     radius_m: float

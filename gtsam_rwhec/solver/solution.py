@@ -60,21 +60,13 @@ class Solution:
 
     Attributes
     ----------
-    X : dict of str to gtsam.Pose3
-        T_targetcarrier_target of each target, metres.
-    Y : dict of str to gtsam.Pose3
-        T_sensorcarrier_sensor of each sensor, metres.
+    X, Y : dict of str to gtsam.Pose3
+        T_targetcarrier_target of each target and T_sensorcarrier_sensor of each sensor, metres.
     scale : float or dict of str to float
         t_B = scale * true length. It is 1 when known and one number when shared. Else it is one number for each target
         (and for each sensor with motions of its own).
-    scale_mode : "known", "shared" or "per_target"
     cost : float
-        J; half a chi-square when the weights are true.
-    is_relative : bool
-        Whether all weights are 1: costs and covariances then have no statistical meaning.
-    certificate : Certificate
-    identifiability : Identifiability
-    residuals : dict of (target, sensor) to Residual
+        J; half a chi-square when the weights are true. ``is_relative``: all weights are 1, and it has no such meaning.
     parts : tuple of SolvedPart
         The unconnected parts, which were solved separately; one part when all frames are connected.
     """
