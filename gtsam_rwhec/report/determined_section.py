@@ -43,7 +43,6 @@ CURES: Mapping[FreeReason, str] = {
     FreeReason.STANDSTILL: "Measure while the carriers move and turn, faster and with changes of direction.",
     FreeReason.SYMMETRY: "Turn by other angles than half a turn, and about axes that are not in one plane.",
 }
-FREE_IN_WORDS = "Turn the carriers about at least two different axes, or fix frames that you know."
 ALL_DETERMINED = "The measurements determine every direction beyond their noise: none is free."
 NO_ANSWER = "the calibration has no answer."
 
@@ -90,7 +89,7 @@ def _distance_to_free(shown: ShownResult) -> Iterator[Block]:
 
 def cure_of(free: FreeDirection) -> str:
     """The motion that settles a free direction."""
-    return FREE_IN_WORDS if free.reason is None else CURES[free.reason]
+    return CURES[free.reason]
 
 
 def _grid(shown: ShownResult) -> Iterator[Block]:

@@ -37,7 +37,6 @@ def limits_of(certificate: Certificate) -> str:
 _BASES = {
     Basis.MEASUREMENTS: "",
     Basis.MOMENTS: "It is of the moments: the measurements were not kept, so the rounding of the sums is not in it.",
-    Basis.REDUCED_FORM: "It is of the form that an older version stored, whose rounding is not in it.",
 }
 
 

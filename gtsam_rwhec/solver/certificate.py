@@ -59,14 +59,6 @@ class SearchPath:
         mirrored = " and mirrored" if self.is_mirrored else ""
         return f"found from {_STARTS[self.start]}{mirrored}, bound proven by {_MULTIPLIERS[self.multipliers]}"
 
-    @staticmethod
-    def parse(text: str) -> SearchPath:
-        """The path that a result file has as text; a ``ValueError`` for any other text."""
-        start, *rest = text.split(", ")
-        multipliers = Multipliers(rest[0]) if rest[:1] not in ([], ["mirrored"]) else Multipliers.RELAXATION
-        start = {"relaxation": Start.INTERIOR_POINT}.get(start, start)
-        return SearchPath(Start(start), multipliers, is_mirrored=rest[-1:] == ["mirrored"])
-
     def __str__(self) -> str:
         return ", ".join([self.start, self.multipliers] + ["mirrored"] * self.is_mirrored)
 
@@ -186,23 +178,7 @@ class Cause(StrEnum):
     )
     #: The search found a better answer than the one that was to be certified.
     BETTER_ANSWER = "better_answer", Status.GAP, "a better answer exists: {better_cost:.8g} against {cost:.8g}"
-    #: Only in result files of format version 4 and older, whose bound was about the reduced form.
-    DIGITS_LOST = (
-        "digits_lost",
-        Status.GAP,
-        "eliminating the translations lost digits: the answer costs {cost:.8g}, and {reduced_cost:.8g} in the reduced "
-        "form that the bound is about; the motion turns too little for the accuracy that sigma claims",
-    )
     NO_BOUND = "no_bound", Status.FAILED, "no finite lower bound was found"
-    #: As DIGITS_LOST: now no answer can cost less than the bound, rounding included.
-    BELOW_BOUND = (
-        "below_bound",
-        Status.FAILED,
-        "the answer costs {cost:.8g}, less than the bound of the reduced form, {reduced_bound:.8g}: eliminating the "
-        "translations lost digits",
-    )
-    #: Read from a result file of format version 3 or older, which has words only; the file has the status.
-    NOT_RECORDED = "not_recorded", Status.GAP, "the file does not tell why"
 
     def __new__(cls, value: str, status: Status, sentence: str) -> Cause:
         """A member of the table."""
@@ -222,8 +198,6 @@ class Basis(StrEnum):
     MEASUREMENTS = "measurements"
     #: Their moments as they are stored, as the measurements were not kept: the rounding of the sums is not enclosed.
     MOMENTS = "moments"
-    #: The reduced form as it was stored: read from a result file of format version 4 or older.
-    REDUCED_FORM = "reduced_form"
 
 
 @dataclass(frozen=True)
@@ -280,7 +254,7 @@ def _triple(v: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-_OF = {Basis.MEASUREMENTS: "", Basis.MOMENTS: " (of the moments)", Basis.REDUCED_FORM: " (of the stored form)"}
+_OF = {Basis.MEASUREMENTS: "", Basis.MOMENTS: " (of the moments)"}
 _OBJECTIVES: dict[Kind, str] = {
     "direct": "Problem 3 of the RWHEC paper: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - "
     "R_Y t_B over sigma and R_A R_X - R_Y R_B times the square root of kappa",
@@ -329,9 +303,7 @@ class Certificate:
     is_relative: bool
     seconds: dict[str, float] = field(default_factory=dict)
     figures: dict[str, float] = field(default_factory=dict)
-    words: str = ""
-    # Result files before format version 5 do not have these two.
-    basis: Basis = Basis.REDUCED_FORM
+    basis: Basis = Basis.MEASUREMENTS
     region: Region | None = None
 
     @property
@@ -339,7 +311,7 @@ class Certificate:
         """The cause in a sentence."""
         parts = int(self.figures.get("parts", 1))
         apart = f"{parts} unconnected parts, solved separately; " if parts > 1 else ""
-        return self.words or apart + self.cause.sentence({"cost": self.cost} | self.figures)
+        return apart + self.cause.sentence({"cost": self.cost} | self.figures)
 
     @property
     def is_certified(self) -> bool:

@@ -38,8 +38,6 @@ class FreeKind(StrEnum):
     TIME_OFFSET = "time_offset"
     #: No direction at the answer, but another answer far away that costs as little.
     TWIN = "twin"
-    #: Read from an older file that has only a sentence: ``FreeDirection.words``.
-    WORDS = "words"
 
 
 class FreeReason(StrEnum):
@@ -87,17 +85,14 @@ class FreeDirection:
     """
 
     kind: FreeKind
-    reason: FreeReason | None
+    reason: FreeReason
     frames: dict[str, Twist] = field(default_factory=dict, hash=False)
     scale: float = 0.0
     own_scales: dict[str, float] = field(default_factory=dict, hash=False)
     time_offsets_s: dict[str, float] = field(default_factory=dict, hash=False)
     length_m: float = 1.0
-    words: str = ""
 
     def __str__(self) -> str:
-        if self.reason is None:
-            return self.words
         if self.kind is FreeKind.TWIN:
             return f"another answer, far from this one, costs the same: {self.reason.words}"
         first, *others = self._movements()
