@@ -7,10 +7,11 @@ from fractions import Fraction
 import exact_arithmetic as exact
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import UNIT, gamma
 from gtsam_rwhec.solver.block_matrix import BlockMatrix, cholesky_allowance, proof_that_it_exceeds, sum_into
 from gtsam_rwhec.solver.elimination import Elimination
 
@@ -165,3 +166,245 @@ def test_sums_into_rows_that_are_named_more_than_once() -> None:
     np.testing.assert_array_equal(result, [[-3.0, -4.0], [0.0, 0.0], [-6.0, -8.0], [0.0, 0.0]])
     sum_into(result, np.array([3, 1]), np.ones((2, 2)))
     np.testing.assert_array_equal(result[[1, 3]], np.ones((2, 2)))
+
+
+def arrow_matrix(D: Array, C: Array, E: Array) -> BlockMatrix:
+    """An arrow matrix whose leaves are eliminated one by one, and whose border is dense."""
+    none = np.zeros(0, dtype=int)
+    order = Elimination.of(len(D), none, none, few=0)
+    return BlockMatrix(order, D, np.zeros((0, *D.shape[1:])), C, E)
+
+
+def dense_matrix(matrix: Array) -> BlockMatrix:
+    return arrow_matrix(np.zeros((0, 1, 1)), np.zeros((0, 1, len(matrix))), matrix)
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    return proof_that_it_exceeds(dense_matrix(matrix)) is not None
+
+
+def arrow_is_positive_definite(D: Array, C: Array, E: Array, of_leaves: Array, of_border: Array) -> bool:
+    return proof_that_it_exceeds(arrow_matrix(D, C, E), np.r_[of_leaves.ravel(), of_border]) is not None
+
+
+def singular_integers(size: int, rank: int, seed: int, largest: int = 3) -> Array:
+    """V V' of integers, V (size, rank), every sum below 2^53: eigenvalue 0 exactly, size - rank times."""
+    V = np.random.default_rng(seed).integers(-largest, largest + 1, (size, rank)).astype(float)
+    return V @ V.T
+
+
+def large_integers(size: int, seed: int) -> Array:
+    """The same of rank size - 1, as large as doubles hold exactly."""
+    return singular_integers(size, size - 1, seed, largest=int(np.sqrt(2.0**52 / size)))
+
+
+@pytest.mark.parametrize("below", [1, 4, 16, 64, 256, 1024])
+@pytest.mark.parametrize("size", [2, 3, 5, 10, 19, 40])
+def test_an_eigenvalue_just_below_zero_does_not_pass(size: int, below: int) -> None:
+    """From -1e-16 to -1e-13 of the largest, exactly -below."""
+    for seed in range(20):
+        singular = large_integers(size, seed)
+        matrix = singular - below * np.eye(size)
+        np.testing.assert_array_equal(singular - matrix, below * np.eye(size))  # nothing was rounded
+        if size <= 10:
+            assert not exact.is_positive_definite(exact.fractions(matrix))
+        assert not is_positive_definite(matrix)
+
+
+@pytest.mark.parametrize("size", [3, 5, 10, 19, 40])
+def test_what_fools_a_plain_factorisation_does_not_pass(size: int) -> None:
+    """One unit in the last place off one entry: LAPACK's factorisation runs through in many of these."""
+    fooled = 0
+    for seed in range(60):
+        matrix = large_integers(size, seed)
+        null = np.linalg.eigh(matrix)[1][:, 0]
+        at = int(np.abs(null).argmin())
+        matrix[at, at] -= 1.0  # v' A v = -v_at^2 for the exact null vector v
+        assert not is_positive_definite(matrix)
+        try:
+            np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            continue
+        fooled += 1
+    assert fooled > 5
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 19, 40])
+def test_zero_is_not_positive(size: int) -> None:
+    assert not is_positive_definite(np.zeros((size, size)))
+    for seed in range(10):
+        assert not is_positive_definite(singular_integers(size, size - 1, seed))
+        assert not is_positive_definite(large_integers(size, seed))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_scaling_by_powers_of_two_hides_nothing(seed: int) -> None:
+    """D A D with D from 2^-40 to 2^40 has the inertia of A, exactly, and condition numbers beyond 1e40."""
+    generator = np.random.default_rng(seed)
+    matrix = large_integers(12, seed) - 4.0 * np.eye(12)
+    d = 2.0 ** generator.integers(-40, 41, 12)
+    assert not is_positive_definite(d[:, None] * matrix * d)
+    definite = singular_integers(12, 11, seed) + 2.0**-20 * np.eye(12)
+    assert is_positive_definite(d[:, None] * definite * d)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 19, 40, 217])
+@pytest.mark.parametrize("seed", range(5))
+def test_clearly_definite_passes(size: int, seed: int) -> None:
+    """Down to smallest eigenvalues that are a few times the allowance, N^2 u of the diagonal."""
+    matrix = singular_integers(size, size - 1, seed) if size < 217 else 9.0 * np.eye(size)
+    assert is_positive_definite(matrix + np.eye(size))
+    room = 4.0 * size * (size + 2) * UNIT * float(np.diagonal(matrix).max() + 1.0)
+    assert is_positive_definite(matrix + room * np.eye(size))
+
+
+@given(seed=st.integers(0, 10**6), size=st.integers(1, 8), shift=st.integers(-400, 400), spread=st.integers(0, 12))
+@settings(max_examples=150, deadline=None)
+def test_what_passes_is_definite(seed: int, size: int, shift: int, spread: int) -> None:
+    """Random, rounded, nearly singular and badly scaled matrices: passing implies exact definiteness."""
+    generator = np.random.default_rng(seed)
+    V = generator.standard_normal((size, size)) * 10.0 ** generator.uniform(-spread, 0, (size, 1))
+    V[:, 0] = V[:, -1]  # singular before rounding
+    matrix = V @ V.T
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    matrix += shift * UNIT * np.diag(np.diagonal(matrix))
+    if is_positive_definite(matrix):
+        assert exact.is_positive_definite(exact.fractions(matrix))
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))
+@example([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+@example([5e-324, 0.0, 5e-324, 0.0, 0.0, 5e-324])
+@settings(max_examples=300, deadline=None)
+def test_any_three_by_three(entries: list[float]) -> None:
+    matrix = np.zeros((3, 3))
+    matrix[np.tril_indices(3)] = entries
+    matrix += np.tril(matrix, -1).T
+    if is_positive_definite(matrix):
+        assert exact.is_positive_definite(exact.fractions(matrix))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("at", [(0, 0), (2, 0), (2, 2), (39, 20)])
+def test_what_is_not_a_number_is_not_definite(value: float, at: tuple[int, int]) -> None:
+    matrix = 4.0 * np.eye(40)
+    matrix[at] = matrix[at[::-1]] = value
+    with np.errstate(invalid="ignore"):
+        assert not is_positive_definite(matrix)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-200, 1e-100, 1e100, 1e200, 1e280])
+def test_extreme_scales_fool_nobody(scale: float) -> None:
+    """Powers of ten are not exact, so exactness judges; where numbers underflow, it refuses."""
+    for seed in range(10):
+        matrix = scale * (large_integers(6, seed) - 4.0 * np.eye(6))
+        if is_positive_definite(matrix):
+            assert exact.is_positive_definite(exact.fractions(matrix))
+    assert is_positive_definite(scale * 4.0 * np.eye(6)) or scale < 1e-280
+
+
+def dense_arrow(D: Array, C: Array, E: Array) -> Array:
+    """Blocks D (L, m, m) that are coupled with a border E (b, b) alone, by C (L, m, b), as one array."""
+    L, m = D.shape[:2]
+    full = np.zeros((L * m + len(E),) * 2)
+    np.einsum("lilj->lij", full[: L * m, : L * m].reshape(L, m, L, m))[...] = D
+    full[: L * m, L * m :] = C.reshape(L * m, len(E))
+    full[L * m :, : L * m], full[L * m :, L * m :] = full[: L * m, L * m :].T, E
+    return full
+
+
+def arrow_below_zero(leaves: int, m: int, b: int, seed: int, shift: float) -> tuple[Array, Array, Array]:
+    """An arrow matrix of integers, singular, minus shift I: V V' where leaves share no column of V but with the border.
+
+    The border's part has one column too few, which leaves a null vector.
+    """
+    generator = np.random.default_rng(seed)
+    of_leaf = generator.integers(-3, 4, (leaves, m, m)).astype(float)
+    to_border = generator.integers(-3, 4, (leaves, b, m)).astype(float)
+    own = generator.integers(-3, 4, (b, b - 1)).astype(float)
+    D = of_leaf @ of_leaf.transpose(0, 2, 1) - shift * np.eye(m)
+    C = of_leaf @ to_border.transpose(0, 2, 1)
+    E = own @ own.T + (to_border @ to_border.transpose(0, 2, 1)).sum(axis=0) - shift * np.eye(b)
+    return D, C, E
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 4), (4, 3, 4), (3, 9, 10), (30, 3, 7)])
+@pytest.mark.parametrize("exponent", [40, 36, 30, 20])
+def test_arrow_just_below_zero_does_not_pass(shape: tuple[int, int, int], exponent: int) -> None:
+    for seed in range(10):
+        D, C, E = arrow_below_zero(*shape, seed, 2.0**-exponent)
+        if len(E) + D.shape[0] * D.shape[1] < 20:
+            assert not exact.is_positive_definite(exact.fractions(dense_arrow(D, C, E)))
+        margins = np.zeros(D.shape[:2]), np.zeros(len(E))
+        assert not arrow_is_positive_definite(D, C, E, *margins)
+        assert not is_positive_definite(dense_arrow(D, C, E))
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    leaves=st.integers(0, 5),
+    m=st.integers(1, 4),
+    b=st.integers(1, 5),
+    exponent=st.integers(0, 50),
+)
+@settings(max_examples=100, deadline=None)
+def test_arrow_and_dense_agree(seed: int, leaves: int, m: int, b: int, exponent: int) -> None:
+    """On definite matrices with any room above the allowance, on indefinite ones, and both keep their word between."""
+    D, C, E = arrow_below_zero(leaves, m, b, seed, -(2.0**-exponent))
+    full = dense_arrow(D, C, E)
+    by_arrow = arrow_is_positive_definite(D, C, E, np.zeros((leaves, m)), np.zeros(b))
+    by_dense = is_positive_definite(full)
+    room = 4.0 * float(cholesky_allowance(dense_matrix(full), np.full(len(full), np.diagonal(full).max())).max())
+    if 2.0**-exponent > room:
+        assert by_arrow
+        assert by_dense
+    for shift in (2.0**-exponent, 2.0 * 2.0**-exponent):  # to zero, and as far below
+        D, E = D - shift * np.eye(m), E - shift * np.eye(b)
+        assert not arrow_is_positive_definite(D, C, E, np.zeros((leaves, m)), np.zeros(b))
+        assert not is_positive_definite(dense_arrow(D, C, E))
+
+
+@given(seed=st.integers(0, 10**6), relative=st.integers(-60, 60))
+@settings(max_examples=100, deadline=None)
+def test_margins_are_proven_exactly(seed: int, relative: int) -> None:
+    """arrow - diag(margin) for margins of either sign around what makes it singular."""
+    generator = np.random.default_rng(seed)
+    margins = generator.uniform(0.5, 2.0, (3, 2)), generator.uniform(0.5, 2.0, 3)
+    D, C, E = arrow_below_zero(3, 2, 3, seed, 0.0)
+    sign = float(generator.choice([-1.0, 1.0]))
+    # Singular but for rounding once the margin is taken off; then a few units of rounding on top.
+    D = D + sign * np.array([np.diag(row) for row in margins[0]])
+    E = E + sign * np.diag(margins[1])
+    D *= 1.0 + relative * UNIT
+    E *= 1.0 + relative * UNIT
+    if arrow_is_positive_definite(D, C, E, sign * margins[0], sign * margins[1]):
+        taken = exact.fractions(np.diag(sign * np.r_[margins[0].ravel(), margins[1]]))
+        assert exact.is_positive_definite(exact.fractions(dense_arrow(D, C, E)) - taken)
+
+
+@pytest.mark.parametrize("terms", [1, 10, 1000, 10**6])
+def test_gamma_bounds_that_many_roundings(terms: int) -> None:
+    unit = Fraction(UNIT)
+    assert Fraction(gamma(terms)) >= terms * unit / (1 - terms * unit)
+    assert Fraction(gamma(terms)) <= (1 + Fraction(1, 10**9)) * terms * unit / (1 - terms * unit)
+
+
+def test_gamma_refuses_what_it_cannot_bound() -> None:
+    with pytest.raises(OverflowError, match="too many"):
+        gamma(100, unit=0.01)
+
+
+@pytest.mark.parametrize("size", [3, 19, 60])
+def test_the_allowance_covers_the_factorisations_error(size: int) -> None:
+    """|A - LL'| of a real factorisation, exactly, entry by entry within Higham's bound and far from it."""
+    generator = np.random.default_rng(size)
+    V = generator.standard_normal((size, size))
+    matrix = V @ V.T + np.eye(size)
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    lower = exact.fractions(np.linalg.cholesky(matrix))
+    error = np.abs((exact.fractions(matrix) - lower @ lower.T).astype(float))
+    d = np.sqrt(np.diagonal(matrix))
+    g = gamma(size + 1)
+    assert (error <= g / (1.0 - g) * np.outer(d, d)).all()
+    assert error.any()
+    assert (np.linalg.norm(error, 2) <= cholesky_allowance(dense_matrix(matrix), np.diagonal(matrix))).all()

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from naive_cost import naive_cost
+from rwhec_factors.se3 import pose
 from solved_problems import MODES, NOISE, matrices, simulated
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import RwhecWarning, WeightsWarning
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning, WeightsWarning
+from gtsam_rwhec.simulate import Motion, Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
+from gtsam_rwhec.solver import Cause, Start
+from gtsam_rwhec.solver import search as attempt
+from gtsam_rwhec.solver.bound import Bound
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.solution import contradicted_by
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -156,3 +164,251 @@ def test_exact_data_are_certified_wherever_the_origin_of_the_world_is(distance_m
     # Another answer is refused: 1e-6 m is ten thousand times the rounding.
     moved = {name: pose.retract(np.array([0, 0, 0, 1e-6, 0, 0])) for name, pose in solution.X.items()}
     assert not rw.certify(problem, moved, solution.Y).is_certified
+
+
+@pytest.mark.parametrize(
+    ("cost", "degrees_of_freedom", "ratio"),
+    [
+        (100.0, 200, None),  # what true weights predict
+        (190.0, 200, None),  # less than twice that
+        (210.0, 200, 2.1),
+        (3.0, 2, None),  # three times, but chance makes that once in twenty
+        (10.0, 2, 10.0),
+        (10.0, 0, None),  # nothing tells
+    ],
+)
+def test_twice_what_is_predicted_and_beyond_chance(cost: float, degrees_of_freedom: int, ratio: float | None) -> None:
+    assert contradicted_by(cost, degrees_of_freedom) == (None if ratio is None else pytest.approx(ratio))
+
+
+def test_true_weights_are_contradicted_less_than_once_in_a_thousand() -> None:
+    generator = np.random.default_rng(0)
+    for degrees_of_freedom in (1, 3, 10, 100):
+        costs = 0.5 * generator.chisquare(degrees_of_freedom, 20_000)
+        told = sum(contradicted_by(float(cost), degrees_of_freedom) is not None for cost in costs)
+        assert told <= 40
+
+
+def cost_of(problem: rw.Problem, X: Any, Y: Any, scale: Any) -> float:
+    """By plain loops over the measurements."""
+    part = parts_of(problem)[0]
+    return naive_cost(problem, matrices(X), matrices(Y), scale, part.kind, part.gauge)
+
+
+def perturbed(poses: Any, size: float, seed: int) -> dict[str, gtsam.Pose3]:
+    generator = np.random.default_rng(seed)
+    return {name: T.retract(size * generator.standard_normal(6)) for name, T in poses.items()}
+
+
+def scaled(scale: Any, factor: float, known: tuple[str, ...] = ()) -> Any:
+    """Every unknown scale times a factor."""
+    if isinstance(scale, dict):
+        return {name: value if name in known else value * factor for name, value in scale.items()}
+    return scale * factor
+
+
+# -- solve ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["auto", "sdp", "local"])
+@pytest.mark.parametrize("knowledge", ["none", "fixed", "priors", "motions"])
+@pytest.mark.parametrize("mode", MODES)
+def test_no_small_step_from_the_answer_costs_less(mode: str, knowledge: str, method: Any) -> None:
+    """The gradient of the measurements' own cost is zero at the answer, along every pose and every unknown scale."""
+    simulation = simulated(mode, **(dict(odometry=8, odometry_noise=NOISE) if knowledge == "motions" else {}))
+    problem = simulation.problem
+    if knowledge == "fixed":
+        problem.fix("sensor0", simulation.Y["sensor0"])
+        problem.fix("target1", simulation.X["target1"])
+    if knowledge == "priors":
+        problem.add_prior("sensor1", simulation.Y["sensor1"] @ pose(np.eye(3), [0.05, 0.0, 0.1]), sigma=0.02, kappa=1e3)
+        problem.add_prior("target0", simulation.X["target0"], kappa=30.0)
+    initial = (simulation.X, simulation.Y, simulation.scale) if method == "local" else None
+    solution = rw.solve(problem, method, initial=initial)
+    assert solution.certificate.is_certified
+    assert solution.cost == pytest.approx(cost_of(problem, solution.X, solution.Y, solution.scale), rel=1e-9)
+    assert solution.certificate.lower_bound <= solution.cost
+
+    step = 1e-5
+    for name, T in {**solution.X, **solution.Y}.items():
+        if name in problem.fixed:
+            np.testing.assert_allclose(T.matrix(), problem.fixed[name], atol=1e-15)
+            continue
+        for axis in np.eye(6):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = {**solution.X, **solution.Y, name: T.retract(sign * step * axis)}
+                X, Y = ({key: moved[key] for key in side} for side in (solution.X, solution.Y))
+                ends.append(cost_of(problem, X, Y, solution.scale))
+            curvature = (ends[0] + ends[1] - 2.0 * solution.cost) / step**2
+            assert curvature > 0.0
+            # The minimum is within a tenth of a micrometre or microradian.
+            assert abs(ends[0] - ends[1]) / (2.0 * step) < 1e-7 * curvature
+    if mode != "known":
+        names = problem.targets if mode == "per_target" else ("all",)
+        for name in names:
+            if name in problem.fixed_scales:
+                continue
+            ends = []
+            for sign in (1.0, -1.0):
+                scale = solution.scale
+                if isinstance(scale, dict):
+                    scale = {**scale, name: scale[name] * (1.0 + sign * step)}
+                    ends.append(cost_of(problem, solution.X, solution.Y, scale))
+                else:
+                    ends.append(cost_of(problem, solution.X, solution.Y, scale * (1.0 + sign * step)))
+            curvature = (ends[0] + ends[1] - 2.0 * solution.cost) / step**2
+            assert abs(ends[0] - ends[1]) / (2.0 * step) < 1e-7 * curvature
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_methods_agree(mode: str) -> None:
+    problem = simulated(mode).problem
+    auto, sdp = rw.solve(problem), rw.solve(problem, method="sdp")
+    assert sdp.certificate.path.start in (Start.CLARABEL, Start.INTERIOR_POINT)
+    assert sdp.cost == pytest.approx(auto.cost, rel=1e-9)
+    for name, T in {**auto.X, **auto.Y}.items():
+        np.testing.assert_allclose({**sdp.X, **sdp.Y}[name].matrix(), T.matrix(), atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [1e-3, 0.2])
+def test_local_descends_from_the_users_start(mode: str, size: float) -> None:
+    problem = simulated(mode).problem
+    best = rw.solve(problem)
+    known = tuple(problem.fixed_scales)
+    start = (
+        perturbed(best.X, size, 1),
+        perturbed(best.Y, size, 2),
+        scaled(best.scale, 1.2, known) if mode != "known" else 1.0,
+    )
+    local = rw.solve(problem, method="local", initial=start)
+    assert local.certificate.path.start is Start.GIVEN
+    assert local.certificate.is_certified
+    assert local.cost == pytest.approx(best.cost, rel=1e-9)
+    for name, T in {**best.X, **best.Y}.items():
+        np.testing.assert_allclose({**local.X, **local.Y}[name].matrix(), T.matrix(), atol=1e-7)
+
+
+def with_local_minimum() -> tuple[rw.Problem, rw.Solution, rw.Solution]:
+    """Five noisy measurements, the best answer, and where descent from a bad start ends."""
+    problem = general(
+        1, 1, seed=0, noise=Noise(0.05, 20.0), number_of_measurements=5, motion=Motion(max_angle_rad=1.0)
+    ).problem
+    best = rw.solve(problem)
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        X, Y = random_poses(2, 1.0, generator)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            local = rw.solve(problem, method="local", initial=({"target0": X}, {"sensor0": Y}, 1.0))
+        if local.cost > 2.0 * best.cost:
+            return problem, best, local
+    raise AssertionError("no start led to a local minimum")
+
+
+def test_a_local_minimum_is_not_certified() -> None:
+    problem, best, local = with_local_minimum()
+    assert best.certificate.is_optimal  # five measurements with noise of 9 degrees leave directions free
+    assert local.certificate.status == "gap"
+    assert not local.certificate.is_certified
+    assert local.certificate.lower_bound <= best.cost < local.cost
+    assert local.certificate.cause is Cause.LOCAL_MINIMUM_POSSIBLE
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)
+        warnings.simplefilter("error", NotCertifiedWarning)
+        with pytest.raises(NotCertifiedWarning, match="not proven optimal"):
+            rw.solve(problem, method="local", initial=(local.X, local.Y, 1.0))
+
+
+def test_a_local_minimum_given_to_certify_is_beaten() -> None:
+    problem, best, local = with_local_minimum()
+    certificate = rw.certify(problem, X=local.X, Y=local.Y)
+    assert certificate.status == "gap"
+    assert certificate.cost == pytest.approx(local.cost, rel=1e-9)
+    assert certificate.lower_bound == pytest.approx(best.cost, rel=1e-6)
+    assert certificate.cause is Cause.BETTER_ANSWER
+    assert certificate.reason == f"a better answer exists: {best.cost:.8g} against {local.cost:.8g}"
+
+
+# -- certify ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_optimum_is_certified_as_given(mode: str) -> None:
+    problem = simulated(mode).problem
+    solution = rw.solve(problem)
+    for X, Y in ((solution.X, solution.Y), (matrices(solution.X), matrices(solution.Y))):
+        certificate = rw.certify(problem, X=X, Y=Y, scale=solution.scale)
+        assert certificate.status == "certified"
+        assert certificate.cause.status is rw.Status.CERTIFIED
+        assert certificate.cost == pytest.approx(solution.cost, rel=1e-9)
+        assert certificate.lower_bound <= certificate.cost
+        assert certificate.relative_gap < 1e-6
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [1e-3, 0.1])
+def test_an_answer_beside_the_optimum_is_not(mode: str, size: float) -> None:
+    problem = simulated(mode).problem
+    best = rw.solve(problem)
+    X, Y = perturbed(best.X, size, 3), perturbed(best.Y, size, 4)
+    certificate = rw.certify(problem, X=X, Y=Y, scale=best.scale)
+    assert certificate.status == "gap"
+    assert certificate.cost == pytest.approx(cost_of(problem, X, Y, best.scale), rel=1e-9)
+    assert certificate.cost > best.cost
+    assert certificate.lower_bound == pytest.approx(best.cost, rel=1e-6)
+    assert certificate.cause is Cause.BETTER_ANSWER
+    assert certificate.gap == pytest.approx(certificate.cost - certificate.lower_bound)
+    assert certificate.relative_gap == pytest.approx(certificate.gap / certificate.cost)
+
+
+def test_without_a_bound_a_worse_answer_is_not_called_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gap needs a bound. No measurements are known that have none, so the search is given the record of none."""
+    problem = simulated("known").problem
+    best = rw.solve(problem)
+    monkeypatch.setattr(attempt, "lower_bound", lambda *_, **__: Bound())
+    for size in (0.0, 0.1):
+        certificate = rw.certify(problem, X=perturbed(best.X, size, 3), Y=best.Y)
+        assert (certificate.status, certificate.cause) == (rw.Status.FAILED, Cause.NO_BOUND)
+        assert certificate.lower_bound == -np.inf
+
+
+@pytest.mark.parametrize("mode", ["shared", "per_target"])
+def test_the_optimum_with_another_scale_is_not(mode: str) -> None:
+    problem = simulated(mode).problem
+    best = rw.solve(problem)
+    wrong = scaled(best.scale, 1.05, tuple(problem.fixed_scales))
+    certificate = rw.certify(problem, X=best.X, Y=best.Y, scale=wrong)
+    assert certificate.status == "gap"
+    assert certificate.cost == pytest.approx(cost_of(problem, best.X, best.Y, wrong), rel=1e-9)
+    assert certificate.cause is Cause.BETTER_ANSWER
+
+
+def test_one_number_stands_for_all_unknown_scales() -> None:
+    simulation = general(2, 1, seed=1, noise=NOISE, scale="per_target", true_scale={"target0": 0.8, "target1": 0.8})
+    problem = simulation.problem
+    each = rw.certify(problem, X=simulation.X, Y=simulation.Y, scale={"target0": 0.8, "target1": 0.8})
+    assert rw.certify(problem, X=simulation.X, Y=simulation.Y, scale=0.8).cost == each.cost
+
+
+def test_the_truth_is_near_the_optimum_but_not_it() -> None:
+    """Noise takes the optimum away from the truth: its cost is above by about half the number of unknowns."""
+    simulation = simulated("known", number_of_measurements=50)
+    best = rw.solve(simulation.problem)
+    certificate = rw.certify(simulation.problem, X=simulation.X, Y=simulation.Y)
+    assert certificate.status == "gap"
+    assert 2.0 < certificate.cost - best.cost < 40.0  # half a chi-square of 24 degrees of freedom: 12 on average
+
+
+def test_parts_are_certified_together() -> None:
+    simulation = general(2, 2, seed=2, graph=[(0, 0), (1, 1)], noise=NOISE)
+    problem = simulation.problem
+    best = rw.solve(problem)
+    certificate = rw.certify(problem, X=best.X, Y=best.Y)
+    assert certificate.is_certified
+    assert certificate.cost == pytest.approx(sum(part.certificate.cost for part in best.parts), rel=1e-9)
+    worse = rw.certify(problem, X={**best.X, **perturbed({"target1": best.X["target1"]}, 0.01, 1)}, Y=best.Y)
+    assert worse.status == "gap"
+    assert worse.cost > certificate.cost
+    assert worse.lower_bound == pytest.approx(certificate.lower_bound, rel=1e-9)
