@@ -13,7 +13,7 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import ROTATION_ROUNDING, Array, checked_rows, orthonormality, rows_to_transforms
 from gtsam_rwhec.geometry.rounding import UNIT
 from gtsam_rwhec.problem.knowledge import check_name
-from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pair
+from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pair, whole_stamps
 from gtsam_rwhec.problem.moment_stack import BACK_ENTRIES, FRONT, FRONT_ENTRIES, MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, Gauge, Moments
 
@@ -285,7 +285,7 @@ class GivenMany:
         def chosen(values: np.ndarray) -> np.ndarray:
             return values.copy() if is_sorted else values[order]  # a copy, since the caller's arrays may change
 
-        stamps = self._checked_stamps(count)
+        stamps = whole_stamps(given.stamps_ns, count, self.where)
         result = Sorted(
             pairs=pairs,
             first=np.r_[0, np.cumsum(number)],
@@ -349,14 +349,3 @@ class GivenMany:
                 "its pair in pairs"
             )
         return index.astype(np.int64)
-
-    def _checked_stamps(self, count: int) -> np.ndarray | None:
-        if self.measurements.stamps_ns is None:
-            return None
-        stamps = np.asarray(self.measurements.stamps_ns)
-        if stamps.shape != (count,) or not np.issubdtype(stamps.dtype, np.integer):
-            raise CountError(
-                f"{self.where}: stamps_ns has shape {stamps.shape} of {stamps.dtype} for {count} measurements; give "
-                "integer nanoseconds"
-            )
-        return stamps.astype(np.int64)

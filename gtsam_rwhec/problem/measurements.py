@@ -192,6 +192,20 @@ def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.nd
     A CountError says that their number or type is another one, a StampError which stamp goes back. Measurements of one
     pair may have one stamp.
     """
+    stamps = whole_stamps(stamps_ns, count, where)
+    back = np.flatnonzero(np.diff(stamps) < 0) if stamps is not None else np.zeros(0, dtype=int)
+    if stamps is not None and back.size:
+        i = int(back[0]) + 1
+        raise StampError(
+            f"{where}: stamp {i} ({stamps[i]} ns) is before the stamp ahead of it ({stamps[i - 1]} ns): rows are out "
+            "of order, or a clock was set back. Sort the measurements by stamp; where a clock was set back, correct "
+            "the stamps, or leave stamps_ns out"
+        )
+    return stamps
+
+
+def whole_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.ndarray | None:
+    """Stamps as (count,) integer nanoseconds in any order; a CountError for others."""
     if stamps_ns is None:
         return None
     try:
@@ -202,16 +216,7 @@ def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.nd
         raise CountError(f"{where}: stamps_ns has shape {stamps.shape} for {count} measurements")
     if not np.issubdtype(stamps.dtype, np.integer):
         raise CountError(f"{where}: stamps_ns is of {stamps.dtype}; give integer nanoseconds")
-    stamps = stamps.astype(np.int64)
-    back = np.flatnonzero(np.diff(stamps) < 0)
-    if back.size:
-        i = int(back[0]) + 1
-        raise StampError(
-            f"{where}: stamp {i} ({stamps[i]} ns) is before the stamp ahead of it ({stamps[i - 1]} ns): rows are out "
-            "of order, or a clock was set back. Sort the measurements by stamp; where a clock was set back, correct "
-            "the stamps, or leave stamps_ns out"
-        )
-    return stamps
+    return stamps.astype(np.int64)
 
 
 def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -> Array | None:

@@ -223,8 +223,7 @@ class MomentStack:
 
     def is_finite(self) -> np.ndarray:
         """(E,): whether the sums of a pair are numbers that did not overflow."""
-        finite: np.ndarray = np.isfinite(self.front).all(axis=1)
-        return finite
+        return np.asarray(np.isfinite(self.front).all(axis=1))
 
     def squares(self, features: slice) -> Array:
         """(E,): the sum of the weighted squares of t_A or t_B."""

@@ -181,7 +181,7 @@ class BlockFactor:
             x[n] = 0.0
             tail -= passed[:, d * m :].sum(axis=0)
         rest = np.concatenate([x[self.order.rest].reshape(-1, c), tail])
-        rest = scipy.linalg.cho_solve((self.rest, True), rest, check_finite=False)
+        rest = scipy.linalg.lapack.dpotrs(self.rest, rest, lower=1)[0] if len(rest) else rest
         x[self.order.rest], tail = rest[: len(rest) - q].reshape(-1, m, c), rest[len(rest) - q :]
         for group, lower, rows in zip(
             reversed(self.order.groups), reversed(self.frames), reversed(self.rows), strict=True

@@ -37,7 +37,7 @@ from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.null_vectors import NullVectors, free_vectors, point_as_null_vector, stationary_along
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.region import AT_LEAST, LARGER, Region, half_widths, smallest_region
-from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT, constraint_values
+from gtsam_rwhec.solver.rotations import constraint_values, multiplier_blocks
 
 #: Margins of definiteness as parts of the form's diagonal: the largest that is proven costs least.
 ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -227,8 +227,7 @@ class _Lagrangian:
         value = evaluation.cost - float((multipliers * constraints).sum()) - linear
         value_error = evaluation.cost_error + gamma(20 * n + 8) * float(np.abs(multipliers * constraints).sum())
         value_error += gamma(8) * (abs(evaluation.cost) + abs(linear) + abs(value))
-        Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)
-        size = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)
+        Lambda, size = multiplier_blocks(multipliers)
         r = np.c_[point.numbers[:, 4:], np.ones(n)]
         g, g_error = evaluation.gradient.copy(), evaluation.gradient_error.copy()
         of_numbers, of_errors = g[:-1].reshape(n, 13), g_error[:-1].reshape(n, 13)
@@ -300,7 +299,7 @@ class _Lagrangian:
     def indefinite(self, enough: float) -> Bound:
         """Z has a negative eigenvalue: rotations are limited, so a slack on their entries costs a limited amount."""
         n = len(self.multipliers)
-        Lambda = (self.multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)[:, :9, :9]
+        Lambda = multiplier_blocks(self.multipliers)[0][:, :9, :9]
         smallest, direction = self.form.form.smallest_eigenpair(Lambda) if n else (0.0, np.zeros(0))
         slack = max(-1.01 * smallest, 4.0 * UNIT * self.form.form.magnitude)
         limit = 1e3 * self.form.form.magnitude

@@ -19,7 +19,7 @@ from gtsam_rwhec.solver.block_matrix import (
     is_proven_to_exceed,
     proof_that_it_exceeds,
 )
-from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
+from gtsam_rwhec.solver.rotations import multiplier_blocks
 
 #: A variable that is held has this many times its own diagonal entry added.
 HELD = 2.0**50
@@ -76,8 +76,7 @@ class Curvature:
     def less(self, multipliers: Array) -> Curvature:
         """Q - Lambda for multipliers (n, 20), with the rounding of the subtraction."""
         n = len(multipliers)
-        blocks = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)[:, :9, :9]
-        size = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)[:, :9, :9].copy()
+        blocks, size = (each[:, :9, :9] for each in multiplier_blocks(multipliers))
         frames = self.matrix.frames.copy()
         frames[:, 4:, 4:] -= blocks
         size += np.abs(frames[:, 4:, 4:])

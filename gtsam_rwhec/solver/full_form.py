@@ -96,7 +96,7 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
     A block has 13 numbers for each frame, and 9 in the second form; the tail is [alpha, h].
     """
     n, E = len(part.free), len(part.pairs)
-    coupled: np.ndarray = (slots.frames < n).all(axis=1)
+    coupled = np.asarray((slots.frames < n).all(axis=1))
     where = np.cumsum(coupled) - 1
     order = Elimination.of(n, *slots.frames[coupled].T)
     couplings = np.zeros((int(coupled.sum()), 13, 13))

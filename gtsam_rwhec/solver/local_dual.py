@@ -24,7 +24,7 @@ from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, CONSTRAINTS_FLAT, project, unvec, vec
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, multiplier_blocks, project, unvec, vec
 from gtsam_rwhec.solver.small_dual import maximise, null_multipliers, scatter
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
@@ -36,7 +36,7 @@ def own_curvature(whole: PartForm, multipliers: Array) -> Array:
     """The smallest mu (n,) with Z v = mu Q v for vectors v of one frame alone: Z is surely negative where mu is."""
     own, inner = _own_blocks(whole)
     M = own[:, 4:, 4:] - np.matmul(own[:, 4:, :4], np.linalg.solve(inner, own[:, :4, 4:]))
-    Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(-1, 10, 10)[:, :9, :9]
+    Lambda = multiplier_blocks(multipliers)[0][:, :9, :9]
     values, vectors = np.linalg.eigh(0.5 * (M + M.transpose(0, 2, 1)))
     root = vectors / np.sqrt(np.maximum(values, 1e-9 * np.abs(values).max(axis=1, initial=1e-290)[:, None]))[:, None, :]
     smallest: Array = 1.0 - np.linalg.eigvalsh(root.transpose(0, 2, 1) @ Lambda @ root)[:, -1]

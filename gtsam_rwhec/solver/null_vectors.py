@@ -18,7 +18,7 @@ from gtsam_rwhec.geometry.rounding import gamma
 from gtsam_rwhec.solver.answers import Action, Evaluation
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, CONSTRAINTS_FLAT, WITH_CONSTANT
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, WITH_CONSTANT, multiplier_blocks
 
 #: Eigenvalues up to this many times the test's allowance for rounding count as zero.
 REACH = 100.0
@@ -175,8 +175,7 @@ def _with_multipliers(
 ) -> NullVectors:
     """What Z = Q - Lambda + slack does to V, from what Q does."""
     n, k = len(multipliers), V.shape[1]
-    Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)
-    size = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)
+    Lambda, size = multiplier_blocks(multipliers)
     r = V[:-1].reshape(n, 13, k)[:, 4:]
     x = np.c_[evaluation.point.numbers[:, 4:], np.ones(n)]
     of_V = np.einsum("nij,njk->nik", Lambda[:, :9, :9], r) - slack * r

@@ -137,6 +137,13 @@ def random_rotations(count: int, generator: np.random.Generator) -> Array:
     )
 
 
+def multiplier_blocks(multipliers: Array) -> tuple[Array, Array]:
+    """Lambda = sum lambda_k A_k for multipliers (n, 20), over [vec R, h] (n, 10, 10), and the sizes of its terms."""
+    n = len(multipliers)
+    blocks, sizes = multipliers @ CONSTRAINTS_FLAT, np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)
+    return blocks.reshape(n, 10, 10), sizes.reshape(n, 10, 10)
+
+
 def kkt_multipliers(R: Array, gradient: Array) -> Array:
     """(n, 20) multipliers of the constraints at a critical point: S_i = sym(R_i' G_i) on R'R = I (design fact 3).
 

@@ -123,7 +123,7 @@ class Search:
         Planar motion leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a little, and
         the image may cost more than the bound allows: then the image is returned with this gap.
         """
-        if self._has_positive_scales(found.R):
+        if found.answer.has_positive_scales:
             return found
         with self.stages.of("descent"):
             end = descend(self.form, mirrored(self.part, found.R), self.options.max_descent_iterations)
