@@ -5,32 +5,23 @@ targets. ``null`` stands for what is infinite: a standard deviation along a free
 """
 
 from __future__ import annotations
+
 import json
 from collections import Counter
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
-from typing import Final
-from typing import Literal
+from typing import Annotated, Final, Literal
+
 import numpy as np
-from pydantic import BaseModel
-from pydantic import ConfigDict
-from pydantic import Field
-from pydantic import ValidationError
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.poses import one_transform
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
+from gtsam_rwhec.errors import FileFormatError, FrameError
+from gtsam_rwhec.files.whole_files import read_whole, write_atomically
+from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.odometry.odometry_record import JointCertificate
-from gtsam_rwhec.odometry.odometry_record import OdometryCalibration
-from gtsam_rwhec.odometry.odometry_record import free_in_words
+from gtsam_rwhec.odometry.odometry_record import JointCertificate, OdometryCalibration, free_in_words
 
 FORMAT: Final = "gtsam-rwhec odometry result"
 FORMAT_VERSION: Final = 1
