@@ -13,9 +13,8 @@ from gtsam_rwhec.errors import MissingPackageError
 #: The extra of this package that installs a package, by the name that ``import`` has.
 EXTRAS = {
     "PIL": "log", "cv2": "log", "google": "log", "loky": "log", "lz4": "log", "mcap": "log", "mcap_protobuf": "log",
-    "yaml": "log", "zstandard": "log", "rosbags": "rosbags",
-    "jinja2": "report", "matplotlib": "report", "plotly": "report", "textalloc": "report",
-    "requests": "cli", "rich": "cli", "typer": "cli",
+    "requests": "log", "yaml": "log", "zstandard": "log", "rosbags": "rosbags",
+    "jinja2": "report", "matplotlib": "report", "plotly": "report", "rich": "report", "typer": "cli",
     "dask": "fleet", "distributed": "fleet", "fsspec": "fleet", "pyarrow": "fleet", "s3fs": "fleet",
 }  # fmt: skip
 

@@ -1,12 +1,15 @@
 """A package that is missing: the error names the extra that installs it."""
 
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
 from gtsam_rwhec.errors import MissingPackageError, RwhecError
-from gtsam_rwhec.files.optional_packages import extra_named
+from gtsam_rwhec.files.optional_packages import EXTRAS, extra_named
 
 
 def test_missing_package_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,3 +43,15 @@ except rw.errors.MissingPackageError as error:
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout == f"{package} is not installed: pip install 'gtsam-rwhec[{extra}]'\n"
+
+
+def test_each_package_is_in_the_extra_that_is_named() -> None:
+    distributions = {
+        "PIL": "pillow", "cv2": "opencv-python-headless", "distributed": "dask", "google": "protobuf",
+        "mcap_protobuf": "mcap-protobuf-support", "yaml": "pyyaml",
+    }  # fmt: skip
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    extras = tomllib.loads(text)["project"]["optional-dependencies"]
+    for package, extra in EXTRAS.items():
+        names = {re.match(r"[\w-]+", requirement)[0] for requirement in extras[extra]}  # type: ignore[index]
+        assert distributions.get(package, package) in names, package

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.files.terminal_text import LONGEST, LONGEST_NAME, brief, printable, shown
+from gtsam_rwhec.files.terminal_text import LONGEST, LONGEST_NAME, brief, printable, rounded, shown
 
 HOSTILE = {
     "\x1b[31mred\x1b[0m": r"\x1b[31mred\x1b[0m",
@@ -73,3 +73,11 @@ def test_any_value(value: object, said: str) -> None:
 )
 def test_a_large_value_is_short(value: object) -> None:
     assert len(brief(value)) < LONGEST_NAME + 60
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "written"),
+    [(941_653.0, 3, "942000"), (1234.0, 2, "1200"), (0.0512, 2, "0.051"), (3.0, 2, "3"), (float("inf"), 2, "inf")],
+)
+def test_numbers_have_few_digits_and_no_exponent(value: float, digits: int, written: str) -> None:
+    assert rounded(value, digits) == written

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 from given_commands import command
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "fleet"))
 from robot_nights import failed_night, robot_nights
 
 from gtsam_rwhec.fleet import rows_json, rows_parquet
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "fleet"))
 
 
 @pytest.fixture(scope="module")
