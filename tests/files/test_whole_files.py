@@ -89,7 +89,8 @@ def test_what_is_no_image_is_refused_at_once(tmp_path: Path, kind: str) -> None:
     image = tmp_path / "images" / "a.png"
     if (made := make(image)) != image:
         image.symlink_to(made)
-    (tmp_path / "poses.txt").write_text("a 1 2 3 0 0 0 1")
+    (tmp_path / "images" / "b.png").touch()
+    (tmp_path / "poses.txt").write_text("a 1 2 3 0 0 0 1\nb 1 2 4 0 0 0 1")
     with pytest.raises(FileFormatError, match=words):
         rw.logs.write_image_folder(tmp_path / "images", tmp_path / "poses.txt", tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
