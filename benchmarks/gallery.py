@@ -10,7 +10,6 @@ in FOLDER: an interrupted campaign goes on where it was. Exits with 1 if a bar i
 """
 
 from __future__ import annotations
-
 import io
 import json
 import os
@@ -18,20 +17,24 @@ import re
 import tempfile
 import warnings
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-
 import gallery_scene as scene
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from gallery_faults import FAULTS, Fault
-from loky import ProcessPoolExecutor, as_completed
+from bars import Row
+from bars import benchmark_parser
+from bars import print_rows
+from gallery_faults import FAULTS
+from gallery_faults import Fault
+from loky import ProcessPoolExecutor
+from loky import as_completed
 from rich.console import Console
-
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.report.advice import print_advice
 from gtsam_rwhec.rig import read_rig
+from gtsam_rwhec.report.advice import Advice
+from gtsam_rwhec.report.terminal_report import print_sentence
 
 #: The share of runs in which the fault is to be named.
 NAMED = 140 / 150
@@ -69,7 +72,8 @@ def paragraph(calibrated: rw.runs.Calibrated) -> str:
     free = calibrated.refined.free_directions
     if not free:
         free = calibrated.solution.identifiability.free_directions
-    print_advice(console, free, calibrated.log, calibration.judgement)
+    for words, style in Advice.of(free, calibrated.log, calibration.judgement).items:
+        print_sentence(console, words, style)
     return f"{calibration.judgement}\n{stream.getvalue()}".strip()
 
 

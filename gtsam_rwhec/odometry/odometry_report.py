@@ -1,24 +1,41 @@
 """The report of a calibration of odometries, as people read it: verdict, what to do, poses, what is free, the proof."""
 
 from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
-
 import gtsam
 import numpy as np
-
-from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.terminal_text import shown_path
-from gtsam_rwhec.odometry.odometry_result import OdometryResult, SensorRecord, is_odometry_result, read_odometry_result
-from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
+from gtsam_rwhec.odometry.odometry_result import OdometryResult
+from gtsam_rwhec.odometry.odometry_result import SensorRecord
+from gtsam_rwhec.odometry.odometry_result import is_odometry_result
+from gtsam_rwhec.odometry.odometry_result import read_odometry_result
 from gtsam_rwhec.report.html_page import write_page
-from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
-from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, print_tables, report_console
-from gtsam_rwhec.report.report_blocks import Block, Folded, Listing, Number, Page, Paragraph, Section, Table
+from gtsam_rwhec.report.report_blocks import Block
+from gtsam_rwhec.report.report_blocks import Folded
+from gtsam_rwhec.report.report_blocks import Listing
+from gtsam_rwhec.report.report_blocks import Number
+from gtsam_rwhec.report.report_blocks import Page
+from gtsam_rwhec.report.report_blocks import Paragraph
+from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.calibration_report import pose_cells
+from gtsam_rwhec.report.report_blocks import TONES
+from gtsam_rwhec.report.report_blocks import Words
+from gtsam_rwhec.report.terminal_report import STYLES
+from gtsam_rwhec.report.terminal_report import print_heading
+from gtsam_rwhec.report.terminal_report import print_list
+from gtsam_rwhec.report.terminal_report import print_sections
+from gtsam_rwhec.report.terminal_report import print_sentence
+from gtsam_rwhec.report.terminal_report import print_tables
+from gtsam_rwhec.report.terminal_report import report_console
+from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS
+from gtsam_rwhec.report.verdict_section import POSE_HEADINGS
 
 #: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.
 FREE_SHARE = 0.1
+#: So many sentences say what is not used.
+MOST_REMOVED = 4
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along "
     "and about the sensor's own axes; free: not determined."
@@ -26,32 +43,33 @@ LEGEND = (
 
 
 def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path | None = None) -> None:
-    """Print the report of a calibration of odometries."""
+    """Print the report of a calibration of odometries: what matters, or all that its page says."""
     console = report_console()
     print_sentence(console, str(result.judgement), STYLES[result.verdict])
     if page is not None:
         print_sentence(console, f"The report: {shown_path(page)}")
+    if verbose:
+        print_sections(console, odometry_page(result).sections[1:])
+        return
     console.print()
-    print_tables(console, [pose_table(result)], LEGEND)
+    print_tables(console, [pose_table(result)], tight=True)
     print_list(console, scales_and_clocks(result))
     if result.given:
         print_heading(console, "What was given, and how the answer depends on it", tight=True)
         print_list(console, given_in_words(result))
     print_heading(console, "The proof and the noise", tight=True)
     print_list(console, proof_in_words(result))
-    removed = removed_in_words(result)
-    if removed:
-        print_list(console, removed if verbose else removed[:4])
+    print_list(console, removed_in_words(result)[:MOST_REMOVED])
     print_list(console, [f"{words[:1].upper()}{words[1:]}." for words in result.remarks])
-    if verbose:
-        print_list(console, [one.sentence for one in result.free_directions])
 
 
-def pose_table(result: OdometryResult) -> FrameTable:
+def pose_table(result: OdometryResult) -> Table:
     """Poses in the frame of the reference, with their standard deviations."""
-    rows = {one.sensor: (*_pose(result, one), *deviations(one)) for one in result.sensors}
+    rows: dict[str, tuple[Words, ...]] = {
+        one.sensor: (*_pose(result, one), *_deviations(one)) for one in result.sensors
+    }
     title = f"Sensors in the frame of {result.reference}"
-    return FrameTable(title, "sensor", (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, tight=True)
+    return Table.of(title, "sensor", (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, LEGEND)
 
 
 def _pose(result: OdometryResult, one: SensorRecord) -> tuple[str, ...]:
@@ -69,7 +87,7 @@ def _pose(result: OdometryResult, one: SensorRecord) -> tuple[str, ...]:
     return tuple(cells)
 
 
-def deviations(one: SensorRecord) -> tuple[str, ...]:
+def _deviations(one: SensorRecord) -> tuple[str, ...]:
     """Standard deviations in mm, then in degrees."""
     millimetres = ("free" if x is None else f"{x:.2f}" for x in one.standard_deviations_mm)
     degrees = ("free" if x is None else f"{x:.3f}" for x in one.standard_deviations_deg)
@@ -135,7 +153,6 @@ def removed_in_words(result: OdometryResult) -> list[str]:
     ]
 
 
-TONES = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
 #: Before the name of a field in a result file.
 OF = "result.json#"
 
@@ -170,14 +187,14 @@ def odometry_page(result: OdometryResult) -> Page:
     open_ = (Listing((*free, *others)),) if free or others else (Paragraph(determined, "good"),)
     given: tuple[Block, ...] = (Listing(tuple(given_in_words(result))),)
     sections = (
-        Section("verdict", "Verdict", (Paragraph(str(result.judgement), tone), *_findings(result))),  # type: ignore[arg-type]
+        Section("verdict", "Verdict", (Paragraph(str(result.judgement), tone), *_findings(result))),
         Section("poses", f"Poses in the frame of {result.reference}", tuple(_poses(result))),
         Section("determines", "What the motions determine", open_),
         Section("given", "What was given", given if result.given else (), "" if result.given else "nothing was given."),
         Section("noise", "Noise and windows", tuple(_noise(result))),
         Section("proof", "The proof", tuple(_proof(result))),
     )
-    return Page("Calibration of odometries", tone, sections, f"Written by {result.written_by}.")  # type: ignore[arg-type]
+    return Page("Calibration of odometries", tone, sections, f"Written by {result.written_by}.")
 
 
 def _findings(result: OdometryResult) -> Iterator[Block]:
@@ -186,8 +203,7 @@ def _findings(result: OdometryResult) -> Iterator[Block]:
 
 
 def _poses(result: OdometryResult) -> Iterator[Block]:
-    table = pose_table(result)
-    yield Table(table.title, ("sensor", *table.headings), tuple((n, *cells) for n, cells in table.rows.items()), LEGEND)
+    yield pose_table(result)
     said = scales_and_clocks(result)
     if said:
         yield Listing(tuple(said))

@@ -1,29 +1,46 @@
-"""The report of ``calibrate``: a screen of it, or all: verdict, what to do, points, choices, poses and details."""
+"""Calibrations, refinements and solutions on the terminal: one screen, or all that their page says in words."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import gtsam
+import numpy as np
 from rich.console import Console
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.report.advice import Advice, print_advice
-from gtsam_rwhec.report.covariance_report import label, print_refined_body, wrong_sentence
-from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, report_console
-from gtsam_rwhec.report.short_poses import refined_poses, scales_and_clocks
-from gtsam_rwhec.report.short_report import LINES, ShortReport
-from gtsam_rwhec.report.solution_report import print_solution_body, solved_poses
+from gtsam_rwhec.calibration.verdict import Finding, Verdict
+from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.fitting.fit_options import About
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.unknowns import UnknownKind
+from gtsam_rwhec.geometry.pose_covariances import standard_deviations
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.report.advice import Advice, certificate_sentence, scale_sentence
+from gtsam_rwhec.report.report_blocks import Paragraph, Section, Table, Words, is_absent
+from gtsam_rwhec.report.report_page import sections_of
+from gtsam_rwhec.report.residual_section import RESIDUAL_HEADINGS, residual_cells
+from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.report.terminal_report import STYLES, print_blocks, print_sections, report_console
+from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, MARK, NO_NOISE_STATED, POSE_HEADINGS
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_judgement import contradicted_names
+from gtsam_rwhec.results.result_judgement import contradicted, contradicted_names, judge
 from gtsam_rwhec.solver.free_directions import FreeDirection
+from gtsam_rwhec.solver.solution import Solution
 
-POINTS = (
-    "This is the error of the calibration alone, where the sensor typically saw its targets; in Python, "
-    "calibration.uncertainty_at(point, frame) tells of any other point."
+ANGLES = "R = Rz(yaw) Ry(pitch) Rx(roll)"
+SOLVED_LEGEND = (
+    f"x, y, z: metres. roll, pitch, yaw: degrees, with {ANGLES}. rms: root mean square length of the residuals of a "
+    "frame's n measurements, weighted as in the cost, in mm and degrees."
 )
-#: How to see everything, in Python.
-WHOLE = "print_calibration(calibration, verbose=True)"
+#: The carrier that has the noise of A.
+CARRIERS: dict[About, str] = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}
+#: Sections that are for browsers: the scene, and texts to copy.
+ON_THE_PAGE_ONLY = ("scene", "inputs")
 
 
 def print_calibration(
@@ -34,7 +51,7 @@ def print_calibration(
     verbose: bool = False,
     lines: int = LINES,
     page: Path | None = None,
-    whole: str = WHOLE,
+    whole: str = "print_calibration(calibration, verbose=True)",
 ) -> None:
     """Print a screen with the verdict, what to do, how far off a point is, and the poses; or everything.
 
@@ -47,7 +64,7 @@ def print_calibration(
     log : LogFields, optional
         What became of the measurements, if they come from a log.
     verbose : bool
-        Print everything: the choices with their evidence, all columns and rows, corners, residuals, the proof.
+        Print everything: what the page says, but for figures and what only the measurements tell.
     lines : int
         The lines of the screen. Sentences in a file are not wrapped, and count as on a terminal of 80 columns.
     page : Path, optional
@@ -57,53 +74,196 @@ def print_calibration(
     """
     console = report_console() if console is None else console
     if verbose:
-        _print_everything(calibration, console, log)
-    else:
-        _short(calibration, log).print(console, lines=lines, page=page, whole=whole)
-
-
-def _short(calibration: Calibration, log: LogFields | None) -> ShortReport:
+        _print_everything(console, ShownResult.of_answer(calibration, log))
+        return
     refined, solution = calibration.refined, calibration.solution
-    said = Advice.of(_free(calibration), log, calibration.judgement).items
-    points = tuple(calibration.points.values())
-    notes = tuple((note, "yellow") for note in calibration.notes)
-    if refined is None:
-        poses = () if solution is None else (solved_poses(solution),)
-        return ShortReport(calibration.judgement, said, points, poses, notes)
-    wrong = contradicted_names(refined, log)
-    marked = frozenset(label(name, wrong) for name in wrong)
-    sentences: tuple[tuple[str, str], ...] = ((wrong_sentence(refined, log), "bold"),) if wrong else ()
-    sentences += (*notes, *((words, "") for words in scales_and_clocks(refined)))
-    return ShortReport(calibration.judgement, said, points, refined_poses(refined, wrong, log), sentences, marked)
-
-
-def _free(calibration: Calibration) -> Sequence[FreeDirection]:
-    refined, solution = calibration.refined, calibration.solution
-    free = () if refined is None else refined.free_directions
+    free: Sequence[FreeDirection] = () if refined is None else refined.free_directions
     if not free and solution is not None:
         free = solution.identifiability.free_directions
-    return free
-
-
-def _print_everything(calibration: Calibration, console: Console, log: LogFields | None) -> None:
-    judgement, refined, solution = calibration.judgement, calibration.refined, calibration.solution
-    print_sentence(console, str(judgement), STYLES[judgement.verdict])
-    print_advice(console, _free(calibration), log, judgement)
-    points = calibration.points
-    if points:
-        print_heading(console, "How far off a point is")
-        print_list(console, map(str, points.values()))
-        print_sentence(console, POINTS, "dim")
-    print_heading(console, "What was chosen, and why")
-    print_list(console, map(str, calibration.choices))
-    print_list(console, calibration.notes, "yellow")
-    if calibration.cannot_tell:
-        print_list(console, [f"Not checked, as no residual shows it: {_facts(calibration)}."], "dim")
+    report = ShortReport(
+        calibration.judgement,
+        Advice.of(free, log, calibration.judgement).items,
+        tuple(calibration.points.values()),
+        sentences=tuple((note, "yellow") for note in calibration.notes),
+    )
     if refined is not None:
-        print_refined_body(console, refined, log, outliers_are_said=True)
+        report = _with_refined_poses(report, refined, log)
     elif solution is not None:
-        print_solution_body(console, solution)
+        report = replace(report, poses=(_solved_poses(solution),))
+    report.print(console, lines=lines, page=page, whole=whole)
 
 
-def _facts(calibration: Calibration) -> str:
-    return "; ".join(words.removeprefix("data cannot tell: ") for words in calibration.cannot_tell)
+def print_refined(refined: Refined, console: Console | None = None, *, log: LogFields | None = None) -> None:
+    """Print the verdict, what to do, the refined poses with their standard deviations, and the details.
+
+    Parameters
+    ----------
+    refined : Refined
+        The result of `gtsam_rwhec.refine`.
+    console : rich.console.Console, optional
+        Where to print; standard output by default.
+    log : LogFields, optional
+        What became of the measurements, if they come from a log.
+    """
+    console = report_console() if console is None else console
+    noise = Section("noise-of-A", "Noise of the carriers' poses", (Paragraph(_carrier_noise_sentence(refined)),))
+    _print_everything(console, ShownResult.of_answer(refined, log), [noise] if refined.reprojection is None else [])
+
+
+def print_solution(
+    solution: Solution,
+    console: Console | None = None,
+    *,
+    findings: Sequence[Finding] = (),
+    verbose: bool = True,
+    lines: int = LINES,
+    page: Path | None = None,
+    whole: str = "print_solution(solution)",
+) -> None:
+    """Print the verdict, what to do, the poses, and the details; or a screen of it.
+
+    Parameters
+    ----------
+    solution : Solution
+        The result of `gtsam_rwhec.solve`.
+    console : rich.console.Console, optional
+        Where to print; standard output by default.
+    findings : sequence of Finding, optional
+        What else is known against the poses: how A and B were read.
+    verbose : bool
+        Print everything; otherwise a screen: the verdict, what to do, poses with residuals, and what is proven.
+    lines, page, whole
+        The screen's lines, the page with everything, if one was written, and how to see everything here.
+    """
+    console = report_console() if console is None else console
+    judgement = judge(solution, findings=findings)
+    if verbose:
+        _print_everything(console, ShownResult.of_answer(solution, findings=findings))
+        return
+    advice = [(f"  - {NO_NOISE_STATED}", STYLES[Verdict.CARE])] if solution.is_relative else []
+    advice += Advice.of(solution.identifiability.free_directions, judgement=judgement).items
+    scale = () if solution.scale_mode == "known" else (scale_sentence(solution),)
+    sentences = tuple((words, "") for words in (*scale, certificate_sentence(solution.certificate)))
+    report = ShortReport(judgement, tuple(advice), (), (_solved_poses(solution),), sentences)
+    report.print(console, lines=lines, page=page, whole=whole)
+
+
+def _print_everything(console: Console, shown: ShownResult, more: Sequence[Section] = ()) -> None:
+    """The verdict first, then the sections that have something to say without figures and measurements."""
+    sections = [
+        replace(section, blocks=tuple(block for block in section.blocks if not is_absent(block)))
+        for section in sections_of(shown)
+        if section.blocks and section.name not in ON_THE_PAGE_ONLY
+    ]
+    print_blocks(console, sections[0].blocks)
+    print_sections(console, [*sections[1:], *more])
+
+
+def _with_refined_poses(report: ShortReport, refined: Refined, log: LogFields | None) -> ShortReport:
+    """With the poses, marked where they are not to be used, and scales and clocks."""
+    wrong = contradicted_names(refined, log)
+    sentences = list(report.sentences)
+    if wrong:
+        counts = "; ".join(map(str, contradicted(refined, log)))
+        sentences.insert(0, (f"{MARK}: do not use this pose; {counts}.", "bold"))
+    sentences += [(words, "") for words in scales_and_clocks(refined)]
+    marked = frozenset(_label(name, wrong) for name in wrong)
+    return replace(report, poses=_refined_poses(refined, wrong, log), sentences=tuple(sentences), marked=marked)
+
+
+def _refined_poses(refined: Refined, wrong: Collection[str], log: LogFields | None) -> tuple[PoseTables, PoseTables]:
+    """Refined poses with their standard deviations along and about all axes, and with the largest ones alone."""
+    carriers = ("of their carrier", "of their carrier") if log is None else (log.sensor_carrier, log.target_carrier)
+    tables = []
+    sides = ((f"Sensors in the frame {carriers[0]}", refined.Y), (f"Targets in the frame {carriers[1]}", refined.X))
+    for (title, poses), kind in zip(sides, ("sensor", "target"), strict=True):
+        rows: dict[str, tuple[Words, ...]] = {}
+        for name in sorted(poses, key=natural_key):
+            known = deviation_cells(refined.covariance(name)) if name in refined.names else ("fixed",) * 6
+            rows[_label(name, wrong)] = (*pose_cells(poses[name]), *known)
+        tables.append(Table.of(title, kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows))
+    free = "; free: not determined" if any("free" in row for table in tables for row in table.rows) else ""
+    largest = tuple(map(with_largest, tables))
+    return (
+        PoseTables(tuple(tables), f"{ANGLES}. ±: one standard deviation along and about the frame's own axes{free}."),
+        PoseTables(largest, f"{ANGLES}. ±: the largest standard deviation along and about the frame's axes{free}."),
+    )
+
+
+def with_largest(table: Table) -> Table:
+    """The table with one column for the standard deviations of the translation, and one for those of the rotation."""
+    rows = tuple((*row[:7], _largest(row[7:10]), _largest(row[10:])) for row in table.rows)
+    return replace(table, headings=(*table.headings[:7], "± mm", "±°"), rows=rows)
+
+
+def _largest(cells: tuple[Words, ...]) -> Words:
+    """The largest of some cells, of which one that is not a number stands for all."""
+    return max(cells, key=lambda cell: float(str(cell)) if str(cell)[0].isdigit() else math.inf)
+
+
+def _solved_poses(solution: Solution) -> PoseTables:
+    """Certified poses with their residuals, and scales of targets."""
+    scales = solution.scale if isinstance(solution.scale, Mapping) else {}
+    tables = []
+    for kind, poses in (("sensor", solution.Y), ("target", solution.X)):
+        own = any(name in scales for name in poses)
+        rows: dict[str, tuple[Words, ...]] = {}
+        for name in sorted(poses, key=natural_key):
+            scale = (f"{scales[name]:.5f}" if name in scales else "-",) if own else ()
+            rows[name] = (*pose_cells(poses[name]), *residual_cells(solution, name), *scale)
+        headings = (*POSE_HEADINGS, *RESIDUAL_HEADINGS, *(("scale",) if own else ()))
+        tables.append(Table.of(f"{kind.capitalize()}s in the frame of their carrier", kind, headings, rows))
+    return PoseTables(tuple(tables), SOLVED_LEGEND)
+
+
+def pose_cells(pose: gtsam.Pose3) -> tuple[str, ...]:
+    """x, y, z in metres; roll, pitch, yaw in degrees."""
+    translation = (f"{value:z.4f}" for value in pose.translation())
+    return *translation, *(f"{value:z.2f}" for value in np.degrees(pose.rotation().rpy()))
+
+
+def deviation_cells(covariance: Array) -> tuple[str, ...]:
+    """Standard deviations of a pose: translations in millimetres, then rotations in degrees."""
+    degrees, millimetres = standard_deviations(covariance)
+    return *(_cell(value, 2) for value in millimetres), *(_cell(value, 3) for value in degrees)
+
+
+def _cell(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if np.isfinite(value) else "free"
+
+
+def _label(name: str, wrong: Collection[str]) -> str:
+    """A frame's name in tables, marked where its pose is not to be used."""
+    return f"{name} {MARK}" if name in wrong else name
+
+
+def scales_and_clocks(refined: Refined) -> list[str]:
+    """The scales and time offsets, with their standard deviations, in a sentence each."""
+    sentences = []
+    for unknown in refined.unknowns:
+        if unknown.kind not in (UnknownKind.SCALE, UnknownKind.TIME_OFFSET):
+            continue
+        deviation, owner = math.sqrt(refined.covariance(unknown)[0, 0]), unknown.owner
+        if unknown.kind is UnknownKind.SCALE:
+            value = refined.scale[owner] if isinstance(refined.scale, Mapping) else refined.scale
+            of = f" of {owner}" if owner else ""
+            sentences.append(f"Scale{of} (measured / true length): {value:.6f} ± {_cell(deviation, 6)}.")
+        else:
+            offset = 1e3 * refined.time_offsets_s[owner]
+            sentences.append(f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms.")
+    return sentences
+
+
+def _carrier_noise_sentence(refined: Refined) -> str:
+    noise = refined.options.carrier_noise
+    if noise is None:
+        return (
+            "Noise of A: none, the carriers' poses count as exact. If they are not, the standard deviations above are "
+            "too small. A rig file states this noise under carriers: noise."
+        )
+    if noise.covariances is not None:
+        return "Noise of A: the covariances given for each measurement."
+    return (
+        f"Noise of A: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis "
+        f"of the {CARRIERS[noise.about]}, as given."
+    )

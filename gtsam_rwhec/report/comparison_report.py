@@ -1,17 +1,18 @@
-"""The report of a comparison: a line for each method with an answer, and the reason for each method without one."""
+"""Reports of methods against each other, and of predictions of measurements that a calibration has not seen."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 
 from rich.console import Console
 
+from gtsam_rwhec.calibration.cross_validation import CrossValidation, HoldOutError
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.methods.comparison import Compared, Comparison
-from gtsam_rwhec.report.advice import print_advice
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
-from gtsam_rwhec.report.sentences import certificate_sentence
+from gtsam_rwhec.report.advice import Advice, certificate_sentence
+from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Table, Words
+from gtsam_rwhec.report.terminal_report import print_blocks, report_console
 
 HEADINGS = ("cost J", "gap", "gap %", "rms mm", "rms°", "ms")
 LEGEND = (
@@ -27,12 +28,17 @@ CHAINED_LEGEND = (
 )
 #: Pairs and frames are named up to this number.
 MOST_NAMED = 10
-
-
-def comparison_table(comparison: Comparison) -> FrameTable:
-    """A line for each method with an answer, cheapest first."""
-    rows = {row.method.name: _cells(comparison, row) for row in comparison.rows if row.estimate is not None}
-    return FrameTable("Methods by the cost of their answers", "method", HEADINGS, rows)
+HOLD_OUT_HEADINGS = ("rms mm", "median", "95%", "rms°", "median", "95%", "seen mm", "seen°", "n")
+HOLD_OUT_LEGEND = (
+    "Difference between the measured pose of a target and the pose that a calibration without this measurement "
+    "predicts, in true millimetres and degrees. rms: root mean square. 95%: 95th percentile. seen: rms of the same "
+    "measurements when the calibration uses all of them. n: predicted measurements."
+)
+SPLITS = {
+    "time": "{folds} blocks, contiguous in {time}, each predicted from the others",
+    "pair": "each pair predicted from all other pairs",
+    "sensor": "each half in {time} of a sensor's measurements predicted from all others",
+}
 
 
 def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
@@ -45,21 +51,27 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     console : rich.console.Console, optional
         Where to print; standard output by default.
     """
-    console = report_console() if console is None else console
-    if comparison.certificate is None:
-        print_sentence(console, f"No lower bound of the cost: {comparison.error}", "bold red")
+    print_blocks(report_console() if console is None else console, comparison_blocks(comparison))
+
+
+def comparison_blocks(comparison: Comparison) -> Iterator[Block]:
+    """All that a comparison says."""
+    certificate = comparison.certificate
+    if certificate is None:
+        yield Paragraph(f"No lower bound of the cost: {comparison.error}", "bad")
     else:
-        style = "bold green" if comparison.certificate.is_certified else "bold red"
-        print_sentence(console, certificate_sentence(comparison.certificate, "the certified answer"), style)
+        tone = "good" if certificate.is_certified else "bad"
+        yield Paragraph(certificate_sentence(certificate, "the certified answer"), tone)  # type: ignore[arg-type]
     if comparison.solution is not None:
-        print_advice(console, comparison.solution.identifiability.free_directions)
-    console.print()
-    table = comparison_table(comparison)
-    if table.rows:
-        print_tables(console, [table], LEGEND)
-    for sentence in _remarks(comparison):
-        print_sentence(console, sentence)
-    _print_chained(comparison, console)
+        said = Advice.of(comparison.solution.identifiability.free_directions).sentences
+        if said:
+            yield Listing(said, "bad")
+    rows: dict[str, tuple[Words, ...]] = {
+        row.method.name: _cells(comparison, row) for row in comparison.rows if row.estimate is not None
+    }
+    yield Table.of("Methods by the cost of their answers", "method", HEADINGS, rows, LEGEND)
+    yield from map(Paragraph, _remarks(comparison))
+    yield from _chained(comparison)
     reasons: dict[str, list[str]] = {}
     for row in comparison.rows:
         if row.estimate is None:
@@ -67,29 +79,24 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     if reasons:
         chained = any(row.tree for row in comparison.chained)  # these have an answer, in the table above
         heading = "Why methods do not apply to all pairs at once" if chained else "Methods without an answer"
-        print_heading(console, heading)
-        print_list(console, (f"{', '.join(names)}: {reason}" for reason, names in reasons.items()))
+        yield Paragraph(heading, "lead")
+        yield Listing(tuple(f"{', '.join(names)}: {reason}" for reason, names in reasons.items()))
 
 
-def chained_table(comparison: Comparison) -> FrameTable:
-    """A line for each method for one pair: what its chained answer costs, and how far it is from the joint one."""
+def _chained(comparison: Comparison) -> Iterator[Block]:
+    """The table of chained methods, which pairs the trees avoid and why, and frames that they do not reach."""
+    if not comparison.chained:
+        return
     joint = None if comparison.certificate is None else comparison.certificate.cost
-    rows = {}
+    rows: dict[str, tuple[Words, ...]] = {}
     for row in comparison.chained:
         cost = None if row.estimate is None else row.estimate.cost
         times = "-" if cost is None or not joint else f"{cost / joint:.3g}"
         off = (f"{row.off_mm:.2f}", f"{row.off_deg:.3f}") if row.tree else ("-", "-")
         rows[row.method] = ("-" if cost is None else f"{cost:.7g}", times, *off, str(len(row.tree)))
     headings = ("cost J", "times joint", "off mm", "off°", "pairs")
-    return FrameTable("Methods for few frames, pair by pair, chained along the best tree", "method", headings, rows)
-
-
-def _print_chained(comparison: Comparison, console: Console) -> None:
-    """The table of chained methods, which pairs the trees avoid and why, and frames that they do not reach."""
-    if not comparison.chained:
-        return
-    console.print()
-    print_tables(console, [chained_table(comparison)], CHAINED_LEGEND)
+    title = "Methods for few frames, pair by pair, chained along the best tree"
+    yield Table.of(title, "method", headings, rows, CHAINED_LEGEND)
     said: dict[str, list[str]] = {}
     if comparison.undetermined:
         few = f"{_first(map(str, comparison.undetermined))}: their own measurements do not determine their frames"
@@ -102,8 +109,7 @@ def _print_chained(comparison: Comparison, console: Console) -> None:
             said.setdefault(f"the tree avoids {_first(pairs)}: {why}", []).append(row.method)
         if row.unreached:
             said.setdefault(f"no pair that can be used has {_first(row.unreached)}.", []).append(row.method)
-    for words, names in said.items():
-        print_sentence(console, f"{', '.join(names)}: {words}" if names else words)
+    yield from (Paragraph(f"{', '.join(names)}: {words}" if names else words) for words, names in said.items())
 
 
 def _first(names: Iterable[str]) -> str:
@@ -143,3 +149,53 @@ def _cells(comparison: Comparison, row: Compared) -> tuple[str, ...]:
         f"{math.degrees(row.rotation_rms_rad):.3f}",
         f"{1e3 * row.estimate.seconds:.1f}",
     )
+
+
+def print_cross_validation(result: CrossValidation, console: Console | None = None, *, pairs: bool = False) -> None:
+    """Print what was held out, and the hold-out errors of all measurements, of each sensor and of each target.
+
+    Parameters
+    ----------
+    result : CrossValidation
+        The result of `gtsam_rwhec.cross_validate`.
+    console : rich.console.Console, optional
+        Where to print; standard output by default.
+    pairs : bool
+        Print a line for each pair as well.
+    """
+    time = "time, by their stamps" if result.ordered_by == "stamps" else "the order in which they were added"
+    split = SPLITS[result.by].format(folds=result.number_of_folds, time=time)
+    of_pairs = {pair.label: error for pair, error in result.pairs.items()} if pairs else {}
+    tables = [
+        Table.of(f"Hold-out error by {kind}", kind, HOLD_OUT_HEADINGS, rows)
+        for kind, rows in (
+            ("sensor", {"all": _hold_out_cells(result.overall), **_hold_out_rows(result.sensors)}),
+            ("target", _hold_out_rows(result.targets)),
+            ("pair", _hold_out_rows(of_pairs)),
+        )
+    ]
+    blocks = (
+        Paragraph(f"Hold-out error: {split}", "lead"), *tables, Paragraph(HOLD_OUT_LEGEND, "note"),
+        Listing(tuple(result.notes), "care"),
+    )  # fmt: skip
+    print_blocks(report_console() if console is None else console, blocks)
+
+
+def _hold_out_rows(errors: Mapping[str, HoldOutError]) -> dict[str, tuple[Words, ...]]:
+    return {name: _hold_out_cells(errors[name]) for name in sorted(errors, key=natural_key)}
+
+
+def _hold_out_cells(error: HoldOutError) -> tuple[Words, ...]:
+    held, seen = error.held_out, error.training
+    total = held.count + error.not_predicted
+    return (
+        *(_number(value, 1) for value in (held.translation_rms_mm, held.translation_median_mm, held.translation_95_mm)),
+        *(_number(value, 2) for value in (held.rotation_rms_deg, held.rotation_median_deg, held.rotation_95_deg)),
+        _number(seen.translation_rms_mm, 1),
+        _number(seen.rotation_rms_deg, 2),
+        str(held.count) if error.not_predicted == 0 else f"{held.count} of {total}",
+    )
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"

@@ -12,8 +12,8 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import print_heading, print_list, print_tables, report_console
+from gtsam_rwhec.report.report_blocks import Table, Words
+from gtsam_rwhec.report.terminal_report import print_heading, print_list, print_tables, report_console
 from gtsam_rwhec.results.log_history import LogFields
 
 LEGEND = (
@@ -44,7 +44,7 @@ def print_demo(
     print_heading(console, "Errors that we put into this log, and what was found", tight=True)
     print_list(console, hidden_sentences(refined, log, truth))
     print_heading(console, "How far the answer is from the truth", tight=True)
-    print_tables(console, [truth_table(refined, truth)], LEGEND)
+    print_tables(console, [truth_table(refined, truth)], tight=True)
     print_heading(console, "What to do next", tight=True)
     steps = (
         f"Open {folder / 'report.html'} in a browser: the rig in 3D, the proof, the images. {folder / 'result.json'} "
@@ -84,11 +84,11 @@ def hidden_sentences(refined: RefinedPoses, log: LogFields, truth: DemoTruth) ->
     return sentences
 
 
-def truth_table(refined: RefinedPoses, truth: DemoTruth) -> FrameTable:
+def truth_table(refined: RefinedPoses, truth: DemoTruth) -> Table:
     """How far the found pose of each frame is from the true pose."""
-    rows = {}
+    rows: dict[str, tuple[Words, ...]] = {}
     for name, true in (truth.Y | truth.X).items():
         xi = error_of((refined.Y | refined.X)[name], true)
         inside = "inside" if refined.contains(name, true) else "outside"
         rows[name] = (f"{1e3 * np.linalg.norm(xi[3:]):.2f}", f"{np.degrees(np.linalg.norm(xi[:3])):.3f}", inside)
-    return FrameTable("Found poses and true poses", "frame", ("off mm", "off°", "95 %"), rows, tight=True)
+    return Table.of("Found poses and true poses", "frame", ("off mm", "off°", "95 %"), rows, LEGEND)

@@ -1,38 +1,38 @@
 """Section 3: what was seen: images, detections over time, corners in the image, what was removed, the worst images."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
+from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
-
 import numpy as np
-
-from gtsam_rwhec.report.figures import (
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    VERMILLION,
-    SvgFigure,
-    image_axes,
-    shortened,
-    svg_figure,
-)
-from gtsam_rwhec.report.report_blocks import (
-    Block,
-    Chart,
-    Folded,
-    Listing,
-    Paragraph,
-    Picture,
-    Piece,
-    Section,
-    Table,
-    Words,
-)
+from gtsam_rwhec.report.figures import GREY
+from gtsam_rwhec.report.figures import INK
+from gtsam_rwhec.report.figures import ORANGE
+from gtsam_rwhec.report.figures import PURPLE
+from gtsam_rwhec.report.figures import VERMILLION
+from gtsam_rwhec.report.figures import SvgFigure
+from gtsam_rwhec.report.figures import image_axes
+from gtsam_rwhec.report.figures import shortened
+from gtsam_rwhec.report.figures import svg_figure
+from gtsam_rwhec.report.report_blocks import Block
+from gtsam_rwhec.report.report_blocks import Chart
+from gtsam_rwhec.report.report_blocks import Folded
+from gtsam_rwhec.report.report_blocks import Listing
+from gtsam_rwhec.report.report_blocks import Paragraph
+from gtsam_rwhec.report.report_blocks import Picture
+from gtsam_rwhec.report.report_blocks import Piece
+from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.report_blocks import Words
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.detection_evidence import MOST_LISTED, PIECES, RemovedMeasurement, SeenEvidence, SeenTrack
+from gtsam_rwhec.results.detection_evidence import MOST_LISTED
+from gtsam_rwhec.results.detection_evidence import PIECES
+from gtsam_rwhec.results.detection_evidence import RemovedMeasurement
+from gtsam_rwhec.results.detection_evidence import SeenEvidence
+from gtsam_rwhec.results.detection_evidence import SeenTrack
 from gtsam_rwhec.results.image_errors import SeenCamera
+from gtsam_rwhec.report.choices_section import log_blocks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,8 @@ def seen_section(shown: ShownResult) -> Section:
     """All that was seen, as far as it is known."""
     seen = None if shown.evidence is None else shown.evidence.seen
     if seen is None:
-        return Section("seen", TITLE, missing="the result has no record of its measurements beside it.")
+        found = tuple(_by_stage(shown))
+        return Section("seen", TITLE, found, "" if found else "the result has no record of its measurements beside it.")
     blocks = [
         *_counts(shown, seen),
         *_detections(seen),
@@ -60,7 +61,13 @@ def seen_section(shown: ShownResult) -> Section:
         *_worst(shown, seen),
         *_sheet(shown, seen),
     ]
-    return Section("seen", TITLE, tuple(blocks))
+    return Section("seen", TITLE, (*blocks, *_by_stage(shown)))
+
+
+def _by_stage(shown: ShownResult) -> Iterator[Block]:
+    """What every stage used of each pair, where the measurements come from a log."""
+    if shown.result is not None and shown.result.log is not None:
+        yield Folded("What each stage used, and what it removed", tuple(log_blocks(shown.result.log)))
 
 
 def _counts(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
@@ -158,7 +165,7 @@ def _coverage(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     if not seen.cameras:
         yield Paragraph(
             "Not shown: where in the image targets were seen, and the worst images. The measurements have no corners.",
-            "note",
+            "absent",
         )
         return
     cells = seen.cameras[0].cells
@@ -222,10 +229,10 @@ def _worst(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
         tuple(rows),
     )
     if not shown.images:
-        yield Paragraph("Not shown: these images. The page was made without images.", "note")
+        yield Paragraph("Not shown: these images. The page was made without images.", "absent")
         return
     if all(one.picture is None for one in seen.worst):
-        yield Paragraph(f"Not shown: these images. Why: {seen.no_pictures or 'they cannot be read.'}", "note")
+        yield Paragraph(f"Not shown: these images. Why: {seen.no_pictures or 'they cannot be read.'}", "absent")
         return
     yield Paragraph(
         "In each image: circles where corners were seen, crosses where the answer has them, and lines from the one "
@@ -247,10 +254,10 @@ def _worst(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
 
 def _sheet(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     if not shown.images:
-        yield Paragraph("Not shown: the contact sheet. The page was made without images.", "note")
+        yield Paragraph("Not shown: the contact sheet. The page was made without images.", "absent")
     elif seen.sheet is None:
         why = seen.no_pictures or "there is no contact sheet beside the result."
-        yield Paragraph(f"Not shown: the contact sheet. Why: {why}", "note")
+        yield Paragraph(f"Not shown: the contact sheet. Why: {why}", "absent")
     else:
         yield Picture(
             "contact-sheet",

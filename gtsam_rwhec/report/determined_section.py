@@ -1,28 +1,27 @@
 """Section 4: which sensor and target determine each other, and which directions are free or weak, with their cures."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator, Mapping
-
+from collections.abc import Iterator
+from collections.abc import Mapping
 import numpy as np
-
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol
-from gtsam_rwhec.report.report_blocks import (
-    Block,
-    Folded,
-    Listing,
-    Number,
-    Paragraph,
-    Section,
-    Table,
-    Words,
-    significant,
-)
+from gtsam_rwhec.report.report_blocks import Block
+from gtsam_rwhec.report.report_blocks import Folded
+from gtsam_rwhec.report.report_blocks import Listing
+from gtsam_rwhec.report.report_blocks import Number
+from gtsam_rwhec.report.report_blocks import Paragraph
+from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.report_blocks import Words
+from gtsam_rwhec.report.report_blocks import significant
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
-from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
+from gtsam_rwhec.results.weak_poses import MORE
+from gtsam_rwhec.results.weak_poses import TURN_RAD
+from gtsam_rwhec.results.weak_poses import WEAK
+from gtsam_rwhec.results.weak_poses import WeakDirection
+from gtsam_rwhec.solver.free_directions import FreeDirection
+from gtsam_rwhec.solver.free_directions import FreeReason
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10
@@ -42,6 +41,13 @@ CURES: Mapping[FreeReason, str] = {
     FreeReason.COMPENSATED: "Turn about a second axis, or state what is known: a size, a scale, or one of the poses.",
     FreeReason.STANDSTILL: "Measure while the carriers move and turn, faster and with changes of direction.",
     FreeReason.SYMMETRY: "Turn by other angles than half a turn, and about axes that are not in one plane.",
+}
+#: What the sign of a pair means. The shapes differ, so that nobody needs to see colours.
+DETERMINED, NOT_DETERMINED, NOT_OBSERVED = "■", "□", "·"
+SIGNS = {
+    DETERMINED: "determined by its own measurements",
+    NOT_DETERMINED: "seen, but not determined by its own measurements",
+    NOT_OBSERVED: "not seen",
 }
 ALL_DETERMINED = "The measurements determine every direction beyond their noise: none is free."
 NO_ANSWER = "the calibration has no answer."
@@ -119,13 +125,13 @@ def _grid(shown: ShownResult) -> Iterator[Block]:
 
 
 def _legend(has_outliers: bool) -> str:
-    signs = "; ".join(f"{kind.symbol} {kind.meaning}" for kind in (DETERMINED, NOT_DETERMINED, NOT_OBSERVED))
+    signs = "; ".join(f"{sign} {meaning}" for sign, meaning in SIGNS.items())
     more = ", out of how many where some were left out" if has_outliers else ""
     return f"{signs}. The number beside a sign is that of the measurements in the answer{more}."
 
 
-def _cell(sign: Symbol, count: Count | None) -> Words:
-    return sign.symbol if count is None else (f"{sign.symbol}{TOGETHER}", *count)
+def _cell(sign: str, count: Count | None) -> Words:
+    return sign if count is None else (f"{sign}{TOGETHER}", *count)
 
 
 def _counts(shown: ShownResult) -> dict[Pair, Count]:
@@ -182,7 +188,7 @@ def weak_blocks(shown: ShownResult) -> Iterator[Block]:
     """The weak directions as sentences, and the least known direction of every frame as a table."""
     weak = () if shown.evidence is None else shown.evidence.weak
     if not weak:
-        yield Paragraph(NOT_KNOWN, "note")
+        yield Paragraph(NOT_KNOWN, "absent")
         return
     said = tuple(_sentence(shown, i, one) for i, one in enumerate(weak) if one.is_weak)
     if said:

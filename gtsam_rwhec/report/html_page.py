@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.report.report_blocks import Link, Number, Page, Piece, Words, every
+from gtsam_rwhec.report.figures import SvgFigure
+from gtsam_rwhec.report.report_blocks import Link, Number, Page, Words, every, pieces_of
 
 
 def write_page(page: Page, path: str | Path) -> None:
@@ -39,7 +40,9 @@ def page_html(page: Page) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters.update(base64=_base64, script_json=_script_json, pieces=_pieces, signs=_signs, own_ids=_own_ids)
+    environment.filters.update(
+        base64=_base64, script_json=_script_json, pieces=pieces_of, signs=_signs, own_ids=_own_ids
+    )
     environment.tests.update(number=lambda piece: isinstance(piece, Number), link=lambda piece: isinstance(piece, Link))
     has_drawing = any(block.kind == "drawing" for section in page.sections for block in every(section.blocks))
     script = _own_file("page.js")
@@ -79,8 +82,9 @@ def _packed_plotly() -> str:
     return _base64(gzip.compress(_plotly().encode("utf-8"), 6, mtime=0))
 
 
-def _own_ids(svg: str, name: str) -> str:
+def _own_ids(figure: SvgFigure, name: str) -> str:
     """A figure whose ids are its own: several on one page have parts of the same name. Ids without use are left out."""
+    svg = figure.in_page
     used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
     svg = re.sub(r' id="([^"]*)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", svg)
     return re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
@@ -96,10 +100,6 @@ def _script_json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _pieces(words: Words) -> tuple[Piece, ...]:
-    return words if isinstance(words, tuple) else (words,)
-
-
 def _signs(words: Words) -> int:
     """How many signs words have as they are read."""
-    return sum(len(piece if isinstance(piece, str) else piece.text) for piece in _pieces(words))
+    return sum(len(piece if isinstance(piece, str) else piece.text) for piece in pieces_of(words))

@@ -1,17 +1,21 @@
 """Section 9: what the calibration was made of, enough to make it again; and the poses as texts to copy."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from collections.abc import Mapping
 from typing import Any
-
 import numpy as np
-
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.report.report_blocks import Block, CopyText, Folded, Paragraph, Section, Table
+from gtsam_rwhec.report.report_blocks import Block
+from gtsam_rwhec.report.report_blocks import CopyText
+from gtsam_rwhec.report.report_blocks import Folded
+from gtsam_rwhec.report.report_blocks import Paragraph
+from gtsam_rwhec.report.report_blocks import Section
+from gtsam_rwhec.report.report_blocks import Table
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER
+from gtsam_rwhec.results.schema import SENSOR_CARRIER
+from gtsam_rwhec.results.schema import TARGET_CARRIER
 from gtsam_rwhec.rig.exported_files import copied_texts
 from gtsam_rwhec.rig.rig_frames import RigFrames
 
@@ -42,7 +46,7 @@ def _copies(shown: ShownResult) -> Iterator[Block]:
         try:
             texts = copied_texts(frames_of_tree(shown.tree))
         except RwhecError as error:
-            yield Paragraph(f"Not shown, because other programs cannot read them: {error}.", "note")
+            yield Paragraph(f"Not shown, because other programs cannot read them: {error}.", "absent")
             return
     for name, text in texts.items():
         if name in KINDS:
@@ -83,7 +87,7 @@ def _inputs(shown: ShownResult) -> Iterator[Block]:
     inputs = None if shown.evidence is None else shown.evidence.inputs
     if inputs is None:
         yield Paragraph(
-            "Not shown: files, versions and options, for the result has no evidence.json beside it.", "note"
+            "Not shown: files, versions and options, for the result has no evidence.json beside it.", "absent"
         )
         return
     if inputs.command:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.report.advice import limits_of, time_sentence, weights_sentence
 from gtsam_rwhec.report.figures import BLUE, GREY, INK, ORANGE, VERMILLION, SvgFigure, svg_figure
 from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Listing, Paragraph, Section, Table, Tone, Words
-from gtsam_rwhec.report.sentences import limits_of
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.solver.certificate import Certificate, Status
 
@@ -78,7 +78,14 @@ def _facts(shown: ShownResult, certificate: Certificate) -> Iterator[Words]:
         f"Path: {certificate.path.words}. It says how the answer and its bound came about; the proof does not depend "
         "on it, for it compares cost and bound alone."
     )
-    yield f"Objective: {certificate.objective}. Another objective has another optimum."
+    of_scales = " Refine the answer for the exact model of each target's scale."
+    more = of_scales if certificate.objective.form == "inverse" else ""
+    yield f"Objective: {certificate.objective}. Another objective has another optimum.{more}"
+    assert shown.result is not None
+    refined = shown.result.refined
+    is_estimated = refined is not None and refined.noise_source == "estimated"
+    yield weights_sentence(shown.result.solution, noise_is_estimated=is_estimated)
+    yield time_sentence(certificate)
     eigenvalue = shown.number(*at, "min_eigenvalue", spec=".2g")
     if eigenvalue.value is not None:
         yield (
@@ -110,11 +117,11 @@ def _spectra(shown: ShownResult) -> Iterator[Block]:
     """The spectrum of the largest part that has one."""
     parts = (shown.evidence_tree.get("proof") or {}).get("parts", ())
     if not parts:
-        yield Paragraph(f"{ABSENT}, for the result has no evidence.json beside it with one.", "note")
+        yield Paragraph(f"{ABSENT}, for the result has no evidence.json beside it with one.", "absent")
         return
     having = [part for part in parts if part["eigenvalues"] is not None]
     if not having:
-        yield Paragraph(f"{ABSENT}, for {parts[0]['why_not']}.", "note")
+        yield Paragraph(f"{ABSENT}, for {parts[0]['why_not']}.", "absent")
         return
     part = max(having, key=lambda each: each["rows"])
     values, rounding = np.array(part["eigenvalues"]), part["rounding"]

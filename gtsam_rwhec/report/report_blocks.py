@@ -1,4 +1,4 @@
-"""The blocks of a page: what a section may hold. They say what is shown; the template says how.
+"""The blocks of a report: what a section may hold. They say what is shown; a page and a terminal say how.
 
 Every text is shown as text: a name that is HTML comes out as it is written. A ``Number`` knows its place in the result
 file or in the evidence, so that a test can read both and compare them.
@@ -9,29 +9,30 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
-#: How a paragraph is meant.
-Tone = Literal["plain", "lead", "note", "good", "care", "bad"]
+from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.files.terminal_text import shown
+
+if TYPE_CHECKING:
+    from gtsam_rwhec.report.figures import SvgFigure
+
+#: How a paragraph is meant; ``absent`` says what is not there, and why.
+Tone = Literal["plain", "lead", "note", "absent", "good", "care", "bad"]
+TONES: Mapping[Verdict, Literal["good", "care", "bad"]] = {
+    Verdict.USE: "good",
+    Verdict.CARE: "care",
+    Verdict.DO_NOT_USE: "bad",
+}
 
 
 @dataclass(frozen=True)
 class Number:
     """A number of the result's JSON as it is shown.
 
-    Attributes
-    ----------
-    of : str
-        Where it stands: "result.json#/refined/cost", a JSON pointer in the named file.
-    value : float or None
-        As it stands there; None is an infinite number.
-    times : float
-        It is shown multiplied by this: 1e3 shows metres as millimetres.
-    spec : str
-        How it is formatted, as for `format`.
-    unit : str
-        Written after it.
+    ``of`` is its place, "result.json#/refined/cost": a JSON pointer in the named file. It is shown multiplied by
+    ``times`` (1e3 shows metres as millimetres), formatted by ``spec``; None is an infinite number.
     """
 
     of: str
@@ -50,8 +51,8 @@ class Number:
 
 def significant(number: Number, figures: int) -> Number:
     """The number with so many figures that count, without an exponent; a large one has no decimals."""
-    shown = abs(number.times * (number.value or 0.0))
-    size = math.floor(math.log10(shown)) if 0.0 < shown < math.inf else 0
+    value = abs(number.times * (number.value or 0.0))
+    size = math.floor(math.log10(value)) if 0.0 < value < math.inf else 0
     return replace(number, spec=f".{max(figures - 1 - size, 0)}f")
 
 
@@ -74,6 +75,20 @@ Piece = str | Number | Link
 Words = Piece | tuple[Piece, ...]
 
 
+def pieces_of(words: Words) -> tuple[Piece, ...]:
+    """The pieces of words."""
+    return words if isinstance(words, tuple) else (words,)
+
+
+def plain_text(words: Words) -> str:
+    """Words as text."""
+    said = (
+        piece if isinstance(piece, str) else f"{piece.text} {getattr(piece, 'unit', '')}".rstrip()
+        for piece in pieces_of(words)
+    )
+    return "".join(said).replace("\N{NO-BREAK SPACE}", " ")
+
+
 @dataclass(frozen=True)
 class Paragraph:
     """A paragraph."""
@@ -88,6 +103,7 @@ class Listing:
     """A list of sentences."""
 
     items: tuple[Words, ...]
+    tone: Tone = "plain"
     kind: str = field(default="listing", init=False)
 
 
@@ -95,7 +111,7 @@ class Listing:
 class Table:
     """A table; the first cell of each row is its heading. Cells that are a ``Number`` stand to the right.
 
-    One that ``sorts`` has a button at each heading, and moves inside itself where it is long.
+    On a page, one that ``sorts`` has a button at each heading, and moves inside itself where it is long.
     """
 
     caption: str
@@ -105,15 +121,23 @@ class Table:
     sorts: bool = False
     kind: str = field(default="table", init=False)
 
+    @staticmethod
+    def of(
+        caption: str, kind: str, headings: Iterable[str], rows: Mapping[str, tuple[Words, ...]], legend: str = ""
+    ) -> Table:
+        """Rows by their names, which are of a ``kind`` ("sensor")."""
+        named = tuple((shown(name), *cells) for name, cells in rows.items())
+        return Table(caption, (kind, *headings), named, legend)
+
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure as SVG, made by ``report.page.figures.svg_figure``. `says` is what it shows, for who cannot see it."""
+    """A figure. `says` is what it shows, for who cannot see it."""
 
     name: str
     title: str
     says: str
-    svg: str
+    svg: SvgFigure
     is_wide: bool = False
     kind: str = field(default="chart", init=False)
 
@@ -140,7 +164,7 @@ class Drawing:
     says: str
     traces: tuple[Mapping[str, Any], ...]
     layout: Mapping[str, Any]
-    still_svg: str
+    still_svg: SvgFigure
     kind: str = field(default="drawing", init=False)
 
 
@@ -185,6 +209,11 @@ class Page:
     sections: tuple[Section, ...]
     made_by: str
     warnings: tuple[str, ...] = ()
+
+
+def is_absent(block: Block) -> bool:
+    """Whether a block only says what is not there."""
+    return isinstance(block, Paragraph) and block.tone == "absent"
 
 
 def every(blocks: Iterable[Block]) -> Iterator[Block]:

@@ -14,15 +14,17 @@ from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import EvidenceWarning, FileFormatError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.whole_files import checked_path, is_one_of, read_whole
+from gtsam_rwhec.files.whole_files import checked_path, is_one_of, read_whole, write_atomically
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.report.choices_section import choices_section
 from gtsam_rwhec.report.contribution_section import contribution_section
+from gtsam_rwhec.report.corners_section import corners_section
 from gtsam_rwhec.report.detections_section import seen_section
 from gtsam_rwhec.report.determined_section import determines_section
-from gtsam_rwhec.report.figures import write_figures
 from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.inputs_section import inputs_section
 from gtsam_rwhec.report.proof_section import proof_section
-from gtsam_rwhec.report.report_blocks import Page, Section
+from gtsam_rwhec.report.report_blocks import TONES, Chart, Drawing, Page, Section, every
 from gtsam_rwhec.report.residual_section import residuals_section
 from gtsam_rwhec.report.scene_section import scene_section
 from gtsam_rwhec.report.shown_result import ShownResult
@@ -33,12 +35,12 @@ from gtsam_rwhec.results.evidence import checksum
 from gtsam_rwhec.results.json_tree import MOST_BYTES
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_file import result_json
+from gtsam_rwhec.solver.solution import Solution
 
 #: The name of a result in an output folder.
 RESULT_FILE = "result.json"
 #: Rotations whose matrices differ by less are the same.
 SAME_ROTATION = 1e-6
-TONES = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
 
 #: What a page says once that lacks the parts that need the measurements.
 WITHOUT_EVIDENCE = (
@@ -48,7 +50,7 @@ WITHOUT_EVIDENCE = (
 
 
 def write_html(
-    result: Calibration | str | Path,
+    result: Calibration | Refined | Solution | str | Path,
     path: str | Path,
     evidence: Evidence | None = None,
     *,
@@ -60,9 +62,9 @@ def write_html(
 
     Parameters
     ----------
-    result : Calibration or path
-        What ``calibrate`` returned; or a result file, or the output folder that has one. The evidence beside a file
-        is read with it.
+    result : Calibration, Refined, Solution or path
+        What ``calibrate``, ``refine`` or ``solve`` returned; or a result file, or the output folder that has one. The
+        evidence beside a file is read with it.
     path : str or Path
         The HTML file; an existing file is replaced.
     evidence : Evidence, optional
@@ -84,7 +86,7 @@ def write_html(
     path = checked_path(path)
     folder = None if figures is None else checked_path(figures)
     _check_evidence(evidence)
-    if isinstance(result, Calibration):
+    if isinstance(result, Calibration | Refined | Solution):
         shown = ShownResult.of(result_json(result, log), evidence, images=images)
     else:
         file = _result_file(result)
@@ -97,6 +99,30 @@ def write_html(
     write_page(page, path)
     if folder is not None:
         write_figures(page, folder)
+
+
+def write_figures(page: Page, folder: str | Path) -> list[Path]:
+    """Write every chart of a page, and the still pictures of its scenes, as NAME.svg and NAME.png, black on white.
+
+    Raises
+    ------
+    FileFormatError
+        The folder cannot be made, or a file cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder} cannot be made a folder: {error.strerror}.") from error
+    written = []
+    for block in every(block for section in page.sections for block in section.blocks):
+        if isinstance(block, Chart | Drawing):
+            figure = block.svg if isinstance(block, Chart) else block.still_svg
+            for form in ("svg", "png"):
+                path = folder / f"{block.name}.{form}"
+                write_atomically(path, figure.file(form))
+                written.append(path)
+    return written
 
 
 def _check_evidence(evidence: object) -> None:
@@ -160,7 +186,7 @@ def report_page(shown: ShownResult) -> Page:
     """The page of a result."""
     return Page(
         title="Calibration report",
-        tone=TONES[Verdict(shown.tree["verdict"])],  # type: ignore[arg-type]
+        tone=TONES[Verdict(shown.tree["verdict"])],
         sections=sections_of(shown),
         made_by=f"Written by {shown.tree['written_by']}.",
         warnings=shown.warnings or ((WITHOUT_EVIDENCE,) if shown.evidence is None else ()),
@@ -170,11 +196,13 @@ def report_page(shown: ShownResult) -> Page:
 #: The functions that make them.
 SECTIONS = (
     verdict_section,
+    choices_section,
     scene_section,
     seen_section,
     determines_section,
     proof_section,
     residuals_section,
+    corners_section,
     uncertainty_section,
     contribution_section,
     inputs_section,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtri
 
+from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.figures import (
     GREEN,
@@ -25,12 +27,19 @@ from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Paragraph, Se
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.image_errors import SeenCamera
 from gtsam_rwhec.results.residual_evidence import BEYOND_3_BY_CHANCE, FEWEST, Dependence, ResidualsEvidence
+from gtsam_rwhec.solver.answers import Residual
+from gtsam_rwhec.solver.solution import Solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 TITLE = "Residuals"
+RESIDUAL_HEADINGS = ("rms mm", "rms°", "n")
+CERTIFIED_LEGEND = (
+    "rms: root mean square length of the residuals of a frame's n measurements, weighted as in the cost, in mm and "
+    "degrees."
+)
 #: Residuals are called as large as the noise within these.
 AS_LARGE = (0.9, 1.1)
 #: A table has so many pairs; the others are in the evidence.
@@ -44,7 +53,7 @@ def residuals_section(shown: ShownResult) -> Section:
     found = None if shown.evidence is None else shown.evidence.residuals
     if found is None:
         why = shown.why_missing(found, "the calibration has no covariances, and so no noise to compare with.")
-        return Section("residuals", TITLE, missing=why)
+        return Section("residuals", TITLE, tuple(_of_certified(shown)), why)
     blocks: list[Block] = [
         Paragraph(
             "A residual is how far a measurement B is from what the answer predicts, Y⁻¹ A X. Its size says how noisy "
@@ -76,9 +85,45 @@ def residuals_section(shown: ShownResult) -> Section:
             )
         )
     else:
-        blocks.append(Paragraph("Not shown: errors over the image, for there are no corners.", "note"))
+        blocks.append(Paragraph("Not shown: errors over the image, for there are no corners.", "absent"))
     blocks += [*_by_configuration(shown, found), *_against_noise(shown, found), *_neighbours(shown, found)]
-    return Section("residuals", TITLE, (*blocks, _pairs(shown, found)))
+    return Section("residuals", TITLE, (*blocks, _pairs(shown, found), *_of_certified(shown)))
+
+
+def _of_certified(shown: ShownResult) -> Iterator[Block]:
+    """How well each frame's measurements fit the certified answer."""
+    if shown.result is None:
+        return
+    solution = shown.result.solution
+    names = [name for poses in (solution.Y, solution.X) for name in sorted(poses, key=natural_key)]
+    rows: dict[str, tuple[Words, ...]] = {name: residual_cells(solution, name) for name in names}
+    yield Table.of("Residuals of the certified answer", "frame", RESIDUAL_HEADINGS, rows, CERTIFIED_LEGEND)
+
+
+def residual_cells(solution: Solution, name: str) -> tuple[str, ...]:
+    """The root mean square residual of a frame's measurements, mm and degrees, and how many they are."""
+    residual = pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
+    if residual.number_of_measurements == 0:
+        return "-", "-", "0"
+    return (
+        f"{1e3 * residual.translation_rms_m:.1f}",
+        f"{math.degrees(residual.rotation_rms_rad):.2f}",
+        str(residual.number_of_measurements),
+    )
+
+
+def pooled_residual(residuals: Iterable[Residual]) -> Residual:
+    """The root mean square over all measurements of several pairs."""
+    residuals = tuple(residuals)
+    number = sum(residual.number_of_measurements for residual in residuals)
+    if number == 0:
+        return Residual(0, math.nan, math.nan)
+
+    def pool(rms: Iterable[float]) -> float:
+        squares = (r.number_of_measurements * value**2 for r, value in zip(residuals, rms, strict=True))
+        return math.sqrt(sum(squares) / number)
+
+    return Residual(number, pool(r.translation_rms_m for r in residuals), pool(r.rotation_rms_rad for r in residuals))
 
 
 def _cameras_with_corners(shown: ShownResult) -> tuple[SeenCamera, ...]:
@@ -103,7 +148,9 @@ def _by_sensor(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]:
             "answer). Much larger left out than fitted: too few measurements, or errors that vary slowly.",
         )
     else:
-        yield Paragraph("Not shown: hold-out errors, for no block of measurements is predicted by the others.", "note")
+        yield Paragraph(
+            "Not shown: hold-out errors, for no block of measurements is predicted by the others.", "absent"
+        )
     yield from _pixels(shown)
 
 
@@ -130,7 +177,7 @@ def _by_configuration(shown: ShownResult, found: ResidualsEvidence) -> Iterator[
     one = found.dependence
     if one is None:
         yield Paragraph(
-            f"Not shown: residuals over the carriers' pose, for no sensor has {FEWEST} measurements.", "note"
+            f"Not shown: residuals over the carriers' pose, for no sensor has {FEWEST} measurements.", "absent"
         )
         return
     at = ("residuals", "dependence")

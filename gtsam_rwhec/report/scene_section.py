@@ -68,7 +68,7 @@ def scene_section(shown: ShownResult) -> Section:
             f"{_count(len(shown.tree[kind]), kind[:-1])} on {scene.world}, in its axes. {_of_ellipsoids(scene, lines)}"
         )
         blocks += [_drawing(kind, f"The {kind}", scene, lines, says), *_list_of(lines)]
-    return Section("scene", TITLE, (*blocks, Paragraph(WITHOUT_PATH, "note"), *_heights(shown)))
+    return Section("scene", TITLE, (*blocks, Paragraph(WITHOUT_PATH, "absent"), *_heights(shown)))
 
 
 def _drawing(name: str, title: str, scene: Scene, lines: tuple[Line, ...], says: str) -> Drawing:

@@ -7,8 +7,8 @@ poses get the lines that are left. Where they do not fit, the short report says 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,8 +20,8 @@ from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.files.terminal_text import LONGEST_LINE, rounded, shown, shown_path
 from gtsam_rwhec.report.advice import Styled
-from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.printing import STYLES, print_heading, print_sentence, report_console
+from gtsam_rwhec.report.report_blocks import Table, plain_text
+from gtsam_rwhec.report.terminal_report import STYLES, TerminalTable, print_heading, print_sentence, report_console
 
 #: Lines of a short report, with what a command says besides.
 LINES = 40
@@ -43,10 +43,10 @@ SENTENCE_LINES = 4
 class PoseTables:
     """The tables of sensors and targets, in one choice of columns, with the meaning of these columns."""
 
-    tables: tuple[FrameTable, ...]
+    tables: tuple[Table, ...]
     legend: str
 
-    def first(self, number: int, marked: frozenset[str]) -> tuple[tuple[FrameTable, ...], list[str]]:
+    def first(self, number: int, marked: frozenset[str]) -> tuple[tuple[Table, ...], list[str]]:
         """The tables with this many rows in all, shared out, and what was left out: "92 more targets".
 
         Rows that are ``marked`` come before others.
@@ -57,13 +57,19 @@ class PoseTables:
             i = min((i for i in range(len(wanted)) if kept[i] < wanted[i]), key=lambda i: kept[i])
             kept[i] += 1
             spare -= 1
-        tables = tuple(table.first(count, marked) for table, count in zip(self.tables, kept, strict=True))
+        tables = tuple(_first_rows(table, count, marked) for table, count in zip(self.tables, kept, strict=True))
         left = [
-            f"{all_ - count} more {table.kind}{'s' if all_ - count > 1 else ''}"
+            f"{all_ - count} more {table.headings[0]}{'s' if all_ - count > 1 else ''}"
             for table, all_, count in zip(self.tables, wanted, kept, strict=True)
             if all_ > count
         ]
         return tables, left
+
+
+def _first_rows(table: Table, number: int, marked: frozenset[str]) -> Table:
+    """The table with this many rows, in their order: those that are ``marked``, then the first of the others."""
+    order = sorted(range(len(table.rows)), key=lambda i: plain_text(table.rows[i][0]) not in marked)
+    return replace(table, rows=tuple(table.rows[i] for i in sorted(order[:number])))
 
 
 @dataclass(frozen=True)
@@ -223,16 +229,20 @@ def _point(point: PointUncertainty) -> str:
 def _height_of_all(room: _Room, poses: PoseTables) -> int:
     """Lines of all rows and what the columns mean; of more rows than lines, as many as rows."""
     rows = sum(len(table.rows) for table in poses.tables)
-    return rows if rows > room.left else room.lines_of(*poses.tables, poses.legend) + 1
+    return rows if rows > room.left else room.lines_of(*_tight(poses.tables), poses.legend) + 1
+
+
+def _tight(tables: Iterable[Table]) -> list[TerminalTable]:
+    return [TerminalTable(table, tight=True) for table in tables]
 
 
 def _print_poses(console: Console, room: _Room, choices: Sequence[PoseTables], marked: frozenset[str]) -> None:
     """The poses in the first choice of columns that shows all frames, or most of them."""
 
-    def said(poses: PoseTables, number: int) -> tuple[list[FrameTable], str]:
+    def said(poses: PoseTables, number: int) -> tuple[list[TerminalTable], str]:
         tables, left = poses.first(number, marked)
         more = f"{' and '.join(left)} not shown here. " if left else ""
-        return [table for table in tables if table.rows], f"{more}{poses.legend}"
+        return _tight(table for table in tables if table.rows), f"{more}{poses.legend}"
 
     def fits(poses: PoseTables, number: int) -> bool:
         tables, legend = said(poses, number)

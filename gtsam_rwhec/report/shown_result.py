@@ -1,22 +1,28 @@
-"""The result that a page shows: its JSON, the records that were read from it, and the evidence."""
+"""The result that a report shows: its JSON, the records that were read from it, and the evidence."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.verdict import Finding, Judgement
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.report.report_blocks import Number
 from gtsam_rwhec.results import Evidence
 from gtsam_rwhec.results.evidence import evidence_json
-from gtsam_rwhec.results.result_file import Result, has_no_answer, parse_result, parse_tree
+from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.result_file import Result, has_no_answer, parse_result, parse_tree, result_json
+from gtsam_rwhec.results.result_judgement import judge
+from gtsam_rwhec.solver.solution import Solution
 
 
 @dataclass(frozen=True, eq=False)
 class ShownResult:
-    """A result as its page shows it.
+    """A result as its report shows it.
 
     Attributes
     ----------
@@ -31,6 +37,8 @@ class ShownResult:
         Whether the page may show what cameras saw; images may be confidential.
     warnings : tuple of str
         What could not be shown although it is there.
+    findings : tuple of Finding
+        What is known against a solution that was not calibrated, beside what the file holds.
     """
 
     tree: Mapping[str, Any]
@@ -39,18 +47,31 @@ class ShownResult:
     name: str
     images: bool = True
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @staticmethod
     def of(content: bytes, evidence: Evidence | None, name: str = "result.json", *, images: bool = True) -> ShownResult:
-        """Of a result file's content.
-
-        Raises
-        ------
-        FileFormatError, ResultVersionError
-            As `read_result` does; a result without an answer is shown all the same.
-        """
+        """Of a result file's content; raises as `read_result`. A result without an answer is shown all the same."""
         tree = parse_tree(content, name)
         return ShownResult(tree, None if has_no_answer(tree) else parse_result(content, name), evidence, name, images)
+
+    @staticmethod
+    def of_answer(
+        answer: Calibration | Refined | Solution, log: LogFields | None = None, findings: Sequence[Finding] = ()
+    ) -> ShownResult:
+        """Of what was just computed."""
+        shown = ShownResult.of(result_json(answer, log), None)
+        if not findings or not isinstance(answer, Solution):
+            return shown
+        judgement = judge(answer, findings=findings)
+        more = {"verdict": judgement.verdict.value, "verdict_reason": judgement.reason}
+        return ShownResult({**shown.tree, **more}, shown.result, None, shown.name, findings=tuple(findings))
+
+    @property
+    def judgement(self) -> Judgement:
+        """The verdict, with its grounds."""
+        assert self.result is not None
+        return judge(self.result.solution, findings=self.findings) if self.findings else self.result.judgement
 
     @cached_property
     def evidence_tree(self) -> Any:

@@ -11,11 +11,16 @@ from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
 from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, INK, plain_decades, shortened, svg_figure
 from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Number, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.report.verdict_section import ANGLES, LEGEND, TRANSLATION, deviation_cells, known_unknowns
+from gtsam_rwhec.report.verdict_section import (
+    DEVIATION_HEADINGS,
+    LEGEND,
+    POSE_HEADINGS,
+    deviation_cells,
+    known_unknowns,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,7 +55,7 @@ def _points(shown: ShownResult) -> Iterator[Block]:
     derived = shown.evidence_tree.get("derived") or {}
     points = derived.get("points", ())
     if not points:
-        yield Paragraph(NO_EVIDENCE.format(what="points at several distances"), "note")
+        yield Paragraph(NO_EVIDENCE.format(what="points at several distances"), "absent")
         return
     fixed = sorted({point["distance_m"] for point in points if not point["is_seen"]})
     rows: dict[str, dict[float | str, Words]] = {}
@@ -106,7 +111,7 @@ def _relative(shown: ShownResult) -> Iterator[Block]:
     )
     yield Table(
         f"Other sensors in the frame of {relative[0]['first']}",
-        ("sensor", *TRANSLATION, *ANGLES, *DEVIATION_HEADINGS),
+        ("sensor", *POSE_HEADINGS, *DEVIATION_HEADINGS),
         rows,
         "Sensors on one carrier are often known far better relative to each other than on the carrier.",
     )
@@ -120,7 +125,7 @@ def _intrinsics(shown: ShownResult) -> Iterator[Block]:
         yield Paragraph(
             "What wrong intrinsics would do is not shown: the answer is not from corners, and the intrinsics by which "
             "targets were measured, if there are any, are not known to it.",
-            "note",
+            "absent",
         )
         return
     yield from _moved(
@@ -152,7 +157,7 @@ def _clocks(shown: ShownResult) -> Iterator[Block]:
         if offsets
         else "no clock offset was estimated, so the calibration takes all clocks as right"
     )
-    yield Paragraph(f"What clocks would do is not shown: {why}.", "note")
+    yield Paragraph(f"What clocks would do is not shown: {why}.", "absent")
 
 
 def _moved(

@@ -5,14 +5,29 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+import gtsam
+import numpy as np
+
 from gtsam_rwhec.calibration.verdict import Finding, Verdict, findings_of
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.report.advice import Advice
-from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS, MARK
-from gtsam_rwhec.report.report_blocks import Block, Folded, Listing, Paragraph, Section, Table, Tone, Words, significant
+from gtsam_rwhec.report.report_blocks import (
+    TONES,
+    Block,
+    Folded,
+    Listing,
+    Paragraph,
+    Section,
+    Table,
+    Words,
+    significant,
+)
 from gtsam_rwhec.report.shown_result import ShownResult
 
-TONES: dict[Verdict, Tone] = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
+POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")
+DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
+#: Beside the name of a frame whose pose is not to be used.
+MARK = "(!)"
 #: The words in a reason between facts and advice.
 BETWEEN = ". What to do: "
 #: So many sensors have a large figure each; of more, the worst one has.
@@ -57,7 +72,7 @@ def _todo(shown: ShownResult, cure: str) -> Iterator[str]:
         yield NO_NOISE_STATED
     free = () if result.refined is None else result.refined.free_directions
     free = free or result.solution.identifiability.free_directions
-    yield from Advice.of(free, result.log, result.judgement).sentences
+    yield from Advice.of(free, result.log, shown.judgement).sentences
 
 
 def _findings(shown: ShownResult) -> list[Finding]:
@@ -65,10 +80,10 @@ def _findings(shown: ShownResult) -> list[Finding]:
     result = shown.result
     if result is None:
         return []
-    found = findings_of(result.solution, result.refined)
+    found = [*findings_of(result.solution, result.refined), *shown.findings]
     if result.calibration is not None:
         found += result.calibration.findings
-    grounds = list(result.judgement.grounds)
+    grounds = list(shown.judgement.grounds)
     counted = dict.fromkeys(one for one in found if one.ground in grounds)
     return sorted(counted, key=lambda one: grounds.index(one.ground))
 
@@ -115,14 +130,11 @@ def _points(shown: ShownResult) -> Iterator[Block]:
     yield Table("How far off a point is", headings, rows, POINTS)
 
 
-TRANSLATION = ("x m", "y m", "z m")
-ANGLES = ("roll°", "pitch°", "yaw°")
-QUATERNION = ("qw", "qx", "qy", "qz")
 LEGEND = (
     "±: one standard deviation, along and about the axes of the frame itself; free: infinite, because the measurements "
     "leave a direction free."
 )
-LEGEND_ANGLES = "Roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll). "
+LEGEND_ANGLES = "Metres and degrees. Roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll). "
 SCALARS = {"scale": "scale", "time_offset": "clock offset"}
 SCALARS_LEGEND = (
     "Scale: measured length / true length. Clock offset: a stamp of the sensor + this = the carriers' time. ±: one "
@@ -175,26 +187,16 @@ def _scalars(shown: ShownResult) -> Iterator[Block]:
 
 def _table(shown: ShownResult, title: str, kind: str, side: str) -> Table:
     rows = shown.tree[side]
-    order = sorted(range(len(rows)), key=lambda i: natural_key(rows[i]["child"]))
-    angles = angles_of(shown)
-    has_angles = all(row["child"] in angles for row in rows)
     frames = (shown.tree.get("refined") or {}).get("frames", {})
-    deviations = DEVIATION_HEADINGS if frames else ()
     cells = []
-    for i in order:
+    for i in sorted(range(len(rows)), key=lambda i: natural_key(rows[i]["child"])):
         name = rows[i]["child"]
         row: list[Words] = [f"{name} {MARK}" if rows[i].get("contradicted") else name]
         row += [shown.number(side, i, "translation_m", k, spec="z.4f") for k in range(3)]
-        if has_angles:
-            row += [shown.evident("derived", "angles", angles[name], "rpy_deg", k, spec="z.2f") for k in range(3)]
-        else:
-            row += [shown.number(side, i, "quaternion_wxyz", k, spec="z.5f") for k in range(4)]
-        if frames:
-            row += deviation_cells(shown, name)
-        cells.append(tuple(row))
-    headings = (kind, *TRANSLATION, *(ANGLES if has_angles else QUATERNION), *deviations)
-    legend = (LEGEND_ANGLES if has_angles else "") + (LEGEND if frames else "")
-    return Table(title, headings, tuple(cells), legend.strip())
+        row += [f"{angle:z.2f}" for angle in np.degrees(gtsam.Rot3(np.array(rows[i]["rotation_matrix"])).rpy())]
+        cells.append((*row, *(deviation_cells(shown, name) if frames else ())))
+    headings = (kind, *POSE_HEADINGS, *(DEVIATION_HEADINGS if frames else ()))
+    return Table(title, headings, tuple(cells), LEGEND_ANGLES + (LEGEND if frames else ""))
 
 
 def deviation_cells(shown: ShownResult, name: str) -> list[Words]:
@@ -209,9 +211,3 @@ def deviation_cells(shown: ShownResult, name: str) -> list[Words]:
 def known_unknowns(shown: ShownResult) -> frozenset[str]:
     """The names of all that was estimated; a frame that is not among them was stated."""
     return frozenset(shown.tree["refined"]["joint"]["slots"])
-
-
-def angles_of(shown: ShownResult) -> dict[str, int]:
-    """Where the evidence has roll, pitch and yaw of each frame; empty without evidence."""
-    derived = shown.evidence_tree.get("derived") or {}
-    return {row["frame"]: i for i, row in enumerate(derived.get("angles", ()))}

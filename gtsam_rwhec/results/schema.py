@@ -365,6 +365,8 @@ class CalibrationFields:
         Deviations of a constant error of the carriers' poses, which the covariance holds although no residual shows
         it: [omega (rad), v (m)] of the targets' carrier in its own axes, and of the sensors'. Another calibration with
         the same carriers has the same error.
+    cannot_tell : tuple of str
+        What no residual shows, so that nobody checked it.
     """
 
     findings: tuple[Finding, ...]
@@ -374,6 +376,7 @@ class CalibrationFields:
     outliers: str
     notes: tuple[str, ...]
     constant_errors: tuple[tuple[float, ...], ...] = ()
+    cannot_tell: tuple[str, ...] = ()
 
     @staticmethod
     def of(calibration: Calibration) -> CalibrationFields:
@@ -386,4 +389,5 @@ class CalibrationFields:
             outliers=str(calibration.outliers),
             notes=calibration.notes,
             constant_errors=() if calibration.noise.model is None else calibration.noise.model.constant_deviations,
+            cannot_tell=calibration.cannot_tell,
         )

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.report.figures import FILE_DPI, svg_figure, write_figures
+from gtsam_rwhec.report.figures import FILE_DPI, svg_figure
 from gtsam_rwhec.report.html_page import page_html
 from gtsam_rwhec.report.report_blocks import Chart, Drawing, Folded, Page, Section
+from gtsam_rwhec.report.report_page import write_figures
 
 
 def points(figure: Figure) -> None:
@@ -34,8 +37,8 @@ def page() -> Page:
 
 
 def test_figures_take_the_colour_of_the_page_and_equal_ones_are_equal() -> None:
-    svg = svg_figure(points)
-    assert svg == svg_figure(points)
+    svg = svg_figure(points).in_page
+    assert svg == svg_figure(points).in_page
     assert "currentColor" in svg
     assert "#010203" not in svg
 
@@ -47,6 +50,30 @@ def test_ids_of_figures_are_their_own_and_lead_somewhere() -> None:
     used = re.findall(r'(?:xlink:href="#|url\(#)([^")]+)', text)
     assert len(used) > 6
     assert set(used) <= set(ids)
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 1e300), (1e-320, 1.0), (np.nan, np.inf), (5.0, 5.0), (-1e18, 1e18)])
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_no_numbers_end_a_run(numbers: tuple[float, float], scale: str) -> None:
+    """Locators with too many ticks, logarithms of what has none, transforms that overflow."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot(numbers, numbers, "o")
+        axes.set(xscale=scale, yscale=scale)
+        axes.xaxis.set_major_locator(MultipleLocator(1e-3))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for content in (svg_figure(draw).in_page.encode(), svg_figure(draw).file("png")):
+            assert b"<svg" in content or content.startswith(b"\x89PNG")
+
+
+def test_a_figure_that_cannot_be_drawn_says_why() -> None:
+    def draw(figure: Figure) -> None:
+        raise RuntimeError("Locator attempting to generate 1601 ticks")
+
+    assert "1601 ticks" in svg_figure(draw).in_page
 
 
 def test_every_figure_is_written_as_svg_and_png(tmp_path: Path) -> None:

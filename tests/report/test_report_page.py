@@ -132,7 +132,7 @@ def test_a_page_is_of_a_result_its_own_evidence_and_a_file_of_its_own(folder: Pa
     for wrong in (5, "evidence.json"):
         with pytest.raises(rw.errors.OptionError, match=r"give what rw\.results\.evidence_of"):
             rw.report.write_html(other, page, wrong)  # type: ignore[arg-type]
-    for wrong in (None, other.solution, b"result.json"):
+    for wrong in (None, problem, b"result.json"):
         with pytest.raises(rw.errors.OptionError, match=r"give what rw\.calibrate returned"):
             rw.report.write_html(wrong, page)  # type: ignore[arg-type]
     with pytest.raises(rw.errors.FileFormatError, match="is not a path"):

@@ -16,10 +16,10 @@ from rich.text import Text
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
-from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable
-from gtsam_rwhec.report.short_poses import _with_largest
+from gtsam_rwhec.report.calibration_report import with_largest
+from gtsam_rwhec.report.report_blocks import Table
 from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport, lines_beside
+from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, POSE_HEADINGS
 
 WIDTHS = (80, 120)
 
@@ -40,10 +40,10 @@ def printed(calibration: rw.Calibration, width: int = 80, **options: object) -> 
     return stream.getvalue()
 
 
-def frames(kind: str, number: int) -> FrameTable:
+def frames(kind: str, number: int) -> Table:
     """Many frames, whose rows differ."""
     rows = {f"{kind}_{i}": tuple(f"{i + j / 8:.4f}" for j in range(12)) for i in range(number)}
-    return FrameTable(f"{kind}s", kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, tight=True)
+    return Table.of(f"{kind}s", kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows)
 
 
 def large(sensors: int, targets: int, facts: int, advice: int, sentences: int) -> ShortReport:
@@ -61,7 +61,7 @@ def large(sensors: int, targets: int, facts: int, advice: int, sentences: int) -
         advice=tuple(
             (f"  - Do the thing of number {i}, and what it asks for in many words.", "") for i in range(advice)),
         points=points,
-        poses=(PoseTables(tables, "±: of all axes."), PoseTables(tuple(map(_with_largest, tables)), "±: the largest.")),
+        poses=(PoseTables(tables, "±: of all axes."), PoseTables(tuple(map(with_largest, tables)), "±: the largest.")),
         sentences=tuple((f"A sentence of number {i}.", "") for i in range(sentences)),
     )  # fmt: skip
 
@@ -136,10 +136,9 @@ def test_frames_that_are_not_to_be_used_are_among_the_rows() -> None:
 
 
 def test_where_columns_do_not_fit_the_largest_deviation_stands_for_all() -> None:
-    table = FrameTable(
-        "", "", (*POSE_HEADINGS, *DEVIATION_HEADINGS), {"a": (*"123456", "7.1", "9.0", "8.3", "0.1", "free", "0.3")}
-    )
-    assert _with_largest(table).rows == {"a": (*"123456", "9.0", "free")}  # fmt: skip
+    cells = (*"123456", "7.1", "9.0", "8.3", "0.1", "free", "0.3")
+    table = Table.of("", "", (*POSE_HEADINGS, *DEVIATION_HEADINGS), {"a": cells})
+    assert with_largest(table).rows == (("a", *"123456", "9.0", "free"),)
 
 
 def test_warnings_and_frames_without_covariances_are_said(calibration: rw.Calibration) -> None:

@@ -12,19 +12,12 @@ from refined_corners import two_cameras
 from rich.console import Console
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.fitting.corners_as_refined import OF_CARRIERS, centre_causes, focal_cause
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.reprojection_record import Consequence, Intrinsics
-from gtsam_rwhec.report import print_corners, print_refined
-from gtsam_rwhec.report.corner_report import consequences_table, errors_table, intrinsics_sentences, intrinsics_table
-from gtsam_rwhec.report.covariance_report import (
-    FROM_POSES,
-    NOT_FROM_CORNERS,
-    legend,
-    refined_sentences,
-    scale_and_offset_sentences,
-)
-from gtsam_rwhec.results import read_result
+from gtsam_rwhec.report import print_corners
+from gtsam_rwhec.report.corners_section import corners_section, errors_table, intrinsics_sentences, intrinsics_table
+from gtsam_rwhec.report.report_blocks import Chart, Table
+from gtsam_rwhec.report.shown_result import ShownResult
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -40,31 +33,22 @@ def printed(refined: Refined, width: int = 160, *, terminal: bool = False) -> st
     return re.sub(r"\x1b\[[0-9;]*m", "", stream.getvalue())
 
 
+def rows_of(table: Table) -> dict[str, tuple[str, ...]]:
+    return {str(name): tuple(map(str, cells)) for name, *cells in table.rows}
+
+
 def changed(refined: Refined, **of_cam_0: object) -> Refined:
     cam_0: Intrinsics = dataclasses.replace(refined.intrinsics["cam_0"], **of_cam_0)  # type: ignore[arg-type]
     return dataclasses.replace(refined, intrinsics={**refined.intrinsics, "cam_0": cam_0})
 
 
-def test_the_section_stands_between_poses_and_details(refined: Refined) -> None:
-    stream = io.StringIO()
-    print_refined(refined, Console(file=stream, width=160, color_system=None))
-    text = stream.getvalue()
-    places = [text.index(words) for words in ("Poses\n", "Corners and intrinsics\n", "Details\n")]
-    assert places == sorted(places)
-    assert str(refined.reprojection) in text
-    (scale,) = scale_and_offset_sentences(refined)  # intrinsics and shapes have a section of their own
-    assert scale.startswith("Scale of board")
-    assert "it adds corners and intrinsics." in legend(refined)
-    assert refined_sentences(refined)[0] == FROM_POSES
-    assert printed(dataclasses.replace(refined, reprojection=None)) == ""
-
-
-def test_a_log_whose_corners_were_not_used_has_intrinsics_that_count_as_exact(refined: Refined) -> None:
-    log = read_result(GOLDEN / "result_log.json").log
-    for found, is_said in ((refined, False), (dataclasses.replace(refined, reprojection=None, intrinsics={}), True)):
-        stream = io.StringIO()
-        print_refined(found, Console(file=stream, width=160, color_system=None), log=log)
-        assert (NOT_FROM_CORNERS in stream.getvalue()) is is_said
+def test_it_is_a_section_of_the_page_and_nothing_without_corners(refined: Refined) -> None:
+    section = corners_section(ShownResult.of_answer(refined))
+    figures = [block for block in section.blocks if isinstance(block, Chart)]
+    assert [figure.name for figure in figures] == ["intrinsics"]
+    assert "cam_1" in figures[0].svg.in_page
+    poses = dataclasses.replace(refined, reprojection=None, intrinsics={})
+    assert printed(poses) == ""
 
 
 @pytest.mark.parametrize("width", [50, 80, 160])
@@ -79,15 +63,12 @@ def test_nothing_is_cut_and_nothing_sticks_out(refined: Refined, width: int) -> 
 
 def test_errors_and_numbers_are_those_of_the_result(refined: Refined) -> None:
     assert refined.reprojection is not None
-    cells = errors_table(refined.reprojection).rows["cam_1"]
+    (cells,) = (row[1:] for row in errors_table(refined.reprojection).rows if row[0] == "cam_1")
     of = refined.reprojection.sensors["cam_1"]
     assert cells[:3] == (str(of.images), str(of.corners), "0")
     numbers = [of.rms_px, of.held_out_mm, of.held_out_px, of.expected_px]
-    assert [float(cell) for cell in cells[3:]] == pytest.approx(numbers, abs=6e-4)
-    alone = dataclasses.replace(of, held_out_px=None, held_out_mm=None, expected_px=None)
-    without = dataclasses.replace(refined.reprojection, sensors={"cam_1": alone})
-    assert errors_table(without).rows["cam_1"][4:] == ("-", "-", "-")
-    rows = intrinsics_table(refined).rows
+    assert [float(str(cell)) for cell in cells[3:]] == pytest.approx(numbers, abs=6e-4)
+    rows = rows_of(intrinsics_table(refined))
     assert len(rows) == 16
     cam = refined.intrinsics["cam_0"]
     found, deviation, stated, known = (float(cell) for cell in rows["cam_0 fx"][:4])
@@ -120,20 +101,20 @@ def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(ref
         "cam_0: estimated, with a prior from what was stated (a calibration's); the images are 7.0 deviations "
         "off, so the prior was widened 3.2 times; the images do not determine k2, p1: only the prior holds them."
     )
-    assert intrinsics_table(held).rows["cam_0 k2"][-1] == "stated"
-    assert intrinsics_table(held).rows["cam_0 k1"][-1] == "images"
+    assert rows_of(intrinsics_table(held))["cam_0 k2"][-1] == "stated"
+    assert rows_of(intrinsics_table(held))["cam_0 k1"][-1] == "images"
     unknown = changed(refined, stated_as="unknown", held_by_prior=("k2",))
     assert intrinsics_sentences(unknown)[0] == (
         "cam_0: no stated ones count, so the images alone tell them; the images do not determine k2: nothing else "
         "tells them."
     )
-    assert intrinsics_table(unknown).rows["cam_0 fx"][2:] == ("-", "-", "images")
-    assert intrinsics_table(unknown).rows["cam_0 k2"][2:] == ("-", "-", "nothing")
+    assert rows_of(intrinsics_table(unknown))["cam_0 fx"][2:] == ("-", "-", "images")
+    assert rows_of(intrinsics_table(unknown))["cam_0 k2"][2:] == ("-", "-", "nothing")
     exact = changed(refined, stated_as="exact", held_by_prior=refined.intrinsics["cam_0"].names)
     assert intrinsics_sentences(exact)[0] == (
         "cam_0: they count as exact, as was said: their errors are not in the standard deviations."
     )
-    assert {row[-1] for name, row in intrinsics_table(exact).rows.items() if "cam_0" in name} == {"stated"}
+    assert {row[-1] for name, row in rows_of(intrinsics_table(exact)).items() if "cam_0" in name} == {"stated"}
 
 
 def test_a_camera_is_told_once_and_one_that_was_kept_is_told_too(refined: Refined) -> None:
@@ -159,26 +140,6 @@ def test_a_camera_that_was_calibrated_from_a_corner_of_its_image_says_so(refined
     for even in ((0.2, 0.4, 0.99), (0.3, 1.2, 1.4), (None, None, None)):
         said = intrinsics_sentences(changed(part, projection_px=(even,)))
         assert not any("uncertain" in sentence for sentence in said)
-
-
-def test_consequences_have_a_row_for_each_frame_and_the_worst_of_many_cameras(refined: Refined) -> None:
-    assert refined.reprojection is not None
-    table = consequences_table(refined.reprojection, ["cam_0", "cam_1"])
-    assert table.headings == (
-        "1 px of c, cam_0", "0.1% of f, cam_0", "1 px of c, cam_1", "0.1% of f, cam_1", "0.1° of A",
-    )  # fmt: skip
-    assert list(table.rows) == ["board", "cam_0", "cam_1"]
-    by = {(of.frame, of.cause): of for of in refined.reprojection.consequences}
-    of_cx, of_cy = (by["cam_0", cause] for cause in centre_causes("cam_0"))
-    mm, degrees = (float(number) for number in table.rows["cam_0"][0].split(" / "))
-    assert mm == pytest.approx(max(of_cx.translation_mm, of_cy.translation_mm), abs=0.0051)
-    assert degrees == pytest.approx(max(of_cx.rotation_deg, of_cy.rotation_deg), abs=0.00051)
-    names = [f"cam_{k}" for k in range(9)]
-    many = tuple(Consequence("hand", focal_cause(name), 0.01 * k, float(k)) for k, name in enumerate(names))
-    every = dataclasses.replace(refined.reprojection, consequences=(*many, Consequence("hand", OF_CARRIERS, 0.3, 1.2)))
-    table = consequences_table(every, names)
-    assert table.headings == ("1 px of c", "0.1% of f", "0.1° of A")
-    assert table.rows["hand"] == ("-", "8.00 / 0.080", "1.20 / 0.300")
 
 
 def test_the_steps_results_say_their_figures_and_where_a_report_is() -> None:
