@@ -10,6 +10,7 @@ in FOLDER: an interrupted campaign goes on where it was. Exits with 1 if a bar i
 """
 
 from __future__ import annotations
+
 import io
 import json
 import os
@@ -17,24 +18,21 @@ import re
 import tempfile
 import warnings
 import zlib
-from dataclasses import asdict
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+
 import gallery_scene as scene
 import numpy as np
-from bars import Row
-from bars import benchmark_parser
-from bars import print_rows
-from gallery_faults import FAULTS
-from gallery_faults import Fault
-from loky import ProcessPoolExecutor
-from loky import as_completed
+from bars import Row, benchmark_parser, print_rows
+from gallery_faults import FAULTS, Fault
+from loky import ProcessPoolExecutor, as_completed
 from rich.console import Console
+
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.report.advice import Advice
 from gtsam_rwhec.report.terminal_report import print_sentence
+from gtsam_rwhec.rig import read_rig
 
 #: The share of runs in which the fault is to be named.
 NAMED = 140 / 150

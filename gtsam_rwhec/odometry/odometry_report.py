@@ -1,36 +1,39 @@
 """The report of a calibration of odometries, as people read it: verdict, what to do, poses, what is free, the proof."""
 
 from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
+
 import gtsam
 import numpy as np
+
 from gtsam_rwhec.files.terminal_text import shown_path
-from gtsam_rwhec.odometry.odometry_result import OdometryResult
-from gtsam_rwhec.odometry.odometry_result import SensorRecord
-from gtsam_rwhec.odometry.odometry_result import is_odometry_result
-from gtsam_rwhec.odometry.odometry_result import read_odometry_result
-from gtsam_rwhec.report.html_page import write_page
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Folded
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Number
-from gtsam_rwhec.report.report_blocks import Page
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.odometry.odometry_result import OdometryResult, SensorRecord, is_odometry_result, read_odometry_result
 from gtsam_rwhec.report.calibration_report import pose_cells
-from gtsam_rwhec.report.report_blocks import TONES
-from gtsam_rwhec.report.report_blocks import Words
-from gtsam_rwhec.report.terminal_report import STYLES
-from gtsam_rwhec.report.terminal_report import print_heading
-from gtsam_rwhec.report.terminal_report import print_list
-from gtsam_rwhec.report.terminal_report import print_sections
-from gtsam_rwhec.report.terminal_report import print_sentence
-from gtsam_rwhec.report.terminal_report import print_tables
-from gtsam_rwhec.report.terminal_report import report_console
-from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS
-from gtsam_rwhec.report.verdict_section import POSE_HEADINGS
+from gtsam_rwhec.report.html_page import write_page
+from gtsam_rwhec.report.report_blocks import (
+    TONES,
+    Block,
+    Folded,
+    Listing,
+    Number,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    Words,
+)
+from gtsam_rwhec.report.terminal_report import (
+    STYLES,
+    print_heading,
+    print_list,
+    print_sections,
+    print_sentence,
+    print_tables,
+    report_console,
+)
+from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, POSE_HEADINGS
 
 #: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.
 FREE_SHARE = 0.1

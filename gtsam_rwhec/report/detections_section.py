@@ -1,38 +1,39 @@
 """Section 3: what was seen: images, detections over time, corners in the image, what was removed, the worst images."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
-from collections.abc import Sequence
+
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
+
 import numpy as np
-from gtsam_rwhec.report.figures import GREY
-from gtsam_rwhec.report.figures import INK
-from gtsam_rwhec.report.figures import ORANGE
-from gtsam_rwhec.report.figures import PURPLE
-from gtsam_rwhec.report.figures import VERMILLION
-from gtsam_rwhec.report.figures import SvgFigure
-from gtsam_rwhec.report.figures import image_axes
-from gtsam_rwhec.report.figures import shortened
-from gtsam_rwhec.report.figures import svg_figure
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Chart
-from gtsam_rwhec.report.report_blocks import Folded
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Picture
-from gtsam_rwhec.report.report_blocks import Piece
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.report_blocks import Words
-from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.detection_evidence import MOST_LISTED
-from gtsam_rwhec.results.detection_evidence import PIECES
-from gtsam_rwhec.results.detection_evidence import RemovedMeasurement
-from gtsam_rwhec.results.detection_evidence import SeenEvidence
-from gtsam_rwhec.results.detection_evidence import SeenTrack
-from gtsam_rwhec.results.image_errors import SeenCamera
+
 from gtsam_rwhec.report.choices_section import log_blocks
+from gtsam_rwhec.report.figures import (
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    SvgFigure,
+    image_axes,
+    shortened,
+    svg_figure,
+)
+from gtsam_rwhec.report.report_blocks import (
+    Block,
+    Chart,
+    Folded,
+    Listing,
+    Paragraph,
+    Picture,
+    Piece,
+    Section,
+    Table,
+    Words,
+)
+from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.detection_evidence import MOST_LISTED, PIECES, RemovedMeasurement, SeenEvidence, SeenTrack
+from gtsam_rwhec.results.image_errors import SeenCamera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

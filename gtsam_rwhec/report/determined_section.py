@@ -1,27 +1,27 @@
 """Section 4: which sensor and target determine each other, and which directions are free or weak, with their cures."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
+
+from collections.abc import Iterator, Mapping
+
 import numpy as np
+
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import Folded
-from gtsam_rwhec.report.report_blocks import Listing
-from gtsam_rwhec.report.report_blocks import Number
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.report_blocks import Words
-from gtsam_rwhec.report.report_blocks import significant
+from gtsam_rwhec.report.report_blocks import (
+    Block,
+    Folded,
+    Listing,
+    Number,
+    Paragraph,
+    Section,
+    Table,
+    Words,
+    significant,
+)
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.weak_poses import MORE
-from gtsam_rwhec.results.weak_poses import TURN_RAD
-from gtsam_rwhec.results.weak_poses import WEAK
-from gtsam_rwhec.results.weak_poses import WeakDirection
-from gtsam_rwhec.solver.free_directions import FreeDirection
-from gtsam_rwhec.solver.free_directions import FreeReason
+from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10

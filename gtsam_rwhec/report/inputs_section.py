@@ -1,21 +1,17 @@
 """Section 9: what the calibration was made of, enough to make it again; and the poses as texts to copy."""
 
 from __future__ import annotations
-from collections.abc import Iterator
-from collections.abc import Mapping
+
+from collections.abc import Iterator, Mapping
 from typing import Any
+
 import numpy as np
+
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.report.report_blocks import Block
-from gtsam_rwhec.report.report_blocks import CopyText
-from gtsam_rwhec.report.report_blocks import Folded
-from gtsam_rwhec.report.report_blocks import Paragraph
-from gtsam_rwhec.report.report_blocks import Section
-from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.report_blocks import Block, CopyText, Folded, Paragraph, Section, Table
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.schema import SENSOR_CARRIER
-from gtsam_rwhec.results.schema import TARGET_CARRIER
+from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER
 from gtsam_rwhec.rig.exported_files import copied_texts
 from gtsam_rwhec.rig.rig_frames import RigFrames
 

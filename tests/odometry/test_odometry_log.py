@@ -1,32 +1,26 @@
 """Vehicles whose sensors each know only their own motion, the whole road: from a log or TUM files to the files."""
 
 from __future__ import annotations
+
 import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 import pytest
 import synthetic_logs as made
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
+
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.failures import ExitStatus
-from gtsam_rwhec.cli.failures import exit_status
-from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.odometry.odometry_report import odometry_page
-from gtsam_rwhec.odometry.odometry_report import pose_table
-from gtsam_rwhec.odometry.odometry_result import read_odometry_result
-from gtsam_rwhec.odometry.odometry_result import result_json
-from gtsam_rwhec.report.report_blocks import Number
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.report_blocks import every
-from gtsam_rwhec.simulate import Drive
-from gtsam_rwhec.simulate import SimulatedOdometry
-from gtsam_rwhec.simulate import drive
-from gtsam_rwhec.simulate import frame_distance
+from gtsam_rwhec.cli.failures import ExitStatus, exit_status
+from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.odometry.odometry_report import odometry_page, pose_table
+from gtsam_rwhec.odometry.odometry_result import read_odometry_result, result_json
+from gtsam_rwhec.report.report_blocks import Number, Table, every
+from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive, frame_distance
 
 #: Of each sensor: about x, y, z in degrees, and where it is on the vehicle in metres.
 MOUNTS = {
