@@ -20,7 +20,7 @@ from gtsam_rwhec.cameras.targets import (
     family_named,
     is_same_print,
 )
-from gtsam_rwhec.detect.tags import BY_TRUST, dictionary, modules
+from gtsam_rwhec.detect.tags import dictionary, modules
 from gtsam_rwhec.errors import TargetError
 
 TAG = Tag("tag", "tag36h11", 3, 0.12)
@@ -142,15 +142,6 @@ def test_opencv_has_every_family_with_as_many_tags(family: str) -> None:
     tags = dictionary(family)
     assert len(tags.bytesList) == FAMILIES[family]
     assert modules(family, 2) == modules(family) + 2 == tags.markerSize + 4
-
-
-def test_the_widest_dictionaries_begin_with_the_others() -> None:
-    for family in FAMILIES:
-        if family in BY_TRUST:
-            continue
-        stem = family.rpartition("_")[0]
-        (wide,) = (other for other in BY_TRUST if other.startswith(stem + "_"))
-        np.testing.assert_array_equal(dictionary(wide).bytesList[: FAMILIES[family]], dictionary(family).bytesList)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from rendered import PINHOLE, pose, printed, projected, render
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.detect.board_evidence import evidence, smallest_step
+from gtsam_rwhec.detect.board_evidence import evidence
 from gtsam_rwhec.detect.detections import Rejection
 
 CHESS = Checkerboard("chess", 5, 4, 0.03)
@@ -91,9 +91,3 @@ def test_shade_on_a_half_does_not_reject() -> None:
     image = render(PINHOLE, [(printed(CHESS), T)]).astype(float)
     image[:, :160] *= 0.25
     assert evidence(image.astype(np.uint8), grid_of(PINHOLE), PINHOLE).rejection is None
-
-
-def test_the_smallest_step_is_the_distance_between_lines() -> None:
-    x, y = np.meshgrid(np.arange(4) * 10.0, np.arange(3) * 20.0)
-    sheared = np.stack([x + 0.5 * y, y], axis=-1)
-    assert smallest_step(sheared) == pytest.approx(10.0 * 20.0 / np.hypot(10.0, 20.0))

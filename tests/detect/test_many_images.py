@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -90,20 +89,6 @@ def test_each_topic_comes_in_order(images: list[ImageRecord]) -> None:
         assert stamps == sorted(stamps)
 
 
-def test_each_thread_makes_its_detectors_once(images: list[ImageRecord]) -> None:
-    made: list[tuple[str, int]] = []
-
-    def maker(topic: str) -> Callable[[], Detector]:
-        def make() -> Detector:
-            made.append((topic, threading.get_ident()))
-            return MAKERS[topic]()
-
-        return make
-
-    list(detect_in_images(images, {topic: maker(topic) for topic in MAKERS}, workers=2))
-    assert len(made) == len(set(made)) <= 4
-
-
 class FailsOnDark(Detector):
     """Fails as NumPy and OpenCV do, on each image that begins with a black pixel."""
 
@@ -141,15 +126,6 @@ def test_faults_are_reported_and_the_other_images_are_used(images: list[ImageRec
         assert one.fault == ""
         assert one.found is not None
         assert [d.target for d in one.found.detections] == ["tag"]
-
-
-def test_raw_images_need_no_copy(images: list[ImageRecord]) -> None:
-    # bytes cannot be written to; OpenCV must not need to.
-    pixels = cv2.imdecode(np.frombuffer(images[1].data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    raw = ImageRecord(1, 1, "/left", "cam", "mono8", pixels.tobytes(), 320, 240, 320)
-    (one,) = detect_in_images([raw], MAKERS)
-    (other,) = detect_in_images([record("/left", 1, images[1].data)], MAKERS)
-    assert_same({("", 1): one}, {("", 1): other})
 
 
 def test_images_are_read_only_when_they_are_needed(images: list[ImageRecord]) -> None:
@@ -280,12 +256,6 @@ def test_measured_corner_noise() -> None:
     assert measured_corner_px(squared, corners) == pytest.approx(0.3, rel=0.15)
     squared[1::25] = np.nan
     assert measured_corner_px(squared, corners) == pytest.approx(0.3, rel=0.15)
-
-
-def test_measured_corner_noise_has_a_least_value() -> None:
-    assert measured_corner_px(np.zeros(5), np.full(5, 4)) == 0.02
-    assert measured_corner_px(np.zeros(0), np.zeros(0, dtype=int)) == 0.02
-    assert measured_corner_px(np.ones(5), np.full(5, 3), least_px=0.1) == 0.1  # three corners leave nothing over
 
 
 def test_measured_corner_noise_of_single_tags() -> None:

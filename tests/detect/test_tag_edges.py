@@ -6,20 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from rendered import BARREL, FISHEYE, PINHOLE, pose, printed, projected, render
-from scipy.special import ndtr
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Tag
-from gtsam_rwhec.detect.tag_edges import (
-    RefinedCorners,
-    area,
-    crossings,
-    fit_profiles,
-    from_unit_square,
-    lines_through,
-    mapped,
-    refine_corners,
-)
+from gtsam_rwhec.detect.tag_edges import RefinedCorners, refine_corners
 
 TAG = Tag("tag", "tag36h11", 7, 0.1)
 PICTURE = printed(TAG)
@@ -187,41 +177,3 @@ def test_no_tags_give_no_corners() -> None:
     )
     assert found.corners_px.shape == (0, 4, 2)
     assert found.blur_px.shape == (0,)
-
-
-@pytest.mark.parametrize(("edge", "blur"), [(0.0, 1.0), (0.4, 1.2), (-0.5, 0.8)])
-def test_a_profile_of_the_model_is_fitted_in_a_few_rounds(edge: float, blur: float) -> None:
-    places = np.linspace(-5.0, 4.0, 31)
-    z, module = (places - edge) / blur, 4.5
-    values = 30 + 120 * ndtr(z) + 90 * ndtr(-z - module / blur) - 70 * ndtr(z - module / blur)
-    at, wide = 0.0, 1.0
-    for _ in range(6):
-        fitted = fit_profiles(values, places - at, np.array(module), np.array(wide), np.array(110.0))
-        at, wide = at + float(fitted.shift), wide + float(fitted.wider)
-    assert at == pytest.approx(edge, abs=0.01)
-    assert wide == pytest.approx(blur, abs=0.01)
-    assert fitted.step == pytest.approx(120.0, rel=0.02)
-    assert fitted.rms < 0.01
-
-
-def test_from_unit_square_maps_to_the_corners() -> None:
-    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    corners = unit + np.random.default_rng(2).uniform(-0.2, 0.2, (6, 4, 2))
-    H = from_unit_square(corners)
-    for i in range(6):
-        expected = cv2.getPerspectiveTransform(unit.astype(np.float32), corners[i].astype(np.float32))
-        np.testing.assert_allclose(H[i], expected, atol=1e-5)
-    np.testing.assert_allclose(mapped(H, np.array([0.0, 1.0]), 0.0), corners[:, :2], atol=1e-12)
-    np.testing.assert_allclose(mapped(H, np.array([1.0, 0.0]), 1.0), corners[:, 2:], atol=1e-12)
-
-
-def test_lines_through_points_and_their_crossings() -> None:
-    corners = np.array([[[3.0, 1.0], [40.0, 6.0], [38.0, 50.0], [-1.0, 44.0]]])
-    share = np.linspace(0.1, 0.9, 18)[:, None]
-    points = corners[:, :, None] * (1 - share) + np.roll(corners, -1, axis=1)[:, :, None] * share
-    points[0, 1, 4:6] += [5.0, 1.0]  # an occluder's
-    good = np.ones((1, 4, 18), dtype=bool)
-    np.testing.assert_allclose(crossings(lines_through(points, good, 6)), corners, atol=1e-9)
-    good[0, 2, 5:] = False
-    assert np.isnan(lines_through(points, good, 6)[0]).all(axis=1).tolist() == [False, False, True, False]
-    assert area(corners)[0] == pytest.approx(cv2.contourArea(corners[0].astype(np.float32)))

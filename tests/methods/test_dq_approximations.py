@@ -197,20 +197,6 @@ def curve_and_relaxation(make, seed: int, noise: float) -> tuple[Curve, RelaxedC
     return of, relaxed, (found.values[0] - relaxed.values[0]) / of.lambda_scale, found.mu
 
 
-def test_the_curve_is_the_determinant() -> None:
-    of, relaxed, _, _ = curve_and_relaxation(hand_held, 0, 0.1)
-    assert np.count_nonzero(of.coefficients) == 24  # of 25; lambda is counted from lambda_0, a root at mu = 0
-    rows, columns = np.nonzero(of.coefficients)
-    assert (columns <= 8 - 2 * rows).all()
-    rng = np.random.default_rng(0)
-    figures = []
-    for x, y in rng.normal(size=(10, 2)):
-        mu, shift = x * of.mu_scale, y * of.lambda_scale
-        Z = np.diag(relaxed.values - relaxed.values[0] - shift) + mu * relaxed.Z1 - mu**2 * relaxed.Z2
-        figures.append(y ** np.arange(5) @ of.coefficients @ x ** np.arange(9) / np.linalg.det(Z))
-    assert figures == pytest.approx(np.full(10, figures[0]), rel=1e-9)
-
-
 def test_eight_real_roots_below_the_optimum_and_six_above() -> None:
     """Figure 2 (b): the count jumps exactly at lambda*."""
     for seed in range(10):
@@ -220,15 +206,6 @@ def test_eight_real_roots_below_the_optimum_and_six_above() -> None:
         assert real_roots(of.in_x(0.5 * y)) == np.count_nonzero(np.abs(np.roots(of.in_x(0.5 * y)[::-1]).imag) < 1e-9)
         signs = [np.sign(resultant(of.in_x(y * f))) for f in (0.5, 1 - 1e-9, 1 + 1e-9, 1.2)]
         assert signs[0] == signs[1] == -signs[2] == -signs[3]
-
-
-def test_sturm_counts_known_roots() -> None:
-    rng = np.random.default_rng(1)
-    for pairs in range(5):
-        roots = np.concatenate(
-            [rng.normal(size=8 - 2 * pairs), *[[c, c.conjugate()] for c in rng.normal(size=pairs) + 1j]]
-        )
-        assert real_roots(np.poly(roots).real[::-1]) == 8 - 2 * pairs
 
 
 @pytest.mark.parametrize("method", POLYNOMIAL)

@@ -6,19 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from simulated import hand_held, poses
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.geometry.quaternions import left, right
 from gtsam_rwhec.methods import dual_quaternion_cost as cost_module
-from gtsam_rwhec.methods.dual_quaternion_cost import (
-    from_transforms,
-    motion_moments,
-    residuals,
-    times_vectors,
-    to_transform,
-)
+from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms, motion_moments, residuals, to_transform
 from gtsam_rwhec.methods.motions import Motions, cost_of, motions_of, squared_mahalanobis, squared_residuals
 
 
@@ -40,25 +33,6 @@ def test_a_pose_and_back(seed: int, angle: float) -> None:
         assert to_transform(sign * q, sign * q_dual) == pytest.approx(T[0], abs=1e-14)
     assert to_transform(2.0 * q, 2.0 * q_dual) == pytest.approx(T[0], abs=1e-14)
     assert to_transform(q, q_dual + 0.3 * q) == pytest.approx(T[0], abs=1e-14)
-
-
-def test_scipy_has_the_same_quaternion() -> None:
-    T = poses(np.random.default_rng(0).normal(size=(50, 3)), np.zeros((50, 3)))
-    q, _ = from_transforms(T)
-    theirs = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
-    assert np.abs(q - theirs).max() < 1e-14
-
-
-def test_products_of_poses_are_products_of_dual_quaternions() -> None:
-    rng = np.random.default_rng(1)
-    T = poses(rng.normal(size=(2, 3)), rng.normal(size=(2, 3)))
-    (q, p), (q_dual, p_dual) = from_transforms(T)
-    assert to_transform(product(q, p), product(q, p_dual) + product(q_dual, p)) == pytest.approx(T[0] @ T[1], abs=1e-14)
-
-
-def test_a_turn_by_a_vector_is_a_product() -> None:
-    q = np.random.default_rng(2).normal(size=4)
-    assert times_vectors(q) == pytest.approx(right(q)[:, :3])
 
 
 def test_a_zero_quaternion_is_refused() -> None:

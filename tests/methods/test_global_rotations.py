@@ -12,7 +12,6 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods import global_rotations, run
 from gtsam_rwhec.methods.global_rotations import (
     PRODUCTS,
@@ -21,11 +20,10 @@ from gtsam_rwhec.methods.global_rotations import (
     _moment_places,
     certified_rotations,
     global_minimum,
-    products_to_rotation,
 )
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.descent import descend
-from gtsam_rwhec.solver.rotations import random_rotations, vec
+from gtsam_rwhec.solver.rotations import random_rotations
 
 
 def cost_of(problem: rw.Problem, X: Array, Y: Array, scale: float) -> float:
@@ -124,13 +122,6 @@ def unrelated(seed: int) -> UnitForm:
     problem = rw.Problem()
     problem.add("target", "sensor", A, B)
     return UnitForm.of(problem)
-
-
-def test_products_of_a_quaternion_are_its_rotation() -> None:
-    R = random_rotations(10, np.random.default_rng(0))
-    q = of_rotations(R)
-    products = np.array([q[:, a] * q[:, b] for a, b in PRODUCTS]).T
-    np.testing.assert_allclose(products @ products_to_rotation().T, vec(R), atol=1e-14)
 
 
 def test_moments_of_one_pair_of_quaternions_fulfil_everything() -> None:

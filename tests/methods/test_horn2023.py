@@ -18,10 +18,8 @@ from gtsam_rwhec.methods.horn2023 import (
     horn2023,
     multipliers_of,
     polished,
-    pose_chart,
     relaxed,
     residual_rows,
-    rounded,
     signed_quaternions,
     solve_dual_quaternions,
     vector_of,
@@ -64,23 +62,6 @@ def test_the_form_is_the_sum_of_squares_of_a_x_minus_y_b() -> None:
         x, y = (tuple(z.reshape(5, 2, 4)[k]) for k in (stack.target[i], 4))
         expected += np.sum((product(a, x) - product(y, b)) ** 2)
     assert z @ form_of(stack, *residual_rows(stack, q_A, q_B)) @ z == pytest.approx(expected, rel=1e-12)
-
-
-def test_the_charts_derivatives_are_those_of_the_vector() -> None:
-    p = np.random.default_rng(3).standard_normal(14)
-    z, derivatives = pose_chart(p)
-    frames = z.reshape(2, 2, 4)
-    np.testing.assert_allclose(np.einsum("nai,nbi->nab", frames, frames)[:, 0], [[1.0, 0.0], [1.0, 0.0]], atol=1e-14)
-    numeric = [(pose_chart(p + h)[0] - pose_chart(p - h)[0]) / 2e-6 for h in 1e-6 * np.eye(14)]
-    np.testing.assert_allclose(derivatives, np.transpose(numeric), atol=1e-8)
-
-
-def test_rounding_undoes_the_vector() -> None:
-    T = se3.expmap(np.random.default_rng(2).standard_normal((3, 6)))
-    q, t = of_rotations(T[:, :3, :3]), T[:, :3, 3]
-    again_q, again_t = rounded(-1.7 * vector_of(q, t), 3)
-    np.testing.assert_allclose(again_q, -q, atol=1e-14)
-    np.testing.assert_allclose(again_t, t, atol=1e-13)
 
 
 @pytest.mark.parametrize("noise", [Noise(0.01, 125.0, "released"), pytest.param(LARGE, marks=pytest.mark.slow)])

@@ -18,17 +18,6 @@ from gtsam_rwhec.methods.hand_eye import solve_hand_eye
 from gtsam_rwhec.methods.motions import motions_of
 
 
-def test_rows_are_sums_and_differences() -> None:
-    s = hand_held(20, 0)
-    rows = motions_of(s.C, s.H).rows
-    q_C, dual_C = from_transforms(s.C)
-    q_H, dual_H = from_transforms(s.H)
-    expected = np.vstack([(q_C + q_H).T[:3], (q_C - q_H).T, (dual_C + dual_H).T[:3], (dual_C - dual_H).T])
-    clear = q_C[:, 3] + q_H[:, 3] > 0.2
-    assert clear.sum() > 15
-    assert np.abs(rows - expected)[:, clear].max() < 1e-14
-
-
 def test_pose3_and_quaternion_rows_are_the_same_motions() -> None:
     s = hand_held(10, 1)
     rows = motions_of(s.C, s.H).rows
