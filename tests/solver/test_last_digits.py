@@ -1,4 +1,8 @@
-"""No verdict hangs on the last digit: inputs disturbed by 1e-12 give the same status, cause and free directions."""
+"""No verdict hangs on the last digit: inputs disturbed by 1e-12 give the same status, cause and free directions.
+
+Exact data and carriers at rest are not among them: there a disturbance of 1e-12 is all that the inputs tell of answers
+100 times as far away as anything measured, and the proof over that region is about as wide as the tolerance.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise
 
-DISTURBANCES = 8
+DISTURBANCES = 11
 
 
 def facts(problem: rw.Problem) -> tuple[object, ...]:
@@ -33,7 +37,7 @@ def facts(problem: rw.Problem) -> tuple[object, ...]:
 
 @pytest.mark.parametrize("noise", [SMALL_NOISE, GROSS_NOISE], ids=["small noise", "gross noise"])
 @pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
-@pytest.mark.parametrize("motion", ["general", "planar", "single_axis", "none"])
+@pytest.mark.parametrize("motion", ["general", "planar", "single_axis"])
 def test_of_disturbed_inputs(motion: str, scale: ScaleMode, noise: Noise) -> None:
     problem = simulated(2, 2, 3, motion=motion, scale=scale, noise=noise).problem
     draw = np.random.default_rng(0)
