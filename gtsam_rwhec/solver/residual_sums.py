@@ -165,6 +165,7 @@ def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
         A, off = _centred(stack, measured)
         front, back = (stack.B, A) if measured.is_swapped else (A, stack.B)
         k, m = stack.weight.shape
+        is_once = len(np.unique(stack.pairs)) == k  # a pair may have several batches in a stack
         weights = np.empty((k, m, 12))
         weights[:, :, :9], weights[:, :, 9:] = stack.kappa[:, :, None], stack.weight[:, :, None]
         of_directions = r.reshape(k, m, D, 12)
@@ -193,9 +194,11 @@ def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
         reaches = [front_reach[:, :, None] * one_error[:, None], back_reach[:, :, None] * one_error[:, None], one_error]
         reaches[int(measured.is_swapped)] += of_size
         for table, bound, size, value, reach in zip(tables, errors, sizes, new, reaches, strict=True):
-            np.add.at(table, stack.pairs, value)
-            np.add.at(bound, stack.pairs, reach)
-            np.add.at(size, stack.pairs, np.abs(value))
+            for total_of_pairs, of_stack in ((table, value), (bound, reach), (size, np.abs(value))):
+                if is_once:
+                    total_of_pairs[stack.pairs] += of_stack
+                else:
+                    np.add.at(total_of_pairs, stack.pairs, of_stack)
     # Blocks of one pair are added up exactly, so that a million measurements lose no more than one block does.
     summed = np.zeros(shape)
     for pair, parts in products.items():
