@@ -33,8 +33,8 @@ from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig, RigFrames
 from gtsam_rwhec.rig.exported_files import FILES, export_all
 from gtsam_rwhec.runs.changed_rig import changes, rig_for_solving
-from gtsam_rwhec.runs.cleaning_stage import clean_log
-from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.runs.cleaning_stage import cleaned
+from gtsam_rwhec.runs.detection_stage import detected
 from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.odometry_cleaning import gates_of
 from gtsam_rwhec.runs.odometry_tracks import files_of, read_odometry, write_files
@@ -49,7 +49,6 @@ from gtsam_rwhec.runs.output_folder import (
 from gtsam_rwhec.runs.run_log import (
     CALIBRATION_LOG,
     CLEANING_METADATA,
-    DETECTED_LOG,
     RECORDED_LOG,
     REPORT_FILE,
     RESULT_FILE,
@@ -58,6 +57,7 @@ from gtsam_rwhec.runs.run_log import (
     read_embedded_rig,
     read_metadata,
     topics_up_to_detection,
+    write_run_log,
 )
 
 
@@ -246,8 +246,7 @@ def calibrate_odometry_log(
         if is_raw and rig is None:
             raise LogError(f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
         if is_raw:
-            for name in (DETECTED_LOG, CALIBRATION_LOG):
-                check_is_not_read(log, Path(out) / name)
+            check_is_not_read(log, Path(out) / CALIBRATION_LOG)
         is_cleaned = CLEANING_METADATA in log.metadata() and (
             rig is None or not changes(read_embedded_rig(log), rig).cleaning
         )
@@ -293,12 +292,13 @@ def _stages(
     anyway: bool,
     progress: Progress | None,
 ) -> OdometrySolved:
-    if is_raw:
-        assert rig is not None
-        detect_log(list(files), rig, out / DETECTED_LOG, progress=progress)
-        files = [out / DETECTED_LOG]
     if not is_cleaned:
-        clean_log(files[0], out / CALIBRATION_LOG, rig, images="leave_out", progress=progress)
+        with open_log(files) as log:
+            found = log
+            if is_raw:
+                assert rig is not None
+                found = detected(log, rig, progress=progress)
+            write_run_log(cleaned(found, rig, progress), out / CALIBRATION_LOG, "leave_out")
         files = [out / CALIBRATION_LOG]
     solved = solve_odometries_into(files[0], rig, out, progress=progress)
     export_odometries(out / CALIBRATION_LOG, out, anyway=anyway, progress=progress)

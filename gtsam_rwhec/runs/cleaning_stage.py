@@ -303,12 +303,7 @@ def without_fast(
 ) -> Kept:
     """Keep the measurements at low speed: fast motion blurs images, and errors of stamps count more.
 
-    Parameters
-    ----------
-    turning_rad_s, moving_m_s : (N,) arrays
-        The carrier's speeds at each measurement.
-    stamps_ns : (N,) integers
-    max_turning_rad_s, max_moving_m_s : float
+    `turning_rad_s` and `moving_m_s` (N,) are the carrier's speeds at each measurement.
     """
     return Kept.within(
         stamps_ns,

@@ -16,13 +16,12 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.driver_detections import read_driver_detections
-from gtsam_rwhec.runs.image_detections import check_usable, detect_in_log, detection_report
 from gtsam_rwhec.runs.image_pictures import check_drawable, draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
+from gtsam_rwhec.runs.sensor_detections import check_usable, detect_in_log, detection_report, read_driver_detections
 from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics, in_words, read_intrinsics, refuse_not_estimated
 from gtsam_rwhec.runs.topics_of_rig import check_topics
 from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_detections
@@ -143,7 +142,7 @@ def detected(
         has_sheet = write_contact_sheet(Path(sheet), log, rig, cameras, found)
     if draw is not None:
         draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
-    check_usable(log, rig, found)  # after the pictures: they show what is wrong
+    check_usable(log, rig, found, cameras)  # after the pictures: they show what is wrong
     tell("looking for what hides targets")
     blurred, likely = blurred_images(log, rig, cameras, found), likely_causes(log, rig, cameras, found)
     report = report.model_copy(update={"likely": likely, "blurred": blurred})
@@ -172,21 +171,9 @@ def detect_source(
 ) -> DetectionReport:
     """As `detect_log`, for a log or for a folder of images, with a contact sheet beside the written log.
 
-    Parameters
-    ----------
-    source
-        As for ``open_log``; or a folder of images, for a rig file with poses in files (``frames``), whose paths then
-        start from this folder.
-    rig : Rig
-    out_path
-        The MCAP file to write. The sheet (`sheet_beside`) is written where images are, also if no target was detected.
-    images, workers, draw, progress
-        As for `detect_log`.
-
-    Raises
-    ------
-    RwhecError
-        As `detect_log` and `write_folder_log` do.
+    `source` may also be a folder of images, for a rig file with poses in files (``frames``), whose paths then start
+    from this folder. The sheet (`sheet_beside`) is written where images are, also if no target was detected. Raises as
+    `detect_log` and `write_folder_log` do.
     """
     sheet = sheet_beside(out_path)
     check_writable(out_path)

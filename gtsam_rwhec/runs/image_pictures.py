@@ -19,9 +19,9 @@ from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.image_detections import SensorDetections
 from gtsam_rwhec.runs.output_folder import made_folder
 from gtsam_rwhec.runs.run_log import image_name, image_names, picture_file
+from gtsam_rwhec.runs.sensor_detections import SensorDetections
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4

@@ -104,28 +104,13 @@ _DTYPES = ("<f8", "<f4", "<i8", "<i4")
 
 
 class KeptDetections:
-    """The detections that a file keeps, and to which others are added.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it is made with the first batch.
-    inputs : mapping of str to str
-        What the detections depend on.
-    total : int
-        How many images there are.
-
-    Attributes
-    ----------
-    is_whole : bool
-        Whether no image is missing.
-    """
+    """The detections that a file keeps, and to which others are added; the file is made with the first batch."""
 
     def __init__(self, path: Path, inputs: Mapping[str, str], total: int) -> None:
         self.path = path
-        self.inputs = dict(inputs)
-        self.total = total
-        self.is_whole = False
+        self.inputs = dict(inputs)  #: what the detections depend on
+        self.total = total  #: how many images there are
+        self.is_whole = False  #: whether no image is missing
         #: Where the line of each batch begins, its length, and how many images it has.
         self._places: dict[int, tuple[int, int, int]] = {}
         self._stream: BinaryIO | None = None

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
-from dataclasses import replace
+import warnings
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from os.path import commonpath
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from gtsam_rwhec.errors import TargetError
+import cv2
+import numpy as np
+
+from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.detect.images import decode_gray
+from gtsam_rwhec.detect.pictures import draw_errors, jpeg_of
+from gtsam_rwhec.errors import ImageError, LogError, LogWarning, TargetError
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.logs.mcap_reader import Log
+from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.report_page import report_page
@@ -18,20 +29,294 @@ from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results import Evidence, write_evidence
 from gtsam_rwhec.results.contribution import contribution_of
 from gtsam_rwhec.results.derived import derived_of
+from gtsam_rwhec.results.detection_evidence import (
+    PIECES,
+    RemovedCount,
+    SeenEvidence,
+    counts_of,
+    removed_list,
+    span_of,
+    tracks_of,
+)
 from gtsam_rwhec.results.evidence import Inputs, checksum, input_files, versions
+from gtsam_rwhec.results.image_errors import (
+    RatedView,
+    SeenView,
+    WorstImage,
+    board_of,
+    rated_views,
+    seen_cameras,
+    worst_image,
+    worst_views,
+)
 from gtsam_rwhec.results.linear_model import LinearModel, MeasuredRows
 from gtsam_rwhec.results.proof_spectrum import proof_of
+from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.residual_evidence import residuals_of
+from gtsam_rwhec.results.result_judgement import shortage
 from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
 from gtsam_rwhec.results.weak_poses import weak_directions
-from gtsam_rwhec.rig import rig_text
+from gtsam_rwhec.rig import CameraLink, Rig, RigFrames, rig_text
 from gtsam_rwhec.rig.exported_files import copied_texts
+from gtsam_rwhec.rig.rig_frames import known_cameras
+from gtsam_rwhec.rig.sections import link_of_optical
+from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.corner_answer import with_intrinsics
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.run_log import EVIDENCE_FILE, REPORT_FILE, RESULT_FILE
-from gtsam_rwhec.runs.seen_in_log import Pictures, seen_in_log
-from gtsam_rwhec.runs.solution_frames import frames_of
+from gtsam_rwhec.runs.run_log import (
+    EVIDENCE_FILE,
+    REPORT_FILE,
+    RESULT_FILE,
+    detections_topic,
+    image_name,
+    image_names,
+    records_of,
+)
 from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
+
+#: Of intrinsics that were estimated before detection, and that no refinement from corners made better.
+BOARDS_ALONE = "estimated from views of boards alone, before the poses; standard deviations are not known"
+
+
+def frames_of(solved: Solved) -> RigFrames:
+    """The calibrated frames; a sensor has the name of its frame, and estimated intrinsics if there are any."""
+    rig, refined = solved.rig, solved.refined
+    missing = [name for name in (*rig.calibrated, *rig.targets) if name not in refined.X and name not in refined.Y]
+    frame = {name: rig.frame_of(name) for name in refined.Y}
+    cameras, of_corners = known_cameras(solved.cameras, refined.intrinsics)
+    origins = origins_before_corners(rig, cameras) | of_corners
+    return RigFrames(
+        sensor_carrier=rig.carriers.sensors,
+        target_carrier=rig.carriers.targets,
+        sensors={frame[name]: pose.matrix() for name, pose in refined.Y.items()},
+        targets={name: pose.matrix() for name, pose in refined.X.items()},
+        cameras={frame[name]: camera for name, camera in cameras.items() if name in frame},
+        camera_origins={frame[name]: words for name, words in origins.items() if name in frame},
+        time_offsets_s={frame[o.sensor]: o.offset_s for o in solved.log.time_offsets if o.sensor in frame},
+        topics={frame[n]: s.images for n, s in rig.sensors.items() if s.images is not None and n in frame},
+        links={
+            frame[name]: CameraLink(sensor.link.frame, link_of_optical(sensor.link.T_link_optical))
+            for name, sensor in rig.sensors.items()
+            if sensor.link is not None and name in frame
+        },
+        warnings=warnings_of(solved),
+        left_out={name: shortage(solved.log, name) for name in missing},
+    )
+
+
+def origins_before_corners(rig: Rig, sensors: Iterable[str]) -> dict[str, str]:
+    """Where the intrinsics of sensors are from that state none, as detection used them; the others' are as stated."""
+    return {name: BOARDS_ALONE for name in sensors if rig.sensors[name].stated == "unknown"}
+
+
+def warnings_of(solved: Solved) -> tuple[str, ...]:
+    """Why the frames, or some of them, are not to be used; empty where they are."""
+    if solved.judgement.verdict is Verdict.USE:
+        return ()
+    free = sorted({name for each in solved.refined.free_directions for name in each.frames}, key=natural_key)
+    return (str(solved.judgement), *([f"Not determined: {', '.join(free)}"] if free else []))
+
+
+def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
+    """The corners of detections that are used, or that robust estimation left out, with where the calibration has them.
+
+    By camera; those that were left out are marked as not used.
+    """
+    path = read_carrier_motion(log, solved.rig).trajectory
+    targets = {target.name: target for target in solved.rig.target_list}
+    offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
+    boards = {name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X}
+    wanted = ("", RemovalReason.OUTLIER)
+    is_used = {
+        (pair, stamp): not reason
+        for pair, measured in solved.pairs.items()
+        for stamp, reason in zip(measured.stamps_ns.tolist(), measured.reasons, strict=True)
+        if reason in wanted and pair.target in solved.refined.X
+    }
+    seen: dict[str, list[SeenView]] = defaultdict(list)
+    for sensor in solved.cameras:
+        if sensor not in solved.refined.Y:
+            continue
+        records = [
+            record
+            for record in records_of(log, [detections_topic(sensor)], DetectionRecord)
+            if record.corners_px is not None and (Pair(record.id, sensor), record.stamp_ns) in is_used
+        ]
+        stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
+        A, _ = path.at(stamps + round(1e9 * offsets.get(sensor, 0.0)))
+        for record, T in zip(records, np.linalg.inv(solved.refined.Y[sensor].matrix()) @ A, strict=True):
+            board, X = boards[record.id], solved.refined.X[record.id].matrix()
+            if record.corners_px is None or (record.corner_indices is None and len(record.corners_px) != len(board)):
+                continue
+            corners = board if record.corner_indices is None else board[list(record.corner_indices)]  # a driver's: all
+            used = is_used[Pair(record.id, sensor), record.stamp_ns]
+            seen[sensor].append(SeenView.of(record.corners_px, corners, T, X, record.stamp_ns, record.id, is_used=used))
+    return dict(seen)
+
+
+def camera_of(solved: Solved, sensor: str) -> Camera:
+    """A sensor's camera: with the intrinsics that were estimated, where they were."""
+    found = solved.refined.intrinsics.get(sensor)
+    return solved.cameras[sensor] if found is None else found.camera
+
+
+#: A contact sheet of the page is so wide, pixels; it, and each picture of an image, has at most so many bytes.
+SHEET_WIDTH, SHEET_BYTES, PICTURE_BYTES = 1200, 500_000, 90_000
+#: Where images are not found by their stamps, logs up to this size are gone through for them, bytes.
+MOST_SEARCHED = 300_000_000
+WITHOUT = "the report was made without images."
+#: The stages that remove measurements.
+DETECTION, CLEANING, ROBUST = "detection", "cleaning", "robust estimation"
+_BY_DETECTION = {str(reason) for reason in Rejection}
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Where images are: the log with them, and the contact sheet's file, which may be missing.
+
+    With `may_show` False only the images' names are read.
+    """
+
+    log: Log
+    sheet: Path | None
+    may_show: bool = True
+
+
+def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvidence:
+    """What was seen, of a cleaned log; without `pictures` there are neither images nor their names."""
+    views = seen_views(solved, log)
+    found = solved.refined.reprojection
+    cameras = {sensor: camera_of(solved, sensor) for sensor in views}
+    of_tracks = solved.log.detection.corner_px
+    rated = rated_views(
+        views,
+        cameras,
+        found,
+        lambda target, sensor: of_tracks.get(f"{target}/{sensor}") if found is None else found.corner_px,
+    )
+    topics = {sensor: source.images or "" for sensor, source in solved.rig.sensors.items()}
+    topics |= dict.fromkeys(solved.rig.odometries, "")
+
+    worst = worst_views(rated)
+    images, names, why_not = images_of(pictures, solved.rig, worst)
+
+    def name_of(sensor: str, stamp_ns: int) -> str:
+        return PurePosixPath(image_name(names, topics[sensor], stamp_ns)).name
+
+    counts = removed_of(solved)
+    return SeenEvidence(
+        span_s=span_of(solved.pairs.values())[1],
+        pieces=PIECES,
+        tracks=tracks_of(solved.pairs, stage_of),
+        used=sum(int(measured.used.sum()) for measured in solved.pairs.values()),
+        removed=sum(one.count for one in counts),
+        removed_counts=counts,
+        removed_list=removed_list(solved.pairs, name_of),
+        cameras=seen_cameras(rated, cameras, found),
+        worst=tuple(_drawn(one, name_of(one.sensor, one.view.stamp_ns), images) for one in worst),
+        sheet=_sheet(pictures),
+        no_pictures=why_not,
+    )
+
+
+def stage_of(reason: str) -> str:
+    """The stage that removes measurements for a reason."""
+    if reason in _BY_DETECTION:
+        return DETECTION
+    return ROBUST if reason == RemovalReason.OUTLIER else CLEANING
+
+
+def removed_of(solved: Solved) -> tuple[RemovedCount, ...]:
+    """All that was removed of a log, as its stages counted it."""
+    removed: dict[Pair, dict[str, int]] = {
+        track.pair: {why: count for why, count in track.removed.items() if why != RemovalReason.OUTLIER}
+        for track in solved.log.cleaning.tracks
+    }
+    for one in solved.log.outliers:
+        removed.setdefault(one.pair, {})[RemovalReason.OUTLIER.value] = one.left_out
+    return counts_of(removed.items(), stage_of)
+
+
+def images_of(
+    pictures: Pictures | None, rig: Rig, wanted: Sequence[RatedView]
+) -> tuple[dict[tuple[str, int], ImageRecord], Mapping[str, str], str]:
+    """Images by sensor and stamp, the names of the files that images were, and why there are no images."""
+    if pictures is None:
+        return {}, {}, "the recorded log is not known any more."
+    names = image_names(pictures.log)
+    try:
+        # What is damaged in the log was said when it was read for its detections.
+        with warnings.catch_warnings(action="ignore", category=LogWarning):
+            found, why_not = _wanted_images(pictures.log, rig, wanted) if pictures.may_show else ({}, WITHOUT)
+    except LogError as error:
+        return {}, {}, f"the log with the images cannot be read: {error}"
+    return found, names, why_not
+
+
+def _wanted_images(log: Log, rig: Rig, wanted: Sequence[RatedView]) -> tuple[dict[tuple[str, int], ImageRecord], str]:
+    """Images by sensor and stamp, and why there are none."""
+    stamps: dict[str, set[int]] = defaultdict(set)
+    for one in wanted:
+        topic = rig.sensors[one.sensor].images
+        if topic is not None:
+            stamps[topic].add(one.view.stamp_ns)
+    if not stamps:
+        return {}, "no sensor has images: its detections come from a driver." if wanted else ""
+    there = {topic.name for topic in log.topics() if topic.count}
+    found = _found(log, {topic: of for topic, of in stamps.items() if topic in there})
+    sensor_of = {source.images: name for name, source in rig.sensors.items()}
+    images = {(sensor_of[topic], stamp): image for (topic, stamp), image in found.items()}
+    return images, "" if images else "the log that was calibrated has no images (any more)."
+
+
+def _found(log: Log, stamps: Mapping[str, set[int]]) -> dict[tuple[str, int], ImageRecord]:
+    """Images by topic and stamp: where they were logged at their stamps, else by going through a log that is small."""
+    found: dict[tuple[str, int], ImageRecord] = {}
+    if not stamps:
+        return found
+    total = sum(map(len, stamps.values()))
+    at_once = log.records_logged_at(stamps, set().union(*stamps.values()))
+    is_small = sum(file.size for file in log.files) <= MOST_SEARCHED
+    for records in (at_once, log.records(stamps) if is_small else ()):
+        for record in records:
+            if isinstance(record, ImageRecord) and record.stamp_ns in stamps[record.topic]:
+                found[record.topic, record.stamp_ns] = record
+            if len(found) == total:
+                return found
+    return found
+
+
+def _drawn(one: RatedView, name: str, images: Mapping[tuple[str, int], ImageRecord]) -> WorstImage:
+    """An image's record, with its picture if it can be decoded."""
+    record = worst_image(one, name)
+    image = images.get((one.sensor, one.view.stamp_ns))
+    if image is None:
+        return record
+    try:
+        gray = decode_gray(image)
+    except ImageError:  # detection read it, so its bytes have changed since
+        return record
+    drawn = draw_errors(gray, one.view.pixels, one.errors.px)
+    return record.model_copy(update={"magnified": drawn.magnified, "picture": jpeg_of(drawn.picture, PICTURE_BYTES)})
+
+
+def _sheet(pictures: Pictures | None) -> bytes | None:
+    if pictures is None or pictures.sheet is None or not pictures.may_show:
+        return None
+    return small_sheet(pictures.sheet)
+
+
+def small_sheet(path: Path) -> bytes | None:
+    """The contact sheet for a page, as JPEG; None where there is no sheet."""
+    if not path.is_file():
+        return None
+    sheet = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
+    if sheet is None:
+        return None
+    height = max(1, round(sheet.shape[0] * SHEET_WIDTH / sheet.shape[1]))
+    if sheet.shape[1] > SHEET_WIDTH:
+        sheet = cv2.resize(sheet, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return jpeg_of(np.asarray(sheet, dtype=np.uint8), SHEET_BYTES)
 
 
 def evidence_of_log(
@@ -39,15 +324,8 @@ def evidence_of_log(
 ) -> Evidence:
     """What a report shows beside a calibration from a log.
 
-    Parameters
-    ----------
-    calibrated : Calibrated
-    log : Log
-        The cleaned log, which has the corners.
-    sources : sequence of Path
-        The files that the measurements come from.
-    pictures : Pictures, optional
-        Where images are; without it the evidence has none.
+    The cleaned `log` has the corners, `sources` are the files that the measurements come from, and `pictures` is where
+    images are; without it the evidence has none.
     """
     inputs = Inputs(
         files=input_files(sources),
@@ -96,12 +374,7 @@ def write_report(
 ) -> None:
     """Write ``evidence.json`` and ``report.html`` of a calibration from a log, whose ``result.json`` is `result`.
 
-    Page and evidence have images if `pictures` may be shown.
-
-    Raises
-    ------
-    FileFormatError
-        A file cannot be written.
+    Page and evidence have images if `pictures` may be shown. Raises `FileFormatError` if a file cannot be written.
     """
     (progress or silent)("writing the report")
     evidence = evidence_of_log(calibrated, log, sources, pictures)

@@ -17,20 +17,10 @@ from gtsam_rwhec.files.whole_files import why_not_writable, write_atomically
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.runs.kept_detections import KeptDetections, differences, kept_inputs
-from gtsam_rwhec.runs.run_log import (
-    CALIBRATION_LOG,
-    DETECTED_LOG,
-    EVIDENCE_FILE,
-    RECORDED_LOG,
-    REPORT_FILE,
-    RESULT_FILE,
-    SEEN_SHEET,
-)
+from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, EVIDENCE_FILE, RECORDED_LOG, REPORT_FILE, RESULT_FILE, SEEN_SHEET
 
 #: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
-LEFT = (CALIBRATION_LOG, REPORT_FILE, RESULT_FILE, EVIDENCE_FILE, *FILES, SEEN_SHEET)
-#: With the log that it has during the work.
-WRITTEN = (*LEFT, DETECTED_LOG)
+WRITTEN = (CALIBRATION_LOG, REPORT_FILE, RESULT_FILE, EVIDENCE_FILE, *FILES, SEEN_SHEET)
 
 
 def is_written(name: str) -> bool:
@@ -108,20 +98,13 @@ class _Written(BaseModel):
 
 
 class OutputFolder:
-    """The output folder of a calibration while it is at work. `output_folder` makes it.
-
-    Attributes
-    ----------
-    path : Path
-    log : str
-        The name of the log, or of the folder, that is calibrated.
-    begins_anew : bool
-        Whether an unfinished run of other inputs is replaced.
-    """
+    """The output folder of a calibration while it is at work. `output_folder` makes it."""
 
     def __init__(self, path: Path, log: str, before: _Written | None, *, replace: bool) -> None:
         self.path = path
+        #: The name of the log, or of the folder, that is calibrated.
         self.log = log
+        #: Whether an unfinished run of other inputs is replaced.
         self.begins_anew = replace or (before is not None and before.state != "unfinished")
         self._before = before
         self._has_begun = False
@@ -140,10 +123,7 @@ class OutputFolder:
     def kept_detections(self, inputs: dict[str, str], total: int) -> KeptDetections:
         """The detections that an interrupted run kept, if its inputs were the same; else none.
 
-        Raises
-        ------
-        LogError
-            The folder has an unfinished run of other inputs, and nobody asked to replace it.
+        Raises `LogError` if the folder has an unfinished run of other inputs, and nobody asked to replace it.
         """
         file = self.path / DETECTIONS
         earlier = kept_inputs(file)
@@ -162,8 +142,8 @@ class OutputFolder:
             self._kept.go_on()
         return self._kept
 
-    def end(self, error: BaseException | None, sources: Sequence[Path]) -> None:
-        """Bring the list up to date, and remove what only an unfinished run needs; `sources` stay."""
+    def end(self, error: BaseException | None) -> None:
+        """Bring the list up to date, and remove what only an unfinished run needs."""
         if self._kept is not None:
             self._kept.close()
         if isinstance(error, KeyboardInterrupt):
@@ -173,9 +153,7 @@ class OutputFolder:
         ):  # the error itself is said, not what follows it
             self._bring_list_up_to_date(error)
         if error is None:
-            for name in (DETECTED_LOG, DETECTIONS):
-                if not _is_one_of(self.path / name, sources):
-                    (self.path / name).unlink(missing_ok=True)
+            (self.path / DETECTIONS).unlink(missing_ok=True)
 
     def _bring_list_up_to_date(self, error: BaseException | None) -> None:
         if self._has_begun:
@@ -198,21 +176,12 @@ class OutputFolder:
 def output_folder(path: str | Path, log: str, *, replace: bool, sources: Sequence[Path] = ()) -> Iterator[OutputFolder]:
     """Calibrate in the block: into a folder that is free for it, whose list is brought up to date at the end.
 
-    Parameters
-    ----------
-    path
-        It is made if it does not exist, and removed if an error ends the block before anything was written.
-    log : str
-        Name of the log or folder that is calibrated.
-    replace : bool
-        Whether a finished calibration, or an unfinished run of other inputs, is replaced.
-    sources : sequence of Path
-        The files of the log: one that is in the folder is not foreign.
+    The folder is made if it does not exist, and removed if an error ends the block before anything was written. `log`
+    is the name of what is calibrated, `sources` are its files: one that is in the folder is not foreign. With `replace`
+    a finished calibration, or an unfinished run of other inputs, is replaced.
 
-    Raises
-    ------
-    LogError
-        The folder is not free, another run is at work in it, or files cannot be written into it. Nothing was changed.
+    Raises `LogError` if the folder is not free, another run is at work in it, or files cannot be written into it;
+    nothing was changed.
     """
     path = Path(path)
     before = _check_is_free(path, log, replace=replace, sources=sources)
@@ -231,7 +200,7 @@ def output_folder(path: str | Path, log: str, *, replace: bool, sources: Sequenc
                 error = caught
                 raise
             finally:
-                output.end(error, sources)
+                output.end(error)
     finally:
         with suppress(OSError):  # what has files in it stays
             for folder in made:

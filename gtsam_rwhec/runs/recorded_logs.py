@@ -96,20 +96,8 @@ def write_folder_log(
 ) -> tuple[int, int]:
     """Write the images and poses of a folder as one log, for the same rig file.
 
-    Parameters
-    ----------
-    folder
-        Where the paths of the rig file start.
-    rig : Rig
-        The poses of its carriers are ``frames``, and its sensors have images and poses.
-    path
-        The MCAP file to write.
-    progress : callable, optional
-
-    Returns
-    -------
-    int, int
-        How many images and how many poses were written.
+    The paths of the rig file start from `folder`; the poses of its carriers are ``frames``, and its sensors have images
+    and poses. Returns how many images and how many poses were written.
 
     Raises
     ------
@@ -240,18 +228,10 @@ BASE, HAND, CAMERA, TARGET = "base", "hand", "camera", "target"
 
 @dataclass(frozen=True, eq=False)
 class SamplesProblem:
-    """The problem of a file of samples.
+    """The problem of a file of samples."""
 
-    Attributes
-    ----------
-    problem : Problem
-        A X = Y B of one camera and one target.
-    said : str
-        How the file was read, and why.
-    """
-
-    problem: Problem
-    said: str
+    problem: Problem  #: A X = Y B of one camera and one target
+    said: str  #: how the file was read, and why
 
 
 def is_file_of_samples(path: object, rig: Rig | None) -> bool:
@@ -302,10 +282,7 @@ def _problem(samples: HandEyeSamples, on_hand: bool) -> Problem:
 def samples_of_rig(path: str | Path, rig: Rig) -> tuple[HandEyeSamples, bool]:
     """The samples of a file, and whether the rig file has the camera on the hand.
 
-    Raises
-    ------
-    LogError
-        As `read_hand_eye_samples`; the rig file has more sensors or targets; or the file says another setup than it.
+    Raises `LogError` as `read_hand_eye_samples`; or the rig file has more sensors or targets, or another setup.
     """
     source, (parent, child) = rig.carriers.poses, rig.carriers.poses.parent_and_child
     if len(rig.sensors) != 1 or len(rig.targets) != 1:
@@ -334,25 +311,8 @@ def samples_of_rig(path: str | Path, rig: Rig) -> tuple[HandEyeSamples, bool]:
 def write_samples_log(path: str | Path, rig: Rig, out_path: str | Path) -> str:
     """Write samples as a log of the carriers' poses and the detections of the rig file's one sensor and target.
 
-    Parameters
-    ----------
-    path
-        The file of samples.
-    rig : Rig
-        Its carriers' poses are ``frames``: the file's robot poses are T_parent_child. Its sensor has ``detections``,
-        the name of the topic to write.
-    out_path
-        The MCAP file to write.
-
-    Returns
-    -------
-    str
-        How the file was read, in words.
-
-    Raises
-    ------
-    LogError
-        As `samples_of_rig`.
+    The rig file's carriers have ``frames``: the file's robot poses are T_parent_child. Its sensor has ``detections``,
+    the name of the topic to write. Returns how the file was read, in words. Raises as `samples_of_rig`.
     """
     samples, on_hand = samples_of_rig(path, rig)
     parent, child = rig.carriers.poses.parent_and_child

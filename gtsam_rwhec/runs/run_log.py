@@ -145,27 +145,13 @@ def _plain(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class LogMetadata:
-    """The metadata of a log of detections or of pairs.
+    """What the stages of a log say of themselves."""
 
-    Attributes
-    ----------
-    rig : Rig
-        The rig file that the last stage worked with.
-    cameras : dict of sensor to Camera
-        Intrinsics that detection used.
-    detection : DetectionReport
-        The report of detection.
-    cleaning : CleaningReport or None
-        The report of cleaning; None before cleaning.
-    image_names : dict of str to str
-        Of the files that a folder's images were, as `image_names` has them.
-    """
-
-    rig: Rig
-    cameras: Mapping[str, Camera]
+    rig: Rig  #: that the last stage worked with
+    cameras: Mapping[str, Camera]  #: the intrinsics that detection used, by sensor
     detection: DetectionReport
-    cleaning: CleaningReport | None = None
-    image_names: Mapping[str, str] = field(default_factory=dict)
+    cleaning: CleaningReport | None = None  #: None before cleaning
+    image_names: Mapping[str, str] = field(default_factory=dict)  #: of a folder's files, as `image_names` has them
 
     def entries(self) -> dict[str, dict[str, str]]:
         """The metadata records of a log, by name."""
@@ -195,17 +181,9 @@ class LogMetadata:
 class RunLog(Log):
     """A log with what the stages found, in memory: it reads as the file that is written of it.
 
-    Parameters
-    ----------
-    recorded : Log
-        It stays open, and is read for all that no stage of this run found.
-    kept : collection of str
-        The topics of `recorded` that count; those of a stage that is run again do not.
-    stages : LogMetadata
-    found : mapping of str to sequence of Record
-        What the stages of this run found, by topic, in the order of time.
-    detections : mapping of str to sequence of DetectionRecord
-        The detections among it by sensor, as they are written.
+    `recorded` stays open, and is read for all that no stage of this run found; only its topics `kept` count, not those
+    of a stage that is run again. `found` has what was found by topic, in the order of time, and `detections` the
+    detections by sensor as they are written.
     """
 
     def __init__(
@@ -318,13 +296,7 @@ def _as_read(topic: str, records: Sequence[DetectionRecord]) -> list[DetectionRe
 
 
 def read_metadata(log: Log) -> LogMetadata:
-    """Read the metadata that the stages so far wrote.
-
-    Raises
-    ------
-    LogError
-        No stage wrote the log, or its metadata is damaged.
-    """
+    """The metadata that the stages so far wrote; `LogError` if there is none, or it is damaged."""
     if isinstance(log, RunLog):
         return log.stages
     rig = read_embedded_rig(log)
@@ -354,13 +326,7 @@ def read_embedded_rig(log: Log) -> Rig:
 
 
 def read_cameras(log: Log) -> dict[str, Camera]:
-    """The intrinsics that detection used, by sensor.
-
-    Raises
-    ------
-    LogError
-        The intrinsics are damaged.
-    """
+    """The intrinsics that detection used, by sensor; `LogError` if they are damaged."""
     if isinstance(log, RunLog):
         return dict(log.stages.cameras)
     where = f"{log.files[0].path}, metadata {CAMERAS_METADATA}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,9 +17,9 @@ from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS, ENOUGH, EstimatedInt
 from gtsam_rwhec.detect.board_layout import plane_coordinates
 from gtsam_rwhec.detect.detections import Detection, Rejection, layouts_over_track
 from gtsam_rwhec.detect.detector import Detector
-from gtsam_rwhec.detect.images import Size, stated_size
+from gtsam_rwhec.detect.images import Size
 from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images
-from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogError, LogWarning
+from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogError
 from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, Log
@@ -28,8 +27,14 @@ from gtsam_rwhec.logs.records import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.sections import Intrinsics
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.image_detections import check_usable, detections_of_sensor, message_count
 from gtsam_rwhec.runs.image_pictures import write_contact_sheet
+from gtsam_rwhec.runs.sensor_detections import (
+    check_usable,
+    detections_of_sensor,
+    images_of_topic,
+    message_count,
+    usual_size,
+)
 from gtsam_rwhec.runs.unread_targets import likely_causes
 
 #: Lens models without rays for more than this share of the image are warned of.
@@ -133,8 +138,6 @@ def _numbers(camera: Camera) -> tuple[object, ...]:
 
 #: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
 FIRST, TIMES = 16, 4
-#: Images have the size that most of the first so many have.
-FOR_SIZE = 20
 #: From fewer views than this a first camera is made with those too that the lens bends too much for a pinhole.
 FEW = 6
 #: The focal length of a usual lens over the width.
@@ -164,7 +167,13 @@ def estimate_intrinsics(
     for name, sensor in rig.sensors.items():
         if sensor.images is None or sensor.intrinsics is None or sensor.intrinsics.estimate is None:
             continue
-        size = _image_size(log, rig, name, sensor.images)
+        size = usual_size(log, sensor.images)
+        if size is None:
+            place = rig.source.place(("sensors", name, "intrinsics"))
+            raise LogError(
+                f"{place}: intrinsics are to be estimated, and {log.files[0].path}, topic {sensor.images} has no image "
+                "whose size can be read"
+            )
         result = _of_images(log, rig, name, sensor.images, size, sensor.intrinsics.estimate, workers, progress)
         if isinstance(result, NotEstimated):
             failed[name] = result
@@ -197,8 +206,8 @@ def refuse_not_estimated(
         name: detections_of_sensor(log, rig, name, [_without_poses(image) for image in of.images], motion)
         for name, of in failed.items()
     }
-    check_usable(log, rig, found)
     cameras = {name: of.camera for name, of in failed.items()}
+    check_usable(log, rig, found, cameras)
     has_sheet = sheet is not None and write_contact_sheet(Path(sheet), log, rig, cameras, found)
     said = []
     for name, of in failed.items():
@@ -225,7 +234,7 @@ def _of_images(
         looked_at: list[int] = []
 
         def images() -> Iterator[ImageRecord]:
-            for i, record in enumerate(_records(log, topic)):
+            for i, record in enumerate(images_of_topic(log, topic)):
                 if i in which:
                     looked_at.append(i)
                     yield record
@@ -324,31 +333,3 @@ def _camera(size: Size) -> Camera:
     width, height = size
     K = [[USUAL * width, 0.0, 0.5 * (width - 1)], [0.0, USUAL * width, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
     return Camera.of(width, height, "pinhole", K, (), "in place of the camera")
-
-
-def _image_size(log: Log, rig: Rig, sensor: str, topic: str) -> Size:
-    """The size (width, height) of most of a topic's first images."""
-    sizes: Counter[Size] = Counter()
-    for record in _records(log, topic):
-        size = stated_size(record.data) if record.is_compressed else (record.width or 0, record.height or 0)
-        if size is not None and min(size) > 0:
-            sizes[size] += 1
-        if sizes.total() == FOR_SIZE:
-            break
-    if not sizes:
-        place = rig.source.place(("sensors", sensor, "intrinsics"))
-        raise LogError(
-            f"{place}: intrinsics are to be estimated, and {log.files[0].path}, topic {topic} has no image whose size "
-            "can be read"
-        )
-    return sizes.most_common(1)[0][0]
-
-
-def _records(log: Log, topic: str) -> Iterator[ImageRecord]:
-    """The images of a topic. Detection says later which messages cannot be read."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LogWarning)
-        for record in log.records([topic]):
-            if not isinstance(record, ImageRecord):
-                raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
-            yield record

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +23,8 @@ from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.image_detections import SensorDetections
 from gtsam_rwhec.runs.run_log import RECORDED_LOG
+from gtsam_rwhec.runs.sensor_detections import SensorDetections
 
 #: At most this number of images is looked at, of several targets at least `LEAST` for each; nothing more is tried after
 #: this number of seconds of the processor.
@@ -98,15 +99,20 @@ def _some_images(log: Log, topic: str, camera: Camera, of_sensor: SensorDetectio
         if count > 0:
             places = np.linspace(0, len(members) - 1, count + 2)[1:-1] if count < len(members) else np.arange(count)
             chosen += [members[i] for i in places.round().astype(int).tolist()]
-    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in chosen}
+    return _decoded(log, topic, camera, of_sensor, chosen)
+
+
+def _decoded(
+    log: Log, topic: str, camera: Camera, of_sensor: SensorDetections, stamps: Sequence[int]
+) -> dict[int, Gray]:
+    """The images of some stamps, in their order, that can be decoded."""
+    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in stamps}
     images = {}
     for record in log.records_logged_at([topic], wanted.values()):
         if isinstance(record, ImageRecord) and record.stamp_ns in wanted:
-            try:
+            with suppress(ImageError):  # its fault is in the report
                 images[record.stamp_ns] = decode_gray(record, (camera.width, camera.height))
-            except ImageError:
-                continue  # its fault is in the report
-    return {stamp: images[stamp] for stamp in chosen if stamp in images}
+    return {stamp: images[stamp] for stamp in stamps if stamp in images}
 
 
 def _look(
@@ -380,7 +386,8 @@ def blurred_images(
         looked_at = _spread(unread if hides else whole)
         if len(looked_at) < FEWEST:
             continue
-        blur = [motion_blur_px(gray) for gray in _images(log, rig, sensor, cameras[sensor], of_sensor, looked_at)]
+        topic = str(rig.sensors[sensor].images)
+        blur = list(map(motion_blur_px, _decoded(log, topic, cameras[sensor], of_sensor, looked_at).values()))
         least_px = WIDE_PX if hides else WIDE_AND_READ_PX
         moved = [(wide, narrow) for wide, narrow in blur if wide > least_px and wide > WIDER * narrow]
         if len(moved) >= max(2, BLURRED_SHARE * len(blur)):
@@ -402,18 +409,3 @@ def _spread(stamps: list[int]) -> list[int]:
         return []
     places = np.unique(np.linspace(0, len(stamps) - 1, LOOKED_AT).round().astype(int))
     return [stamps[place] for place in places.tolist()]
-
-
-def _images(
-    log: Log, rig: Rig, sensor: str, camera: Camera, of_sensor: SensorDetections, stamps: list[int]
-) -> list[Gray]:
-    """The images of some stamps that can be decoded."""
-    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in stamps}
-    images = []
-    for record in log.records_logged_at([str(rig.sensors[sensor].images)], wanted.values()):
-        if isinstance(record, ImageRecord) and record.stamp_ns in wanted:
-            try:
-                images.append(decode_gray(record, (camera.width, camera.height)))
-            except ImageError:
-                continue  # its fault is in the report
-    return images

@@ -18,12 +18,11 @@ from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, export_all
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import check_image_options, detected
-from gtsam_rwhec.runs.image_detections import image_count
 from gtsam_rwhec.runs.image_pictures import has_images
 from gtsam_rwhec.runs.kept_detections import inputs_of
-from gtsam_rwhec.runs.log_evidence import write_report
+from gtsam_rwhec.runs.log_evidence import Pictures, frames_of, write_report
 from gtsam_rwhec.runs.output_folder import (
-    LEFT,
+    WRITTEN,
     OutputFolder,
     check_is_not_read,
     list_written,
@@ -50,14 +49,13 @@ from gtsam_rwhec.runs.run_log import (
     read_embedded_rig,
     read_metadata,
 )
-from gtsam_rwhec.runs.seen_in_log import Pictures
+from gtsam_rwhec.runs.sensor_detections import image_count
 from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files
-from gtsam_rwhec.runs.solution_frames import frames_of
 from gtsam_rwhec.runs.solved_log import read_solved, write_solved
 from gtsam_rwhec.runs.solving_stage import Calibrated, Solved, solve_log
 
 #: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
-OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
+OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in WRITTEN), *FOLDERS]))
 
 
 @dataclass(frozen=True)

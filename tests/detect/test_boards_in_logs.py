@@ -18,8 +18,8 @@ from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.image_detections import detect_in_log
 from gtsam_rwhec.runs.recorded_logs import write_folder_log
+from gtsam_rwhec.runs.sensor_detections import detect_in_log
 from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics, read_intrinsics
 
 BOARD = Checkerboard("board", 5, 3, 0.03)

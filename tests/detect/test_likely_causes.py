@@ -18,7 +18,7 @@ from gtsam_rwhec.logs import DetectionRecord
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.detection_stage import detect_source
-from gtsam_rwhec.runs.image_detections import SensorDetections, of_size
+from gtsam_rwhec.runs.sensor_detections import SensorDetections, of_size
 from gtsam_rwhec.runs.unread_targets import of_rejections
 
 CAMERA = Camera.of(640, 480, "", [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], (), "test")
@@ -125,15 +125,19 @@ def test_what_rejections_say_themselves(reason: str, words: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sizes", "words"),
+    ("size", "of_intrinsics", "words"),
     [
-        ("640 x 480 pixels, but the intrinsics are for 1280 x 960", "multiply fx, fy, cx and cy by 0.5 and write size"),
-        ("480 x 640 pixels, but the intrinsics are for 640 x 480", "Width and height are exchanged"),
-        ("640 x 400 pixels, but the intrinsics are for 640 x 480", "what was cut out of an image has another centre"),
-        ("60 bytes of a PNG file that is cut short", ""),
+        ((640, 480), (1280, 960), "multiply fx, fy, cx and cy by 0.5 and write size"),
+        ((480, 640), (640, 480), "Width and height are exchanged"),
+        ((640, 400), (640, 480), "what was cut out of an image has another centre"),
+        ((640, 480), (640, 480), ""),
+        (None, (640, 480), ""),
     ],
 )
-def test_images_of_another_size_than_the_intrinsics(sizes: str, words: str) -> None:
-    said = of_size(rig("type: tag, family: tag36h11, id: 7, size_m: 0.15"), "camera", f"image/0.png: {sizes}")
+def test_images_of_another_size_than_the_intrinsics(
+    size: tuple[int, int] | None, of_intrinsics: tuple[int, int], words: str
+) -> None:
+    camera = Camera.of(*of_intrinsics, "pinhole", [[500, 0, 320], [0, 500, 240], [0, 0, 1]], (), "test")
+    said = of_size(rig("type: tag, family: tag36h11, id: 7, size_m: 0.15"), "camera", size, camera)
     assert words in said
     assert bool(words) == ("rig.yaml, line 3: sensors.camera.intrinsics" in said)

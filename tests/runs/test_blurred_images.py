@@ -12,7 +12,7 @@ import pytest
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.image_detections import LookedAt, SensorDetections
+from gtsam_rwhec.runs.sensor_detections import LookedAt, SensorDetections
 from gtsam_rwhec.runs.unread_targets import blurred_images
 
 RIG = parse_rig(

@@ -19,7 +19,7 @@ from gtsam_rwhec.runs.output_folder import (
 
 LOG = "run.mcap"
 ALL = (
-    "result.json", "calibration.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro",
+    "result.json", "calibration.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro",
     "camchain.yaml", "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_0.yaml",
 )  # fmt: skip
 
@@ -139,8 +139,8 @@ def test_an_unfinished_run_is_gone_on_with(tmp_path: Path) -> None:
 
 
 def test_who_mended_the_inputs_of_a_run_that_failed_need_not_ask(tmp_path: Path) -> None:
-    interrupted(tmp_path, "detected.mcap", ends_with=LogError("a wrong rig file"))
-    assert contents(tmp_path).keys() == {LIST_FILE, "detected.mcap"}
+    interrupted(tmp_path, "tf.yaml", ends_with=LogError("a wrong rig file"))
+    assert contents(tmp_path).keys() == {LIST_FILE, "tf.yaml"}
     run(tmp_path, *ALL, log="other.mcap")
 
 

@@ -12,9 +12,9 @@ from intrinsics_samples import CAMCHAIN, ROS
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, RwhecError
 from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.runs.log_evidence import BOARDS_ALONE, origins_before_corners
 from gtsam_rwhec.runs.recorded_logs import write_folder_log
 from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files, read_intrinsics
-from gtsam_rwhec.runs.solution_frames import BOARDS_ALONE, origins_before_corners
 
 FILES = {
     "chain.yaml": CAMCHAIN,

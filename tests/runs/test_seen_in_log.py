@@ -11,7 +11,7 @@ import synthetic_logs as made
 
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.results.image_errors import CornerErrors, RatedView, SeenView
-from gtsam_rwhec.runs.seen_in_log import (
+from gtsam_rwhec.runs.log_evidence import (
     CLEANING,
     DETECTION,
     ROBUST,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -13,11 +13,13 @@ import numpy as np
 from gtsam_rwhec.cameras.board_turns import Turns, choose_turns, turn_between
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.plane_ambiguity import choose_over_time
+from gtsam_rwhec.cameras.target_poses import plane_poses
 from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target
 from gtsam_rwhec.detect.detections import Rejection, layouts_over_track, turned_detection
 from gtsam_rwhec.detect.detector import Detection, Detector
+from gtsam_rwhec.detect.images import Size, stated_size
 from gtsam_rwhec.detect.many_images import DetectedImage, detect_in_images, measured_corner_px
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import CameraError, LogError, LogWarning
 from gtsam_rwhec.files.progress import Counted, Progress, Remark
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
@@ -26,6 +28,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA, detections_topic, image_key
+from gtsam_rwhec.runs.tracks import target_of
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,8 @@ def _counts(sensor: str, records: list[DetectionRecord]) -> Iterator[TrackCount]
         yield TrackCount(target=target, sensor=sensor, used=removed.pop("", 0), removed=dict(removed))
 
 
+#: Images have the size that most of the first so many have.
+FOR_SIZE = 20
 #: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
 
@@ -152,7 +157,7 @@ def _detected(
         kept.finish()
 
 
-def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> None:
+def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections], cameras: Mapping[str, Camera]) -> None:
     """Raise `LogError` if no image of a sensor can be used, with what is wrong with the first, and what to do."""
     for sensor, of_sensor in found.items():
         topic, faults = rig.sensors[sensor].images, of_sensor.faults
@@ -160,29 +165,50 @@ def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> N
             why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
             raise LogError(
                 f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
-                f"be used; {why}{of_size(rig, sensor, why)}"
+                f"be used; {why}{of_size(rig, sensor, usual_size(log, topic), cameras[sensor])}"
             )
 
 
-def of_size(rig: Rig, sensor: str, fault: str) -> str:
-    """What to do where images have another size than the intrinsics are for; empty for another fault."""
-    sizes = re.search(r"(\d+) x (\d+) pixels, but the intrinsics are for (\d+) x (\d+)", fault)
-    if sizes is None:
+def of_size(rig: Rig, sensor: str, size: Size | None, camera: Camera) -> str:
+    """What to do where images have another size (width, height) than the intrinsics are for, else empty."""
+    if size is None or size == (camera.width, camera.height):
         return ""
-    width, height, of_width, of_height = map(int, sizes.groups())
     place = rig.source.place(("sensors", sensor, "intrinsics"))
-    if abs(width * of_height - height * of_width) <= max(of_width, of_height):
+    (width, height), most = size, max(camera.width, camera.height)
+    if abs(width * camera.height - height * camera.width) <= most:
         return (
             f". If these images are the whole view in another resolution, multiply fx, fy, cx and cy by "
-            f"{width / of_width:.6g} and write size: [{width}, {height}]; if they were cut out, or are of another "
+            f"{width / camera.width:.6g} and write size: [{width}, {height}]; if they were cut out, or are of another "
             f"camera, give the intrinsics of these images ({place})"
         )
-    if abs(width * of_width - height * of_height) <= max(of_width, of_height):
+    if abs(width * camera.width - height * camera.height) <= most:
         return (
             f". Width and height are exchanged: the images were turned by a quarter, or size is written the wrong way "
             f"round. Give images as the camera takes them, and size: [width, height] ({place})"
         )
     return f". Give the intrinsics of these images ({place}): what was cut out of an image has another centre"
+
+
+def usual_size(log: Log, topic: str) -> Size | None:
+    """The size (width, height) of most of a topic's first images; None where none says it."""
+    sizes: Counter[Size] = Counter()
+    for record in images_of_topic(log, topic):
+        size = stated_size(record.data) if record.is_compressed else (record.width or 0, record.height or 0)
+        if size is not None and min(size) > 0:
+            sizes[size] += 1
+        if sizes.total() == FOR_SIZE:
+            break
+    return sizes.most_common(1)[0][0] if sizes else None
+
+
+def images_of_topic(log: Log, topic: str) -> Iterator[ImageRecord]:
+    """The images of a topic. Detection says later which messages cannot be read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LogWarning)
+        for record in log.records([topic]):
+            if not isinstance(record, ImageRecord):
+                raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
+            yield record
 
 
 def detections_of_sensor(
@@ -341,3 +367,106 @@ def image_count(log: Log, rig: Rig) -> int:
 def message_count(log: Log, topic: str | None) -> int:
     """How many messages a topic has, with those that cannot be read."""
     return sum(t.count for t in log.topics() if t.name == topic)
+
+
+#: A driver's corners are assumed to have this standard deviation (pixels), which drivers do not state. If the noise is
+#: estimated, only the proportions between covariances count.
+CORNER_PX = 0.1
+#: Two sizes are the same if they differ by less than this share: some messages have them in single precision.
+SAME_SIZE = 1e-4
+
+
+def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | None) -> SensorDetections:
+    """Read the detections of a sensor from the topic of its driver.
+
+    With intrinsics, poses are computed from the corners and the rig file's sizes; the driver may have used other
+    sizes. The corners of a plane fit two poses. The one nearer to the driver's pose is taken, or, without a driver's
+    pose, the one with the smaller reprojection error. Without intrinsics, the driver's poses and sizes are taken.
+
+    Raises `LogError` if the topic is missing or has no detections, or if the driver made poses with a size other than
+    the rig file's; `StampError` as `check_order`; `CameraError` if there are neither poses nor intrinsics.
+    """
+    source = rig.sensors[sensor]
+    assert source.detections is not None
+    result: list[DetectionRecord] = []
+    targets: list[Target] = []
+    strangers: Counter[tuple[str, str]] = Counter()
+    messages: dict[tuple[int, int], None] = {}
+    for record in log.records([source.detections]):
+        if not isinstance(record, DetectionRecord):
+            raise LogError(f"topic {source.detections} has no detections but {type(record).__name__}s")
+        messages[record.logged_ns, record.stamp_ns] = None
+        target = target_of(record, rig.target_list)
+        if target is None:
+            strangers[record.family or "tag", record.id] += 1
+            continue
+        result.append(_as_told(record, target, camera, sensor))
+        targets.append(target)
+    check_order(np.array([stamp for _, stamp in messages], dtype=np.int64), f"topic {source.detections}")
+    if camera is not None:
+        result = _by_corners(result, targets, camera)
+    return SensorDetections(result, message_count(log, source.detections), strangers)
+
+
+def _as_told(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
+    """The driver's record with the rig file's names and sizes, and corners in our order if poses come from them."""
+    driver_m = record.size_m
+    record = replace(record, id=target.name, family=target.family, size_m=target.length_m)
+    if _has_corners(record, camera):
+        assert record.corners_px is not None
+        # The refinement from corners reads them too.
+        return replace(record, corners_px=_in_our_order(record.corners_px))
+    if record.T_camera_tag is None:
+        raise CameraError(
+            f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver gives no pose of {target.name}, and "
+            f"sensor {sensor} has no intrinsics from which to make one"
+        )
+    if driver_m is not None and not np.isclose(driver_m, target.length_m, rtol=SAME_SIZE, atol=0.0):
+        raise LogError(
+            f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver made its pose of {target.name} with a "
+            f"size of {driver_m:g} m, and the rig file says {target.length_m:g} m. Give the driver's size in the "
+            f"rig file, or the intrinsics of sensor {sensor}: with them poses are computed from corners"
+        )
+    return record
+
+
+def _has_corners(record: DetectionRecord, camera: Camera | None) -> bool:
+    return camera is not None and record.corners_px is not None and len(record.corners_px) == 4
+
+
+def _by_corners(records: list[DetectionRecord], targets: list[Target], camera: Camera) -> list[DetectionRecord]:
+    """The records with poses from their corners, all at once; those without corners stay as they are."""
+    at = [i for i, record in enumerate(records) if _has_corners(record, camera)]
+    corners_px = [records[i].corners_px for i in at]
+    poses = plane_poses(camera, [targets[i].corners() for i in at], corners_px, corner_px=CORNER_PX)  # type: ignore[arg-type]
+    result = list(records)
+    for row, i in enumerate(at):
+        T, covariance = poses.T[row], poses.covariance[row]
+        which = _nearer(T, records[i].T_camera_tag)
+        if not np.isfinite(T[which]).all() or not np.isfinite(covariance[which]).all():
+            result[i] = replace(records[i], T_camera_tag=None, covariance=None, reason=Rejection.NO_POSE)
+            continue
+        result[i] = replace(
+            records[i],
+            T_camera_tag=T[which],
+            covariance=covariance[which],
+            reprojection_px=float(poses.reprojection_px[row, which]),
+        )
+    return result
+
+
+def _nearer(T: Array, of_driver: Array | None) -> int:
+    """Which of two poses (2, 4, 4) is nearer to the driver's; without one the first, which fits better.
+
+    Only the direction of the normal tells the two poses apart: drivers choose a tag's axes as they like.
+    """
+    if of_driver is None:
+        return 0
+    return int(np.argmax([abs(float(one[:3, 2] @ of_driver[:3, 2])) for one in np.nan_to_num(T)]))
+
+
+def _in_our_order(corners_px: np.ndarray) -> np.ndarray:
+    """Put corners clockwise in the image, from the driver's first: the AprilTag library goes counterclockwise."""
+    first, second = corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]
+    clockwise = first[0] * second[1] - first[1] * second[0] > 0.0  # with y down
+    return corners_px if clockwise else corners_px[::-1]
