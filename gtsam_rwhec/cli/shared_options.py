@@ -48,7 +48,6 @@ SensorsOption = Annotated[
     str, typer.Option(rich_help_panel=CSV_PANEL, help="The word for a sensor in the names of the files.")
 ]
 
-LogArgument = Annotated[Path, typer.Argument(help="MCAP file, or a folder of MCAP files (a ROS 2 bag).")]
 McapOption = Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")]
 RigOption = Annotated[
     Path | None,

@@ -15,7 +15,6 @@ The figures of honest files were measured on 2026-11-22 (tests/logs/test_hostile
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from gtsam_rwhec.errors import BudgetError
@@ -82,37 +81,16 @@ PIXELS_TOGETHER = 1 << 23
 SCANS = 64
 
 
-@dataclass(frozen=True)
 class LogBudget:
-    """What a log of `size` bytes may cost."""
+    """What a log of `size` bytes, of the file or of all files of a bag, may cost."""
 
-    #: Bytes of the file, or of all files of a bag.
-    size: int
-
-    @property
-    def chunk(self) -> int:
-        """Bytes that one chunk may yield."""
-        return CHUNK + int(CHUNK_SHARE * self.size)
-
-    @property
-    def open(self) -> int:
-        """Bytes of chunks that are open together."""
-        return OPEN + int(OPEN_SHARE * self.size)
-
-    @property
-    def opened(self) -> int:
-        """Bytes that all chunks may yield in one pass over the log."""
-        return OPENED + OPENED_FOR_A_BYTE * self.size
-
-    @property
-    def message(self) -> int:
-        """Bytes of one message in JSON or protobuf."""
-        return MESSAGE + int(MESSAGE_SHARE * self.size)
-
-    @property
-    def parts(self) -> int:
-        """Parts that may be read in one pass over the log."""
-        return PARTS + PARTS_FOR_A_BYTE * self.size
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.chunk = CHUNK + int(CHUNK_SHARE * size)  #: bytes that one chunk may yield
+        self.open = OPEN + int(OPEN_SHARE * size)  #: bytes of chunks that are open together
+        self.opened = OPENED + OPENED_FOR_A_BYTE * size  #: bytes that all chunks may yield in one pass over the log
+        self.message = MESSAGE + int(MESSAGE_SHARE * size)  #: bytes of one message in JSON or protobuf
+        self.parts = PARTS + PARTS_FOR_A_BYTE * size  #: parts that may be read in one pass over the log
 
 
 class Spending:

@@ -294,7 +294,7 @@ def propose_odometries(poses: Iterable[PoseTopic], where: str) -> tuple[str, tup
         )
         if one.may_lack_scale:
             remarks["sensors", one.name, "odometry"] = f"TODO {_SCALE}"
-    rig = Rig(sensors={**sensors}, reference=reference.name)  # type: ignore[call-arg]
+    rig = Rig(sensors={**sensors}, reference=reference.name)
     head = (
         f"# A first rig file, made from the log {where if is_text(where) else repr(where)}: it has no images and no "
         "detections,\n# and several topics of poses, each taken as what one sensor says of its own motion.\n"
