@@ -28,18 +28,18 @@ from .tasks import Receipt as Receipt
 from .tasks import Task as Task
 from .dask_engine import DaskEngine as DaskEngine
 from .dask_engine import bytes_of as bytes_of
-from .without_secrets import shown as shown
+from .store_requests import shown as shown
 
 # Drift of each robot over time.
 from .watching import RobotChart as RobotChart
 from .watching import Watched as Watched
 from .watching import watch as watch
 from .drift_events import AlarmEvent as AlarmEvent
-from .drift_words import alarm_lines as alarm_lines
-from .drift_words import day_ns_of as day_ns_of
-from .drift_words import drift_remarks as drift_remarks
-from .drift_words import drift_verdict as drift_verdict
-from .drift_words import stream as stream
+from .fleet_report import alarm_lines as alarm_lines
+from .fleet_report import day_ns_of as day_ns_of
+from .fleet_report import drift_remarks as drift_remarks
+from .fleet_report import drift_verdict as drift_verdict
+from .watching import stream as stream
 
 # What people read.
 from .fleet_report import print_fleet as print_fleet

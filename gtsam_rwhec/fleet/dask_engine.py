@@ -23,8 +23,8 @@ from gtsam_rwhec.errors import FleetError, OptionError
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.progress import Progress, Remark, silent
 from gtsam_rwhec.fleet.dask_cluster import START_S, DaskCluster
+from gtsam_rwhec.fleet.store_requests import without_secrets
 from gtsam_rwhec.fleet.tasks import ATTEMPTS, Failed, Receipt, Task, carried_out, failed
-from gtsam_rwhec.fleet.without_secrets import without_secrets
 
 _CLIENT_LOG = logging.getLogger("distributed.client")
 #: The scheduler has so many tasks for each thread at a time, and at least this many.
@@ -85,6 +85,7 @@ class DaskEngine:
         self.address, self.tell = scheduler or "", progress
         self.cluster: DaskCluster | None = None
         self._client: Any = None
+        self._distributed: Any = None
         self._is_gone, self._numbers, self._level = False, count(), _CLIENT_LOG.level
 
     def start(self) -> None:

@@ -14,13 +14,12 @@ from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.drift_events import AlarmEvent, day_text
-from gtsam_rwhec.fleet.drift_words import drift_remarks, drift_verdict
-from gtsam_rwhec.fleet.fleet_report import summary, worst_first
+from gtsam_rwhec.fleet.fleet_report import drift_remarks, drift_verdict, summary, worst_first
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.stores import write_once
 from gtsam_rwhec.fleet.tasks import below
 from gtsam_rwhec.fleet.watching import DAY_NS, RobotChart, Watched, watch
-from gtsam_rwhec.report.figures import GREEN, INK, ORANGE, VERMILLION, plain_decades, shortened, svg_figure
+from gtsam_rwhec.report.figures import INK, VERMILLION, shortened, svg_figure
 from gtsam_rwhec.report.html_page import page_html, write_page
 from gtsam_rwhec.report.report_blocks import Block, Chart, Link, Listing, Number, Page, Paragraph, Section, Table, Words
 
@@ -36,15 +35,9 @@ PAGE_FILE = "summary.html"
 MADE_BY = "Written by gtsam-rwhec fleet."
 #: Blue that is seen on dark as well as on light.
 BLUE = "#2C8CC9"
-#: More signs than this become pixels.
-MANY_SIGNS = 600
 #: Chances below are drawn here.
 LEAST_CHANCE = 1e-16
-SIGNS = {
-    Verdict.USE: (GREEN, "o", "use"),
-    Verdict.CARE: (ORANGE, "^", "with care"),
-    Verdict.DO_NOT_USE: (VERMILLION, "x", "do not use"),
-}
+_WORDS = {Verdict.USE: "use", Verdict.CARE: "with care", Verdict.DO_NOT_USE: "do not use"}
 
 
 def put_page(rows: Sequence[RobotRow], output: str) -> str:
@@ -91,10 +84,8 @@ def fleet_page(
     failures = _failures(rows)
     if failures:
         sections.append(Section("failures", "What failed, and why", failures))
-    chart, costs = _uncertainty_chart(rows), _costs(rows)
-    if chart is not None:
-        sections.append(Section("figures", "How well they are known", (chart,)))
     if rows:
+        costs = _costs(rows)
         table = _table(rows, has_results=has_results)
         sections.append(Section("robots", "All calibrations", (*([Paragraph(costs)] if costs else []), table)))
     return Page(title="A fleet's calibrations", tone=tone, sections=tuple(sections), made_by=MADE_BY)
@@ -191,54 +182,11 @@ def _name(row: RobotRow, has_results: bool) -> Words:
 
 
 def _verdict(row: RobotRow) -> str:
-    return "failed" if row.verdict is None else SIGNS[row.verdict][2]
+    return "failed" if row.verdict is None else _WORDS[row.verdict]
 
 
 def _some(names: list[str]) -> str:
     return ", ".join(names[:MOST_NAMES]) + (f", and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else "")
-
-
-def _uncertainty_chart(rows: Sequence[RobotRow]) -> Chart | None:
-    """Rotation over position, one sign a calibration; None without covariances that are finite."""
-    found: dict[Verdict, list[tuple[float, float]]] = {}
-    free = 0
-    for row in rows:
-        if row.verdict is None or row.covariance is None or not len(row.covariance):
-            continue
-        turned, moved = row.largest_deviations()
-        if math.isfinite(turned + moved) and min(turned, moved) > 0.0:
-            found.setdefault(row.verdict, []).append((1e3 * moved, math.degrees(turned)))
-        else:
-            free += 1
-    if not found:
-        return None
-    count = sum(map(len, found.values()))
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for verdict, points in found.items():
-            colour, sign, label = SIGNS[verdict]
-            axes.plot(
-                *np.array(points).T, sign, color=colour, markersize=4, alpha=0.8, label=f"{label} ({len(points)})",
-                rasterized=count > MANY_SIGNS,
-            )  # fmt: skip
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        together = np.concatenate([np.array(points) for points in found.values()])
-        for axis, values in zip((axes.xaxis, axes.yaxis), together.T, strict=True):
-            plain_decades(axis, float(values.min()), float(values.max()))
-        axes.set_xlabel("position (mm)")
-        axes.set_ylabel("rotation (degrees)")
-        axes.legend(loc="best")
-
-    without = f" {free} with a free direction are not in it." if free else ""
-    return Chart(
-        "uncertainty",
-        "How certain the poses are",
-        f"The largest standard deviation of any frame, of {count} calibrations. Those far to the right or above "
-        f"the others had too little motion, or worse measurements.{without}",
-        svg_figure(draw),
-    )
 
 
 def _alarm_table(alarms: list[AlarmEvent]) -> Table:

@@ -27,8 +27,8 @@ from gtsam_rwhec.fleet.fleet_rows import (
     check_format,
     read_rows,
 )
+from gtsam_rwhec.fleet.store_requests import shown
 from gtsam_rwhec.fleet.stores import exists, read_bytes
-from gtsam_rwhec.fleet.without_secrets import shown
 from gtsam_rwhec.solver.certificate import Status
 
 #: Column, type, what it is, and the row's own name of what is kept as it is. Types are names of functions of pyarrow,

@@ -29,12 +29,11 @@ from gtsam_rwhec.files.progress import Counted, Progress, Remark, check_progress
 from gtsam_rwhec.fleet.fleet_parquet import rows_parquet
 from gtsam_rwhec.fleet.fleet_rows import PARQUET_FILE, ROWS_FILE, FailedLog, RobotRow, read_rows, rows_json
 from gtsam_rwhec.fleet.log_task import LogTask, map_log
-from gtsam_rwhec.fleet.manifest import LogSource, Manifest, Robot
-from gtsam_rwhec.fleet.rig_source import RigSource, read_rig_source
+from gtsam_rwhec.fleet.manifest import LogSource, Manifest, RigSource, Robot, read_rig_source
+from gtsam_rwhec.fleet.store_requests import shown, without_secrets
 from gtsam_rwhec.fleet.stores import exists, listed, local_path, read_bytes, stamp_of, write_once
 from gtsam_rwhec.fleet.tasks import Engine, Failed, InProcess, Receipt, Task, below, kept_receipt
 from gtsam_rwhec.fleet.unit_task import Answer, Each, UnitTask, solve_unit, write_results
-from gtsam_rwhec.fleet.without_secrets import shown, without_secrets
 
 #: Which version wrote the output; written before the first task.
 ABOUT_FILE = "about.json"
@@ -246,7 +245,7 @@ def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Ou
     for log in logs:
         of_robot[log.robot].append(log)
     if each == "log":
-        named = [
+        named: list[tuple[str, str | None, list[PlannedLog]]] = [
             (name, None, [log])
             for robot, own in of_robot.items()
             for name, log in zip(_names(robot, own), own, strict=True)

@@ -1,31 +1,28 @@
-"""Manifests of fleets: which robot has which logs and which rig file, and which robots see the same targets.
-
-    rig: rigs/arm.yaml                  # of every robot that names no other
-    robots:
-      arm_01: {logs: "s3://logs/arm_01/*.mcap"}
-      arm_02:
-        rig: rigs/arm_02.yaml
-        logs:
-          - s3://logs/arm_02/monday.mcap
-          - {log: "s3://logs/arm_02/tuesday.mcap", rig: rigs/arm_02_new_camera.yaml}
-    sites:                              # these robots see the same targets, and are solved together
-      hall_a: [arm_01, arm_02]
+"""Manifests of fleets, which docs/fleets.md shows, and the rig files that they name, as any worker can read them.
 
 Every path is a URL of fsspec, or a path; relative ones start from the manifest's folder. Names with * ? [ are patterns.
 """
 
 from __future__ import annotations
 
+import hashlib
 import posixpath
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from gtsam_rwhec.errors import FileFormatError, ManifestError, StoreError
+from gtsam_rwhec.errors import FileFormatError, ManifestError, RigError, StoreError, UnfinishedRigWarning
+from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, dotted, parse_yaml, read_text, shown, suggestion
+from gtsam_rwhec.fleet.store_requests import shown as shown_url
 from gtsam_rwhec.fleet.stores import listed, local_path, read_bytes
-from gtsam_rwhec.fleet.without_secrets import shown as shown_url
+from gtsam_rwhec.rig import Rig, parse_rig
+from gtsam_rwhec.rig.sections import ESTIMATE
 
 #: Robots and sites name folders of the output; "/" and "@" join names of frames and of units.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -261,3 +258,89 @@ class _Checks:
         url = self._url(entry, path)
         place = f"{self.file.where}, line {self.file.line(path)}: {dotted(path)}"
         return None if url is None else LogSource(url, rig or "", place)
+
+
+#: A rig file, or a file that it names, has at most this many bytes.
+MOST_RIG_BYTES = 4_000_000
+
+
+@dataclass(frozen=True)
+class RigSource:
+    """A rig file as bytes."""
+
+    url: str  #: Where it is
+    text: str
+    #: The files with intrinsics and targets that it names: the path as it has it, and the content. Those of absolute
+    #: paths are read where they are, by every worker
+    files: tuple[tuple[str, bytes], ...] = ()
+
+    @property
+    def sha256(self) -> str:
+        """A checksum of all of it, in hexadecimal digits."""
+        digest = hashlib.sha256(self.text.encode())
+        for name, content in self.files:
+            digest.update(f"\0{name}\0{len(content)}\0".encode() + content)
+        return digest.hexdigest()
+
+    def rig(self, folder: Path) -> Rig:
+        """The rig; the files that it names are written below a folder of this process, if it names any.
+
+        Raises `RigError` as ``read_rig`` does.
+        """
+        if not self.files:
+            return _parsed(self.text, shown_url(self.url))
+        up = max(PurePosixPath(name).parts.count("..") for name, _ in self.files)
+        base = folder.joinpath(*["rig"] * (up + 1))
+        for name, content in self.files:
+            if not PurePosixPath(name).is_absolute():
+                place = base / name
+                place.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(place, content)
+        return _in_words(self.text, shown_url(self.url), base)
+
+
+@lru_cache(maxsize=8)
+def _parsed(text: str, where: str) -> Rig:
+    """A rig file that names no others: a worker parses it once."""
+    return _in_words(text, where, Path())
+
+
+def _in_words(text: str, where: str, folder: Path) -> Rig:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfinishedRigWarning)
+        return parse_rig(text, where, folder)
+
+
+def read_rig_source(url: str) -> RigSource:
+    """Read and check a rig file and the files that it names, which start from its folder; errors as ``read_rig``."""
+    try:
+        text = read_bytes(url, most_bytes=MOST_RIG_BYTES).decode("utf-8-sig")
+        data = parse_yaml(text, shown_url(url)).data
+        named = sorted(_named(data)) if isinstance(data, dict) else []
+        files = tuple((name, read_bytes(joined(url, name), most_bytes=MOST_RIG_BYTES)) for name in named)
+    except UnicodeDecodeError as error:
+        raise RigError(
+            f"{shown_url(url)} is not a text file in UTF-8 (byte {error.start}); YAML was expected."
+        ) from error
+    except (FileFormatError, StoreError) as error:
+        raise RigError(str(error)) from error
+    source = RigSource(url, text, files)
+    with TemporaryDirectory(prefix="gtsam-rwhec-") as folder:
+        source.rig(Path(folder))
+    return source
+
+
+def _named(data: dict[str, Any]) -> set[str]:
+    """The files that the sections of sensors and targets name."""
+    found = set()
+    sensors, targets = data.get("sensors"), data.get("targets")
+    for sensor in sensors.values() if isinstance(sensors, dict) else ():
+        stated = sensor.get("intrinsics") if isinstance(sensor, dict) else None
+        if isinstance(stated, dict):
+            found |= {stated[key] for key in ("file", "kalibr") if isinstance(stated.get(key), str)}
+        elif isinstance(stated, str) and stated != ESTIMATE:
+            found.add(stated)
+    for target in targets.values() if isinstance(targets, dict) else ():
+        if isinstance(target, dict) and isinstance(target.get("kalibr"), str):
+            found.add(target["kalibr"])
+    return found

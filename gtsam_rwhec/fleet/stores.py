@@ -21,8 +21,7 @@ from urllib.parse import unquote, urlsplit
 from gtsam_rwhec.errors import FileFormatError, StoreError
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.whole_files import checked_path, write_atomically
-from gtsam_rwhec.fleet.store_requests import requested
-from gtsam_rwhec.fleet.without_secrets import shown
+from gtsam_rwhec.fleet.store_requests import requested, shown
 
 #: A file that is asked for whole, a manifest or a rig file, has at most this many bytes unless the caller says more.
 MOST_BYTES = 1 << 32
@@ -107,15 +106,7 @@ def stamp_of(url: str) -> str:
 
 
 def read_bytes(url: str, most_bytes: int = MOST_BYTES) -> bytes:
-    """A whole file.
-
-    Raises
-    ------
-    StoreError
-        It is not there, is refused, or has more than `most_bytes`.
-    StoreInterruptedError
-        The store broke off, each time.
-    """
+    """A whole file; a StoreError where it has more than `most_bytes`."""
     size = size_of(url)
     if size > most_bytes:
         raise StoreError(f"{shown(url)} has {size} bytes, and {most_bytes} at most are expected; is it the right file?")
@@ -126,11 +117,6 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     """Parts of a file, each from a byte to before another; all that is asked for, or an error.
 
     Ranges of one call travel at the same time. A range that breaks off is asked for again from where it broke off.
-
-    Raises
-    ------
-    StoreError
-        As `read_bytes`. The second says at which byte of which range the store stopped.
     """
     path = local_path(url)
     if path is not None:
@@ -177,17 +163,8 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 def write_once(url: str, data: bytes) -> bool:
     """Write a file whole, unless it is there with the same bytes. Two who write at once leave one of the two, whole.
 
-    On disks it is a temporary file that is renamed, with its folder made; in stores one request.
-
-    Returns
-    -------
-    bool
-        Whether the file was there, and nothing was written.
-
-    Raises
-    ------
-    StoreError
-        It cannot be written.
+    On disks it is a temporary file that is renamed, with its folder made; in stores one request. It returns whether
+    the file was there, and nothing was written.
     """
     path = local_path(url)
     if path is not None:
@@ -207,13 +184,7 @@ def write_once(url: str, data: bytes) -> bool:
 
 
 def listed(pattern: str) -> list[str]:
-    """The URLs of files that a pattern with ``*``, ``?``, ``[]`` or ``**`` names, sorted; those of folders are not.
-
-    Raises
-    ------
-    StoreError
-        The store cannot be asked. A pattern that nothing fits gives an empty list.
-    """
+    """The URLs of files that a pattern with ``*``, ``?``, ``[]`` or ``**`` names, sorted; those of folders are not."""
     path = local_path(pattern)
     if path is not None:
         found = requested(lambda: glob.glob(str(path), recursive=True), f"the files {path}", pattern)

@@ -20,7 +20,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fleet.fleet_rows import RobotRow, RowFrame, read_rows, rows_json
-from gtsam_rwhec.fleet.log_agreement import disagreeing_logs
+from gtsam_rwhec.fleet.manifest import RigSource
 from gtsam_rwhec.fleet.partial_result import (
     FORMAT_VERSION,
     PartialResult,
@@ -30,10 +30,9 @@ from gtsam_rwhec.fleet.partial_result import (
     removed_in_logs,
     with_sensor_names,
 )
-from gtsam_rwhec.fleet.rig_source import RigSource
 from gtsam_rwhec.fleet.stores import read_bytes, write_once
 from gtsam_rwhec.fleet.tasks import Receipt, below, costs_of, keep_receipt, kept_receipt
-from gtsam_rwhec.fleet.unit_problem import UnitLog, UnitProblem, check_rigs, sensor_name, unit_problem
+from gtsam_rwhec.fleet.unit_problem import UnitLog, UnitProblem, check_rigs, disagreeing_logs, sensor_name, unit_problem
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import LogFields, TimeOffsetFields
 from gtsam_rwhec.results.result_file import result_json

@@ -8,8 +8,6 @@ from .track_comparison import OdometryTrack as OdometryTrack
 
 # The calibration, and what it found.
 from .odometry_calibration import calibrate_odometries as calibrate_odometries
-from .odometry_calibration import Motions as Motions
-from .odometry_calibration import odometry_motions as odometry_motions
 from .odometry_record import OdometryCalibration as OdometryCalibration
 from .odometry_record import JointCertificate as JointCertificate
 from .odometry_record import Windows as Windows

@@ -29,12 +29,11 @@ from importlib.resources import files
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from gtsam_rwhec.calibration.trial_fits import Spread
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.results.nights import Nights, solved
+from gtsam_rwhec.results.nights import Nights, Spread, solved
 
 #: The share of false alarms that is left to "all of it moved"; the rest is for one frame alone, in equal parts.
 OF_ALL = 0.1

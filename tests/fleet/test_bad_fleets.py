@@ -11,7 +11,7 @@ from fleets import MadeFleet, write_fleet
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE
-from gtsam_rwhec.fleet.rig_source import read_rig_source
+from gtsam_rwhec.fleet.manifest import read_rig_source
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ def test_the_counts_come_first_and_then_what_to_do(rows: list[RobotRow], watched
     assert counts.words.startswith("4 calibrations: 1 may be used, 1 to be used with care, 1 not to be used, 1 failed.")
     assert len(steps.items) == 5
     names = [section.name for section in page.sections]
-    assert names == ["verdict", "drift", "worst", "failures", "figures", "robots"]
+    assert names == ["verdict", "drift", "worst", "failures", "robots"]
     assert fleet_page(rows[:1]).tone == "good"
     assert fleet_page(rows[:1], watched).tone == "care"
     assert [row[1] for row in page.sections[2].blocks[0].rows] == ["do not use", "with care"]

@@ -12,9 +12,8 @@ from robot_nights import DAY_NS, DEVIATIONS, day_ns, failed_night, robot_nights,
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
 from gtsam_rwhec.fleet.drift_events import FramesEvent, FreeEvent, NightEvent, NoAnswerEvent
-from gtsam_rwhec.fleet.drift_words import stream
 from gtsam_rwhec.fleet.fleet_rows import RobotRow
-from gtsam_rwhec.fleet.watching import Watched, watch
+from gtsam_rwhec.fleet.watching import Watched, stream, watch
 
 ROBOTS = [f"arm_{i}" for i in range(6)]
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from drives_with_sensors import drive, tracks
 from rwhec_factors import se3
 
-import gtsam_rwhec as rw
 from gtsam_rwhec import odometry
-from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.odometry.window_motions import SampledTrack, best_length
 from gtsam_rwhec.runs.odometry_cleaning import gated
 
@@ -68,19 +65,3 @@ def test_windows_are_longer_where_the_noise_is_larger() -> None:
             samples.append(SampledTrack(replace(track, T_start_sensor=np.array(noisy)), 0, 0.0, good))
         lengths.append(best_length(samples, 0.5))
     assert lengths[1] > lengths[0] >= 0.0999
-
-
-def test_motions_of_two_tracks_are_solved_by_the_problem_of_pairs() -> None:
-    driven = drive("3d", 3)
-    first, second = tracks(driven)[:2]
-    motions = odometry.odometry_motions(first, second, odometry.OdometryOptions(estimate_time_offsets=False))
-    problem = rw.Problem()
-    problem.add_motion("rear", motions.A, motions.B, motions.sigma, motions.kappa, stamps_ns=motions.start_ns)
-    solution = rw.solve(problem)
-    off = se3.logmap(se3.inverse(driven.T("lidar", "rear")[None]) @ solution.Y["rear"].matrix())[0]
-    assert np.linalg.norm(off[:3]) < 0.01
-    assert np.linalg.norm(off[3:]) < 0.15
-    assert (motions.kappa > 0.0).all()
-    far = replace(second, stamps_ns=second.stamps_ns + 10**12)
-    with pytest.raises(UnderdeterminedError, match="share 0 windows"):
-        odometry.odometry_motions(first, far, odometry.OdometryOptions(estimate_time_offsets=False))
