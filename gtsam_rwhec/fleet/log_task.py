@@ -1,63 +1,41 @@
 """One log becomes one partial result, by the stages that ``calibrate`` runs, in a folder of the worker."""
 
 from __future__ import annotations
+
 import hashlib
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
 import numpy as np
-from gtsam_rwhec.calibration.verdict import Finding
-from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.errors import RwhecWarning
-from gtsam_rwhec.errors import StoreInterruptedError
-from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION
-from gtsam_rwhec.fleet.partial_result import LogFacts
-from gtsam_rwhec.fleet.partial_result import PairMeasurements
-from gtsam_rwhec.fleet.partial_result import PartialResult
-from gtsam_rwhec.fleet.partial_result import camera_fields
-from gtsam_rwhec.fleet.stores import stamp_of
-from gtsam_rwhec.fleet.stores import write_once
-from gtsam_rwhec.fleet.tasks import Receipt
-from gtsam_rwhec.fleet.tasks import below
-from gtsam_rwhec.fleet.tasks import costs_of
-from gtsam_rwhec.fleet.tasks import keep_receipt
-from gtsam_rwhec.fleet.tasks import kept_receipt
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, StoreInterruptedError
+from gtsam_rwhec.fleet.manifest import RigSource
+from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION, LogFacts, PairMeasurements, PartialResult, camera_fields
+from gtsam_rwhec.fleet.store_requests import shown
+from gtsam_rwhec.fleet.stores import stamp_of, write_once
+from gtsam_rwhec.fleet.tasks import Receipt, below, costs_of, keep_receipt, kept_receipt
 from gtsam_rwhec.fleet.topic_copy import local_copy_of_topics
-from gtsam_rwhec.logs import Log
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_sections import OdometrySensor
 from gtsam_rwhec.rig.sections import Sensor
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion
-from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.clocks_by_turning import late_clocks
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
-from gtsam_rwhec.runs.doubted_intrinsics import finding_against
-from gtsam_rwhec.runs.doubted_shapes import continued_boards
-from gtsam_rwhec.runs.doubted_shapes import doubted_shapes
+from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
+from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.measured_pairs import poses_used
-from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.run_log import CALIBRATION_LOG
-from gtsam_rwhec.runs.run_log import DETECTED_LOG
-from gtsam_rwhec.runs.run_log import LogMetadata
-from gtsam_rwhec.runs.run_log import is_from_stage
-from gtsam_rwhec.runs.run_log import read_metadata
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, read_pairs
+from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata
 from gtsam_rwhec.runs.topics_of_rig import wanted_topics
-from gtsam_rwhec.fleet.manifest import RigSource
-from gtsam_rwhec.fleet.store_requests import shown
 
 #: The folder of partial results, below the output.
 FOLDER = "partials"

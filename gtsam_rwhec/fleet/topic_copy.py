@@ -5,46 +5,25 @@ ones, are read whole, and a `LogWarning` says why.
 """
 
 from __future__ import annotations
+
 import warnings
-from collections.abc import Collection
-from collections.abc import Iterator
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
-from typing import NamedTuple
-from typing import TypeAlias
+from typing import BinaryIO, NamedTuple, TypeAlias
+
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel
-from mcap.records import ChunkIndex
-from mcap.records import DataEnd
-from mcap.records import Footer
-from mcap.records import Header
-from mcap.records import McapRecord
-from mcap.records import MetadataIndex
-from mcap.records import Schema
-from mcap.records import Statistics
-from gtsam_rwhec.errors import BudgetError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.errors import StoreError
+from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Header, McapRecord, MetadataIndex, Schema, Statistics
+
+from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
 from gtsam_rwhec.files.budgets import Spending
 from gtsam_rwhec.files.whole_files import atomic_stream
-from gtsam_rwhec.fleet.stores import count_bytes
-from gtsam_rwhec.fleet.stores import counted_bytes
-from gtsam_rwhec.fleet.stores import local_path
-from gtsam_rwhec.fleet.stores import read_ranges
-from gtsam_rwhec.fleet.stores import size_of
-from gtsam_rwhec.logs.mcap_file import FAULTS
-from gtsam_rwhec.logs.mcap_file import MAGIC
-from gtsam_rwhec.logs.mcap_file import RECORD
-from gtsam_rwhec.logs.mcap_file import read_index
-from gtsam_rwhec.logs.records import TF_TOPICS
-from gtsam_rwhec.logs.records import Topic
 from gtsam_rwhec.fleet.store_requests import shown
+from gtsam_rwhec.fleet.stores import count_bytes, counted_bytes, local_path, read_ranges, size_of
+from gtsam_rwhec.logs.mcap_file import FAULTS, MAGIC, RECORD, read_index
+from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
 #: Bytes. A file on disk that is smaller is read where it is, whatever is in it.
 SMALL = 64 << 20
