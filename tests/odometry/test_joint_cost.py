@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drives_with_sensors import drive
-from test_odometry_likelihood import SCALED, truth, windows_of
+from test_window_likelihood import SCALED, truth, windows_of
 
 from gtsam_rwhec.odometry.joint_cost import JointForm, joint_form, solved, star_starts
 from gtsam_rwhec.solver.rotations import random_rotations, vec
