@@ -1,30 +1,28 @@
 """A fleet's run on the terminal: how many robots may be used, the worst, what failed, where things are, its costs."""
 
 from __future__ import annotations
+
 import math
 from collections import Counter
 from collections.abc import Sequence
+from datetime import UTC, date, datetime
+
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE
-from gtsam_rwhec.fleet.fleet_rows import RobotRow
-from gtsam_rwhec.fleet.fleet_run import FleetRun
-from gtsam_rwhec.report.report_blocks import Table
-from gtsam_rwhec.report.terminal_report import STYLES
-from gtsam_rwhec.report.terminal_report import print_heading
-from gtsam_rwhec.report.terminal_report import print_list
-from gtsam_rwhec.report.terminal_report import print_sentence
-from gtsam_rwhec.report.terminal_report import print_tables
-from gtsam_rwhec.report.terminal_report import report_console
-from datetime import UTC
-from datetime import date
-from datetime import datetime
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.fleet.drift_events import AlarmEvent
-from gtsam_rwhec.fleet.drift_events import NoAnswerEvent
-from gtsam_rwhec.fleet.drift_events import day_text
+from gtsam_rwhec.files.terminal_text import brief, shown
+from gtsam_rwhec.fleet.drift_events import AlarmEvent, NoAnswerEvent, day_text
+from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
+from gtsam_rwhec.fleet.fleet_run import FleetRun
 from gtsam_rwhec.fleet.watching import Watched
+from gtsam_rwhec.report.report_blocks import Table
+from gtsam_rwhec.report.terminal_report import (
+    STYLES,
+    print_heading,
+    print_list,
+    print_sentence,
+    print_tables,
+    report_console,
+)
 
 #: So many robots and failures are named.
 MOST_NAMED = 10
