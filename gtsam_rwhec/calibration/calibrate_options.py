@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
+
+import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
@@ -21,11 +24,13 @@ from gtsam_rwhec.errors import (
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.fit_options import About, CornerOptions, Drift, PoseOptions, check_choices
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.solution import Solution
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
 RobustChoice = Literal["auto", "gnc", "none"]
-SizesChoice = Literal["check", "known"]
+SizesChoice = Literal["check", "known", "correct", "estimate"]
 ObservationChoice = Literal["auto", "corners", "poses"]
 
 
@@ -46,8 +51,9 @@ class CalibrateOptions(PoseOptions):
     #: Look for likely mistakes in the reading of A and B. Where there are any, or residuals that no sensor has (these
     #: are looked for whatever this says), nothing else is done.
     misreadings: bool = True
-    #: "check": where the sizes of targets are said to be known (``scale="known"``), a size that the motion contradicts
-    #: is found. "known": it is not looked for.
+    #: Where the sizes of targets are said to be known (``scale="known"``). "check": a size that the motion contradicts
+    #: is found. "known": it is not looked for. "correct": it is found, and estimated in place of the stated one.
+    #: "estimate": all are.
     sizes: SizesChoice = "check"
     #: Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
     #: sensor where stamps and motion determine it, also where it is small; not over standstill, nor between stations
@@ -85,6 +91,10 @@ class CalibrateOptions(PoseOptions):
             raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
+
+
+#: Which measurements of each pair count, (N,) booleans.
+Inliers = dict[Pair, np.ndarray]
 
 
 def offsets_of(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:
@@ -139,6 +149,32 @@ class Record:
                 self.notes.setdefault(str(warning.message))
 
 
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a log knows beside its measurements, and ``calibrate`` asks of it.
+
+    Attributes
+    ----------
+    uncleaned : Problem, optional
+        The measurements with those that cleaning removed because they contradict the carriers' motion: a misreading
+        makes these.
+    is_detected : bool
+        Whether this library found B in images: it was not misread.
+    is_inverse : bool
+        Whether A is the inverse of the carriers' poses as they were written: these may be what was misread.
+    late : tuple of Finding
+        Stated clocks that the carriers' turning contradicts: nothing else is computed then.
+    far_off : tuple of str
+        Sensors whose corners contradict their stated intrinsics by far: where these lead nowhere, they are unknown.
+    """
+
+    uncleaned: Problem | None = None
+    is_detected: bool = False
+    is_inverse: bool = False
+    late: tuple[Finding, ...] = ()
+    far_off: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True)
 class Run:
     """One run of ``calibrate``, or an attempt within it.
@@ -149,23 +185,44 @@ class Run:
     options : CalibrateOptions
     tell : Progress
         Is called with the name of each step.
+    recording : Recording or None
+        None for measurements of no log.
     record : Record
     times : int
         How often it was begun, since poses of targets were computed again.
     cameras : dict of str to Camera
         The intrinsics by which they were, where these are not the stated ones.
+    stated : Problem or None
+        The problem with sizes as they were stated, where some are estimated in their place.
+    moved_s : dict of str to float
+        By sensor: how much later than its stamps said A was taken along the carriers' path.
+    agreed : (Solution, inliers) or None
+        The measurements that agree, where clocks and sizes told already, and their certified solution.
     """
 
     problem: Problem
     options: CalibrateOptions
     tell: Progress
+    recording: Recording | None = None
     record: Record = field(default_factory=Record)
     times: int = 1
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    stated: Problem | None = None
+    moved_s: Mapping[str, float] = field(default_factory=dict)
+    agreed: tuple[Solution, Inliers] | None = None
+
+    @property
+    def says_so(self) -> str:
+        """Why a choice was not made from the data."""
+        return "an option says so" if self.recording is None else "the rig file says so"
 
     def again(self, problem: Problem, cameras: Mapping[str, Camera]) -> Run:
         """The run of a problem with other poses of targets, from its beginning."""
-        return Run(problem, self.options, self.tell, times=self.times + 1, cameras=cameras)
+        if self.stated is not None:
+            problem = with_sizes_of(problem, self.stated)
+        return replace(
+            self, problem=problem, record=Record(), times=self.times + 1, cameras=cameras, stated=None, agreed=None
+        )
 
     def attempt(self) -> Run:
         """The same with an empty record: it may be thrown away."""
@@ -174,3 +231,10 @@ class Run:
     def with_time_offsets(self, of: tuple[str, ...]) -> Run:
         """The same, told of which sensors to estimate the time offsets; the record is shared."""
         return replace(self, options=replace(self.options, time_offsets=of))
+
+
+def with_sizes_of(problem: Problem, other: Problem) -> Problem:
+    """The same measurements, with the sizes that another problem states."""
+    result = copy.copy(problem)  # the measurements are shared, what was stated is not
+    result.scale, result.fixed_scales = other.scale, dict(other.fixed_scales)
+    return result

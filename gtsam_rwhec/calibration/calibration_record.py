@@ -21,6 +21,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
 
 
@@ -67,6 +68,9 @@ class Calibration:
         Where each sensor saw its targets.
     carriers : Carriers
     options : CalibrateOptions
+    problem : Problem
+        The measurements that were calibrated: A at the clocks' offsets where it was taken again along a path, poses of
+        targets by the intrinsics that count, and sizes that are estimated in place of stated ones.
     """
 
     X: dict[str, gtsam.Pose3]
@@ -88,6 +92,7 @@ class Calibration:
     views: dict[str, SensorView] = field(repr=False)
     carriers: Carriers
     options: CalibrateOptions = field(repr=False)
+    problem: Problem = field(repr=False)
 
     @property
     def verdict(self) -> Verdict:

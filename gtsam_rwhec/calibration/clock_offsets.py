@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from gtsam_rwhec.calibration.calibrate_options import Run, offsets_of
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of
 from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN, NoiseFound, refined_under_its_noise
-from gtsam_rwhec.calibration.outliers import Inliers, say_outliers, without_outliers
+from gtsam_rwhec.calibration.outliers import say_outliers, without_outliers
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import CountError, OptionError
 from gtsam_rwhec.fitting.fit_options import RefineOptions
@@ -291,7 +291,8 @@ def late_in_place_of_shifted(run: Run, first: Solution | None) -> Answer | None:
 def _by_option(run: Run, first: Solution | None) -> Answer:
     found = _with_offsets(run, first)
     asked = offsets_of(run.problem, run.options)
-    run.record.choose(TIME_OFFSETS, "estimated" if asked else "not estimated", "an option says so")
+    chosen = f"estimated for {', '.join(found.time_offsets_s)}" if asked and found.time_offsets_s else "not estimated"
+    run.record.choose(TIME_OFFSETS, chosen, run.says_so)
     if found.refined is not None:
         _doubt_stated_clocks(run, _stated_clocks(run, found))
     return found

@@ -7,22 +7,25 @@ stated intrinsics, and a flat board's was chosen of two: where the answer says o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run
 from gtsam_rwhec.calibration.clock_offsets import Answer
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS, Lens, estimated_intrinsics
 from gtsam_rwhec.errors import (
     CameraError,
     CountError,
-    MeasurementsNotKeptError,
     OptionError,
     OutlierError,
     RwhecError,
+    RwhecWarning,
+    TargetError,
     UnderdeterminedError,
 )
 from gtsam_rwhec.files.progress import Progress
@@ -37,9 +40,12 @@ from gtsam_rwhec.fitting.observations import Observations, Views, check_corners_
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement import as_stated, beyond_independent_errors, observed
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection, TriedModel
-from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.problem.corners import candidates_of
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import nearer_poses
+from gtsam_rwhec.problem.selection import nearer_poses, selected, with_poses
+from gtsam_rwhec.solver.solution import solve
 
 #: At most so many images are looked at, and of a pair at least so many.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
@@ -94,6 +100,7 @@ def chosen_model(
     Y: Mapping[str, PoseLike],
     options: CornerOptions,
     tell: Progress,
+    thin: CornersRefined | None = None,
 ) -> Tried:
     """The options under which images that were left out are predicted best: those given, or with A as exact.
 
@@ -101,7 +108,7 @@ def chosen_model(
     """
     some = thinned(observations)
     try:
-        first = _scored(some, X, Y, options, tell)
+        first = _scored(some, X, Y, options, tell, thin)
     except CountError as error:
         return Tried(options, in_words(options), f"no other was tried: {error}", (), LeftOut({}, {}))
     every = [first]
@@ -133,8 +140,9 @@ def _scored(
     Y: Mapping[str, PoseLike],
     options: CornerOptions,
     tell: Progress,
+    thin: CornersRefined | None = None,
 ) -> tuple[CornerOptions, Score, LeftOut]:
-    refined = refine_corners(observations, X, Y, options, tell)
+    refined = thin or refine_corners(observations, X, Y, options, tell)
     folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
     found = left_out(observations, refined, options, folds=folds, progress=tell)
     errors = found.errors
@@ -229,6 +237,7 @@ def corners_found(
     observations: Observations,
     options: CornerOptions,
     tell: Progress,
+    thin: CornersRefined | None = None,
 ) -> CornersFound:
     """Refine from corners under the options, or with A as exact where that predicts images better.
 
@@ -239,9 +248,11 @@ def corners_found(
     observations : Observations
     options : CornerOptions
     tell : callable
+    thin : CornersRefined, optional
+        The refinement of ``thinned(observations)`` under the options, where it was made already.
     """
     try:
-        tried = chosen_model(observations, X, Y, options, tell)
+        tried = chosen_model(observations, X, Y, options, tell, thin)
         tell("refining from corners")
         corners = refine_corners(observations, X, Y, tried.options, tell)
     except OutlierError as error:
@@ -420,67 +431,143 @@ def check_observations(problem: Problem, options: CalibrateOptions) -> None:
         check_corners_can_hold(problem)
 
 
-def with_better_poses(run: Run, found: Answer) -> Run | None:
+def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefined | None]:
     """The run again with images whose poses are those that the answer says, or None where they have them already.
 
-    Intrinsics are looked at once, in a part of the images where they are many.
+    Intrinsics are looked at once, in a part of the images where they are many; beside it is what these say. A log's
+    were looked at before: `with_estimated_intrinsics`.
     """
     base = found.refined
-    if base is None or base.free_directions or not run.problem.boards or run.times > MOST_TIMES:
-        return None
-    X, Y, cameras = base.X, base.Y, dict(run.cameras)
+    if base is None or base.free_directions or not run.problem.boards or run.times > MOST_TIMES or run.recording:
+        return None, None
+    X, Y, cameras, corners = base.X, base.Y, dict(run.cameras), None
     if run.options.observations != "poses" and not _why_not(run, base):
-        observations, options = _observed(run, base, found)
+        observations, options, _ = _observed(run, found)
         try:
             corners = refine_corners(thinned(observations), X, Y, options, run.tell)
         except RwhecError:  # then the answer is from the poses, and says why
-            return None
+            return None, None
         if is_doubtful(corners):
-            return None
+            return None, corners
         X, Y = corners.X, corners.Y
         for name, one in corners.intrinsics.items():
             if name not in cameras and _have_moved(one, run.problem.cameras[name]):
                 cameras[name] = one.camera
-    better, changed = nearer_poses(run.problem, X, Y, cameras)
     is_new = len(cameras) > len(run.cameras)
-    return run.again(better, cameras) if is_new or changed else None
+    try:
+        better, changed = nearer_poses(run.problem, X, Y, cameras)
+    except (CameraError, TargetError):  # a lens without a ray for a corner, or a target that is not flat
+        return None, corners
+    return run.again(better, cameras) if is_new or changed else None, corners
 
 
-def answered_by_corners(run: Run, found: Answer) -> Answer:
-    """The answer from the corners, where the problem has them and they give a better one; what was chosen is noted."""
-    base = found.refined
-    if base is None or not run.problem.boards or run.options.observations == "poses":
-        return found
-    why = _why_not(run, base)
+@dataclass(frozen=True, eq=False)
+class ByCorners:
+    """What corners gave, the answer from the poses that they started from, and how many measurements have none."""
+
+    found: CornersFound
+    start: Refined
+    without: dict[Pair, int] = field(default_factory=dict)
+
+
+def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tuple[Run, ByCorners]:
+    """What the corners of a log give, and the run with poses of targets by the intrinsics that they tell.
+
+    ``base`` is an answer from the poses of the inliers. Where the corners contradict the stated intrinsics, the run is
+    at its beginning.
+    """
+    kept = replace(run, problem=selected(run.problem, inliers) if inliers else run.problem)
+    why = "an option says so" if run.options.observations == "poses" else _why_not(kept, base)
     if why:
-        of_corners = CornersFound.none(why)
-    else:
-        observations, options = _observed(run, base, found)
-        of_corners = corners_found(base.X, base.Y, observations, options, run.tell)
+        return run, ByCorners(CornersFound.none(why), base)
+    observations, options, without = _observed(kept, Answer(base.solution, refined=base))
+    by = ByCorners(corners_found(base.X, base.Y, observations, options, run.tell), base, without)
+    corners = by.found.corners
+    if corners is None:
+        return run, by
+    run.tell("computing the poses of targets again, with the estimated intrinsics")
+    try:
+        cameras = {name: one.camera for name, one in corners.intrinsics.items()}
+        better, _ = nearer_poses(run.problem, corners.X, corners.Y, cameras)
+    except (CameraError, TargetError):  # a lens without a ray for a corner, or a target that is not flat
+        return run, by
+    if by.found.contradicted and run.times <= MOST_TIMES:
+        return run.again(better, cameras), by
+    return replace(run, problem=better, cameras=cameras), by
+
+
+def answered_by_corners(
+    run: Run, found: Answer, thin: CornersRefined | None = None, by: ByCorners | None = None
+) -> Answer:
+    """The answer from the corners, where the problem has them and they give a better one; what was chosen is noted.
+
+    ``thin``: what a part of the images says already; ``by``: what all of them do.
+    """
+    base = found.refined
+    if base is None or run.options.observations == "poses" or not (run.problem.boards or run.recording):
+        return found
+    if by is None and (why := _why_not(run, base)):
+        by = ByCorners(CornersFound.none(why), base)
+    elif by is None:
+        observations, options, without = _observed(run, found)
+        by = ByCorners(corners_found(base.X, base.Y, observations, options, run.tell, thin), base, without)
+    elif base.free_directions and by.found.corners is not None:
+        by = ByCorners(CornersFound.none("the motion leaves poses free"), base)
+    of_corners, without = by.found, by.without
     run.record.choices += of_corners.choices
     run.record.findings += of_corners.findings
     if of_corners.corners is None:
         return found
-    return replace(found, refined=as_stated(of_corners.refined(base, found.noise.model), base, of_corners.corners))
+    if without:
+        counts = ", ".join(f"{number} of {pair}" for pair, number in without.items())
+        run.record.choose("measurements without corners", f"{counts} do not count in the poses", "the others have some")
+    return replace(found, refined=as_stated(of_corners.refined(base, found.noise.model), by.start, of_corners.corners))
 
 
 def _why_not(run: Run, base: Refined) -> str:
     """Why the problem's corners cannot be refined from; empty where they can."""
+    problem = run.problem
+    if not problem.boards:
+        return "no measurement has corners and a camera's intrinsics"
+    if any(pair.is_motion for pair in problem.pairs):
+        return "the poses of targets are solved together with the motions of odometries"
+    lacking = [str(pair) for pair, has in _with_corners(problem).items() if not has.any()]
+    if lacking:
+        return f"the measurements of {', '.join(lacking[:5])} have no corners"
     try:
-        check_corners_everywhere(run.problem)
-        check_corners_can_hold(run.problem)
-    except (CountError, OptionError, MeasurementsNotKeptError) as error:
+        check_corners_can_hold(problem)
+    except OptionError as error:
         return str(error)
     return "the motion leaves poses free" if base.free_directions else ""
 
 
-def _observed(run: Run, base: Refined, found: Answer) -> tuple[Observations, CornerOptions]:
+def _with_corners(problem: Problem) -> dict[Pair, np.ndarray]:
+    """Which measurements of each pair (N,) have corners."""
+    found = {}
+    for pair in problem.pairs:
+        pixels = problem.measurements(*pair).pixels
+        none = np.zeros(problem.moments(*pair).count, dtype=bool)
+        found[pair] = none if pixels is None else np.isfinite(pixels).any(axis=(1, 2))
+    return found
+
+
+def _observed(run: Run, found: Answer) -> tuple[Observations, CornerOptions, dict[Pair, int]]:
+    """The corners of the images that agree with the answer, the options, and how many measurements have none."""
+    base, problem = found.refined, run.problem
+    assert base is not None
     noise, model = run.options.carrier_noise, found.noise.model
     options = run.options.corners or CornerOptions(
         carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
         about="targetcarrier" if model is None else model.hand,
     )
-    return observed(run.problem, base, options, run.options.carrier_path)
+    has = _with_corners(problem)
+    inliers = base.inliers or {pair: np.ones(len(mask), dtype=bool) for pair, mask in has.items()}
+    without = {pair: number for pair, mask in has.items() if (number := int((inliers[pair] & ~mask).sum()))}
+    if not all(mask.all() for mask in has.values()):
+        problem = selected(problem, has)
+        base = replace(base, inliers={pair: inliers[pair][mask] for pair, mask in has.items()})
+    observations, options = observed(problem, base, options, run.options.carrier_path)
+    return observations, options, without
 
 
 def _have_moved(found: RefinedIntrinsics, stated: Camera) -> bool:
@@ -490,3 +577,54 @@ def _have_moved(found: RefinedIntrinsics, stated: Camera) -> bool:
     off = np.linalg.norm(stated.pixels(found.camera.undistort(pixels)) - pixels, axis=-1)
     is_sure = bool((np.abs(found.innovation.off) > OTHER_SIGMAS * np.array(found.standard_deviations)).any())
     return is_sure and bool(np.nanmean(off**2) > OTHER_PX**2)
+
+
+def by_told_intrinsics(run: Run, sensors: Collection[str]) -> Run:
+    """The run from its beginning with poses of targets by intrinsics that a sensor's images of flat boards tell alone.
+
+    They count as unknown then. Raises CameraError where the images determine none, or an image has no pose by them.
+    """
+    problem = run.problem
+    told: dict[str, Camera] = {}
+    for name in sensors:
+        stated = problem.cameras[name]
+        seen = [
+            (problem.boards[pair.target][known], image[known])
+            for pair in problem.pairs
+            if pair.sensor == name and pair.target in problem.boards and not problem.boards[pair.target][:, 2].any()
+            for image in _images(problem, pair)
+            if (known := np.isfinite(image[:, 0])).sum() >= CORNERS
+        ]
+        lens: Lens = "equidistant" if stated.model == "equidistant" else "any"
+        boards, pixels = [board for board, _ in seen], [image for _, image in seen]
+        told[name] = estimated_intrinsics(boards, pixels, (stated.width, stated.height), lens).camera
+    again = by_intrinsics(problem, told)
+    corners = run.options.corners or CornerOptions()
+    of_cameras = {name: "unknown" if name in told else corners.stated_of(name) for name in problem.cameras}
+    options = replace(run.options, corners=replace(corners, stated=of_cameras))
+    return replace(run.attempt(), problem=again, options=options, times=2)
+
+
+def _images(problem: Problem, pair: Pair) -> Array:
+    pixels = problem.measurements(*pair).pixels
+    return np.zeros((0, 0, 2)) if pixels is None else pixels[np.isfinite(pixels).any(axis=(1, 2))]
+
+
+def by_intrinsics(problem: Problem, cameras: Mapping[str, Camera]) -> Problem:
+    """The problem with poses of targets by other intrinsics; of a plane's two, those near a certified solution."""
+    every = {}
+    for pair in problem.pairs:
+        raw = every[pair] = problem.measurements(*pair)
+        if pair.sensor not in cameras or raw.pixels is None:
+            continue
+        rows = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2)))
+        both = candidates_of(
+            cameras[pair.sensor], problem.boards[pair.target], raw.pixels[rows], problem.corner_px or 0.1, pair.label
+        )
+        every[pair] = with_poses(raw, rows, *both.chosen(both.by_carriers(raw.A[rows])))
+    again = problem.with_measurements(every)
+    again.cameras = {**problem.cameras, **cameras}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)  # of weights: no outlier is left out yet
+        solution = solve(again)
+    return nearer_poses(again, solution.X, solution.Y)[0]

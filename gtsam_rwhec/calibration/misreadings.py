@@ -12,12 +12,14 @@ none, never (280 draws).
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors.se3 import inverse, so3_logmap
 
+from gtsam_rwhec.calibration.calibrate_options import Run
 from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.other_readings import (
     A_INVERTED,
@@ -42,12 +44,13 @@ from gtsam_rwhec.calibration.trial_fits import (
     signal_of,
 )
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.errors import RwhecWarning, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,10 @@ class Misreading:
         What was likely misread, and what to do.
     rotation_deg, translation_mm : (float, float)
         The median residuals as read, and if read otherwise.
+    of_B : bool
+        Whether B was misread.
+    inverts_A : bool
+        Whether A, alone, is the inverse of what was meant: the carriers are exchanged.
     """
 
     mistake: Mistake
@@ -126,6 +133,8 @@ class Misreading:
     cure: str
     rotation_deg: tuple[float, float]
     translation_mm: tuple[float, float]
+    of_B: bool = False
+    inverts_A: bool = False
 
     def __str__(self) -> str:
         before, after = (
@@ -133,6 +142,50 @@ class Misreading:
             for deg, mm in zip(self.rotation_deg, self.translation_mm, strict=True)
         )
         return f"{self.likely}: the median residual is {before} as read, and {after} otherwise; {self.cure}"
+
+
+@one_blas_thread()
+def misread_as_recorded(run: Run) -> Reading:
+    """How a log's poses were misread in a way that neither sizes nor clocks explain; empty where they were not.
+
+    What cleaning removed counts: a misreading makes it contradict the motion. B that this library found in images was
+    not misread; and where A is the inverse of poses as they were written, these may have been.
+    """
+    recording = run.recording
+    if recording is None or recording.uncleaned is None or run.times > 1 or not run.options.misreadings:
+        return Reading()
+    problem = recording.uncleaned
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
+        try:
+            found = _of_recording(problem, run)
+            if found and recording.is_inverse:
+                found = min(found, _of_recording(inverted(problem), run) or found, key=_is_left)
+        except ScaleError:
+            return Reading()
+    exchanged = exchange_of(problem).misreading if not found else None
+    found = found if exchanged is None else (exchanged,)
+    return Reading() if all(one.mistake.may_be_sizes_or_clocks for one in found) else Reading(found)
+
+
+def _of_recording(problem: Problem, run: Run) -> tuple[Misreading, ...]:
+    assert run.recording is not None
+    found = misreadings(problem, solve(problem, options=run.options.solve, progress=run.tell), progress=run.tell)
+    return (tuple(one for one in found if not one.of_B) or found) if run.recording.is_detected else found
+
+
+def inverted(problem: Problem) -> Problem:
+    """The same measurements with A and B inverted, and targets and sensors exchanged: B^-1 = X^-1 A^-1 Y."""
+    turned = Problem(problem.scale)
+    for target, sensor in problem.pairs:
+        measured = problem.measurements(target, sensor)
+        turned.add(sensor, target, inverse(measured.A), inverse(measured.B))
+    return turned
+
+
+def _is_left(found: tuple[Misreading, ...]) -> float:
+    """The product of the residuals that the first reading leaves."""
+    return found[0].rotation_deg[1] * found[0].translation_mm[1]
 
 
 def are_too_few_to_tell(problem: Problem) -> bool:
@@ -335,6 +388,8 @@ class _Trial:
             "; ".join(part.cure for part in parts),
             (math.degrees(before.rotation_rad), math.degrees(fit.residual.rotation_rad)),
             (1e3 * before.translation_m, 1e3 * fit.residual.translation_m / factor),
+            reading.of_B,
+            reading.inverts_A,
         )
 
     def named_with_unit(self, reading: OtherReading, fit: TrialFit) -> Misreading | None:
@@ -395,6 +450,7 @@ def exchange_of(problem: Problem) -> Exchange:
                 A_INVERTED.cure,
                 (math.degrees(before.rotation_rad), math.degrees(after.rotation_rad)),
                 (1e3 * before.translation_m, 1e3 * after.translation_m),
+                inverts_A=True,
             )
         )
     is_small = is_plain(given.residual, signal)

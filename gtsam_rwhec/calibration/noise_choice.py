@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run, offsets_of
-from gtsam_rwhec.calibration.outliers import Inliers, spare_equations
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, offsets_of
+from gtsam_rwhec.calibration.outliers import spare_equations
 from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
@@ -194,7 +194,12 @@ def refined_under_its_noise(
     record = run.record
     run.tell("refining")
     try:
-        refined, noise, inliers = estimated(run.problem, solution, inliers, run.options, run.tell)
+        if run.agreed is not None and inliers:  # a log's were chosen under each detection's own noise, and stay
+            kept = selected(run.problem, inliers)
+            refined, noise, _ = estimated(kept, solution, {}, run.options, run.tell)
+            refined = replace(refined, inliers=inliers)
+        else:
+            refined, noise, inliers = estimated(run.problem, solution, inliers, run.options, run.tell)
     except (NoiseError, CountError, UnderdeterminedError) as error:
         record.choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
         number = run.problem.number_of_measurements
@@ -202,7 +207,7 @@ def refined_under_its_noise(
         record.find(Ground.NO_COVARIANCE, words)
         return None, NOT_KNOWN, solution, inliers
     if run.options.noise == "given":
-        record.choose("noise of B", "as given", "an option says so")
+        record.choose("noise of B", "as given", run.says_so)
         _doubt_stated_noise(run, refined, inliers)
     elif refined.noise_source == "given":
         record.choose("noise of B", "as given", "the residuals are too few to estimate it")
@@ -240,7 +245,7 @@ def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers)
         return
     run.record.choose("noise of B", f"estimated, for each axis {model.size_words_of_B}", f"{shown} beside A's")
     size = f"{rounded(math.degrees(stated.rotation_rad))}° and {rounded(1e3 * stated.translation_m)} mm for each axis"
-    run.record.choose("noise of A", f"{size}, as you stated", "an option says so")
+    run.record.choose("noise of A", f"{size}, as you stated", run.says_so)
     _doubt_noise_of_A(run, refined, inliers)
 
 
@@ -267,7 +272,7 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
         record.find(Ground.CORRELATED, words)
     elif model.correlation is None:
         if run.options.drift == "none":
-            record.choose(what, "none", "an option says so")
+            record.choose(what, "none", run.says_so)
         elif model.drift_not_sought:
             record.choose(what, "no model of it was tried", model.drift_not_sought)
         else:
@@ -288,7 +293,7 @@ def _say_systematic(run: Run, model: NoiseInData) -> None:
     """Whether errors depend on the configuration, which is a finding too."""
     what, record = "systematic errors", run.record
     if not model.arms_assumed:
-        record.choose(what, "none", "an option says so")
+        record.choose(what, "none", run.says_so)
         return
     tried = "a model with errors that vary with the carriers' configuration explains the residuals"
     if not model.has_systematic:

@@ -45,18 +45,31 @@ class Mistake(StrEnum):
     #: Angles in radians were read as degrees, or the reverse.
     ANGLE_UNIT = "angle_unit"
 
+    @property
+    def may_be_sizes_or_clocks(self) -> bool:
+        """Whether sizes that are estimated, or clocks, may look like it: directions do not tell it."""
+        return self in (Mistake.UNIT, Mistake.SCALE, Mistake.ROWS_SHIFTED)
+
+    @property
+    def is_of_rotations(self) -> bool:
+        """Whether angles of another convention look like it."""
+        return self in (Mistake.QUATERNION_ORDER, Mistake.TRANSPOSED, Mistake.HANDEDNESS)
+
 
 @dataclass(frozen=True)
 class OtherReading:
     """One way to read A and B otherwise; ``changed`` takes A and B (N, 4, 4) and returns them as they were meant.
 
-    ``likely`` and ``cure`` are parts of a sentence: what was misread, and what to do.
+    ``likely`` and ``cure`` are parts of a sentence: what was misread, and what to do. ``of_B``: whether B was misread;
+    ``inverts_A``: whether A, alone, is the inverse of what was meant.
     """
 
     mistake: Mistake
     likely: str
     cure: str
     changed: Callable[[Array, Array], Rows]
+    of_B: bool = False
+    inverts_A: bool = False
     exchanges_roles: bool = False
     shift: int = 0
     of_small_angles: bool = False
@@ -117,6 +130,7 @@ def _quaternions() -> list[OtherReading]:
                     f"the quaternions of {' and '.join(sides)} are {given}, and were read as {read}",
                     f"read {' and '.join(sides)} with order={given!r} (CSV files have w first)",
                     _of_sides(sides, change),
+                    of_B="B" in sides,
                 )
             )
     return found
@@ -127,6 +141,7 @@ A_INVERTED = OtherReading(
     "A is inverted (the poses of the base and the hand are exchanged)",
     "give A = T_sensorcarrier_targetcarrier: the inverse of each pose in A",
     _of_sides(("A",), _inverted),
+    inverts_A=True,
 )
 _INVERTED = [
     A_INVERTED,
@@ -135,6 +150,7 @@ _INVERTED = [
         "B is inverted",
         "give B = T_sensor_target, the target's pose in the sensor's frame: the inverse of each pose in B",
         _of_sides(("B",), _inverted),
+        of_B=True,
     ),
 ]
 _BOTH_INVERTED = OtherReading(
@@ -142,6 +158,7 @@ _BOTH_INVERTED = OtherReading(
     "A and B are both inverted",
     "give the inverse of each pose in A and in B",
     _of_sides(("A", "B"), _inverted),
+    of_B=True,
 )
 #: The poses as they are; with a free scale it tells a wrong unit.
 AS_READ = OtherReading(Mistake.UNIT, "", "", lambda A, B: (A, B))
@@ -158,6 +175,7 @@ _TRANSPOSED = [
         f"the rotations of {side} are transposed (rows for columns, or quaternions of the JPL convention)",
         f"transpose the rotation matrices of {side}, and keep its translations",
         _of_sides((side,), _transposed),
+        of_B=side == "B",
     )
     for side in "AB"
 ]
@@ -196,6 +214,8 @@ def _joined(first: OtherReading, second: OtherReading) -> OtherReading:
         f"{first.likely}, and {second.likely}",
         f"{first.cure}; {second.cure}",
         changed,
+        of_B=first.of_B or second.of_B,
+        inverts_A=first.inverts_A or second.inverts_A,
         exchanges_roles=second.exchanges_roles,
     )
 
@@ -283,11 +303,11 @@ def readings_of_angles(A: Array, B: Array) -> Iterator[OtherReading]:
                 letters = "".join("XYZ"[axis] for axis in order)
                 cure = f"do not convert the Euler angles of {side}: they are in radians (intrinsic {letters})"
                 change = _of_side(side, _alone(stretched_euler(order)))
-                yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, change, of_small_angles=True)
+                yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, change, of_B=side == "B", of_small_angles=True)
         elif largest > SMALL_RAD:
             likely = f"the rotation vectors of {side} are in degrees, and were read as radians"
             cure = f"convert the rotation vectors of {side} to radians"
-            yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, _of_side(side, unwound))
+            yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, _of_side(side, unwound), of_B=side == "B")
 
 
 def _alone(change: Callable[[Array], Array]) -> Callable[[Array, Array], Array]:

@@ -13,11 +13,12 @@ from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import Run, offsets_of
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Sampled, TrialFit, fitted, implausible, residuals
 from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
 from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.robust_solution import robust_solution
 from gtsam_rwhec.geometry.poses import Array
@@ -32,9 +33,6 @@ HALF = 0.5
 NEARLY_HALF = 0.42
 #: From so many measurements on, nearly half is no accident.
 MANY_OF_A_FRAME = 10
-
-#: Which measurements of each pair count, (N,) booleans.
-Inliers = dict[Pair, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -308,7 +306,7 @@ def without_outliers(
     problem, options, record = run.problem, run.options, run.record
     spare = spare_equations(problem)
     if options.robust == "none":
-        record.choose(OUTLIERS, "every measurement counts", "an option says so")
+        record.choose(OUTLIERS, "every measurement counts", run.says_so)
         if gross := gross_errors(problem):
             record.find(Ground.OUTLIERS_KEPT, str(gross))
         return first, {}
@@ -325,7 +323,7 @@ def without_outliers(
         return first, {}
     offsets = clearly_off or offsets_of(problem, options)
     try:
-        solution, inliers = _agreeing(run, first, offsets)
+        solution, inliers = run.agreed or _agreeing(run, first, offsets)
         other = more_consistent(problem, inliers)
         if other is not None:
             solution, inliers = solve(selected(problem, other), options=options.solve), other
@@ -374,14 +372,15 @@ def _agreeing_under(
     problem, options = run.problem, run.options
     has_more = problem.has_covariances or options.carrier_noise is not None or bool(offsets)
     if first is not None and has_more:
-        return _inliers_under_the_full_noise(run, first, offsets, noise)
+        refined = refined_with_outliers(run, first, offsets, noise)
+        return refined.solution, refined.inliers
     found = robust_solution(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=run.tell)
     return found.solution, found.inliers
 
 
-def _inliers_under_the_full_noise(
-    run: Run, first: Solution, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
-) -> tuple[Solution, Inliers]:
+def refined_with_outliers(
+    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
+) -> Refined:
     """Inliers where sigma and kappa do not hold the whole noise: ``refine`` chooses them again under it."""
     options = run.options
     how = RefineOptions(
@@ -395,14 +394,13 @@ def _inliers_under_the_full_noise(
         carrier_path=options.carrier_path if offsets else None,
     )
     try:
-        refined = refine(run.problem, first, how, progress=run.tell)
+        return refine(run.problem, first, how, progress=run.tell)
     except NoiseError:
         if options.carrier_noise is None:
             raise
         # More noise is stated for A than the residuals hold. They are judged by what they show, and again under
         # the noise that is found.
-        refined = refine(run.problem, first, replace(how, carrier_noise=None), progress=run.tell)
-    return refined.solution, refined.inliers
+        return refine(run.problem, first, replace(how, carrier_noise=None), progress=run.tell)
 
 
 def share_that_agrees_plausibly(run: Run, first: Solution | None) -> float | None:

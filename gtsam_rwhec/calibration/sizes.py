@@ -194,8 +194,7 @@ def sizes(
             refined = refine(free, start, options or RefineOptions(noise="estimate"))
         except (ScaleError, CountError, NoiseError, UnderdeterminedError):
             return ()
-        assert isinstance(refined.scale, Mapping)
-        found = [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
+        found = sizes_in(refined)
         if any(size.is_doubted or size.is_uncertain for size in found):
             found = _under_all_noise(free, options, like, progress or silent) or _with_jackknife(free, found)
     return tuple(found)
@@ -219,6 +218,11 @@ def _under_all_noise(
         return []
     if noise.is_drift_untried:
         return []  # errors of neighbours in time are alike, and the deviations do not know it
+    return sizes_in(refined)
+
+
+def sizes_in(refined: Refined) -> list[TargetSize]:
+    """The sizes of an answer with a scale of each target."""
     assert isinstance(refined.scale, Mapping)
     return [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
 

@@ -8,30 +8,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors.se3 import inverse
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Run
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Recording, Run
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.clock_offsets import Answer, answer, check_offsets, late_in_place_of_shifted
-from gtsam_rwhec.calibration.from_corners import answered_by_corners, check_observations, with_better_poses
-from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, reading_of
+from gtsam_rwhec.calibration.from_corners import (
+    answered_by_corners,
+    by_told_intrinsics,
+    check_observations,
+    with_better_poses,
+)
+from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, misread_as_recorded, reading_of
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, views_of
+from gtsam_rwhec.calibration.settled_measurements import settled_measurements
 from gtsam_rwhec.calibration.sizes import TargetSize, doubted_lengths, undetectable
-from gtsam_rwhec.calibration.stated_knowledge import doubt_one_pose, doubt_stated_poses, doubt_stated_sizes
+from gtsam_rwhec.calibration.stated_knowledge import (
+    doubt_one_pose,
+    doubt_stated_poses,
+    doubt_stated_sizes,
+    say_estimated_sizes,
+)
 from gtsam_rwhec.calibration.trial_fits import implausible
 from gtsam_rwhec.calibration.verdict import READING, Finding, Ground, Judgement, findings_of, proof_of
-from gtsam_rwhec.errors import OptionError, ScaleError
+from gtsam_rwhec.errors import OptionError, RwhecError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.solver.solution import Solution, solve
 
@@ -138,7 +151,11 @@ FEWEST_POSES = 6
 
 @one_blas_thread()
 def calibrate(
-    problem: Problem, options: CalibrateOptions | None = None, *, progress: Progress | None = None
+    problem: Problem,
+    options: CalibrateOptions | None = None,
+    *,
+    recording: Recording | None = None,
+    progress: Progress | None = None,
 ) -> Calibration:
     """Find the best answer that the measurements hold, with an uncertainty and a verdict.
 
@@ -148,6 +165,8 @@ def calibrate(
         With its raw measurements: without them, outliers are not looked for.
     options : CalibrateOptions, optional
         Each overrules one choice that is otherwise made from the data.
+    recording : Recording, optional
+        What a log knows beside these measurements.
     progress : callable, optional
         Is called with the name of each stage as it begins.
 
@@ -177,9 +196,17 @@ def calibrate(
         )
     _check_what_needs_measurements(problem, options)
     check_observations(problem, options)
-    run = Run(problem, options, progress or silent)
+    run = Run(problem, options, progress or silent, recording)
     check_offsets(run)
-    return _calibrated(run)
+    found = _calibrated(run)
+    if recording is None or not recording.far_off or (found.refined is not None and found.refined.intrinsics):
+        return found
+    run.tell("computing the poses of targets again, with intrinsics that the images tell")
+    try:
+        again = _calibrated(by_told_intrinsics(run, recording.far_off))
+    except RwhecError:  # no pose by these: what the stated ones gave is judged
+        return found
+    return again if again.refined is not None and again.refined.intrinsics else found
 
 
 def _check_what_needs_measurements(problem: Problem, options: CalibrateOptions) -> None:
@@ -194,18 +221,26 @@ def _check_what_needs_measurements(problem: Problem, options: CalibrateOptions) 
 def _calibrated(run: Run) -> Calibration:
     """All stages, one after the other, and their verdict."""
     found_sizes: tuple[TargetSize, ...] = ()
+    by_corners = None
     with run.record.noted():
-        first, why = _solved(run)
-        reading, found = _read_and_answered(run, first)
-        better = with_better_poses(run, found)
+        reading = misread_as_recorded(run)
+        late = () if run.recording is None else run.recording.late
+        if reading.finding is not None or late:
+            first, why = _solved(run)
+            found = _nothing_else(run, first, [*([reading.finding] if reading.finding else []), *late])
+        else:
+            run, found_sizes, by_corners = settled_measurements(run)
+            first, why = _solved(run)
+            reading, found = _read_and_answered(run, first)
+        better, thin = with_better_poses(run, found)
         if better is not None:
             run.tell("once more, with the poses of targets that the answer says")
             return _calibrated(better)
         if found.refined is not None:
             doubt_stated_poses(run, found.refined, found.inliers)
             doubt_one_pose(run, found.refined, found.inliers)
-            found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
-            found = answered_by_corners(run, found)
+            found_sizes = found_sizes or doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
+            found = answered_by_corners(run, found, thin, by_corners)
     problem, record = run.problem, run.record
     lengths = None
     if found.solution is not None and not reading.misreadings:
@@ -218,7 +253,10 @@ def _calibrated(run: Run) -> Calibration:
         found, found_sizes = Answer(found.solution), ()
     elif reading.finding is not None:
         record.notes.clear()  # they warn of attempts at an answer that is not given
-    solution, inliers, refined = found.solution, found.inliers, found.refined
+    solution, inliers = found.solution, found.inliers
+    refined = None if found.refined is None else _as_stamped(found.refined, run.moved_s)
+    if refined is not None:
+        say_estimated_sizes(run, found_sizes, refined)
     if solution is None:
         record.find(Ground.NO_SCALE, why)
     outliers = outliers_of(run, inliers, is_answered=refined is not None and not refined.free_directions)
@@ -238,7 +276,7 @@ def _calibrated(run: Run) -> Calibration:
         X={} if best is None else best.X,
         Y={} if best is None else best.Y,
         scale=math.nan if best is None else best.scale,
-        time_offsets_s=found.time_offsets_s,
+        time_offsets_s={} if refined is None else refined.time_offsets_s,
         judgement=Judgement.of([*findings_of(solution, refined), *record.findings], proof_of(refined)),
         solution=solution,
         refined=refined,
@@ -254,7 +292,21 @@ def _calibrated(run: Run) -> Calibration:
         views={} if best is None else views_of(problem, inliers, best.scale),
         carriers=Carriers(problem.sensor_carrier, problem.target_carrier),
         options=run.options,
+        problem=problem,
     )
+
+
+def _as_stamped(refined: Refined, moved_s: Mapping[str, float]) -> Refined:
+    """The answer with time offsets over the stamps as they were given: A was taken later on the way."""
+    offsets = {name: moved_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
+    return replace(refined, time_offsets_s=offsets)
+
+
+def _nothing_else(run: Run, first: Solution | None, findings: list[Finding]) -> Answer:
+    """The answer that is no more than the first solution, since measurements were misread or are of another time."""
+    run.record.choose(READING, "nothing else is computed", "the poses were misread, or are of another time")
+    run.record.findings += findings
+    return Answer(first)
 
 
 def _solved(run: Run) -> tuple[Solution | None, str]:
@@ -278,9 +330,10 @@ def _read_and_answered(run: Run, first: Solution | None) -> tuple[Reading, Answe
     Residuals of no sensor in the fit of all measurements may come from outliers alone: then those that agree decide.
     """
     what, tries = READING, run.options.misreadings
-    reading = (
-        reading_of(run.problem, first, run.tell) if tries else Reading(implausible=implausible(run.problem, first))
-    )
+    problem, agreeing = run.problem, first
+    if run.agreed is not None:  # a log's poses were read, with those that cleaning removed, before
+        agreeing, problem = run.agreed[0], selected(run.problem, run.agreed[1])
+    reading = reading_of(problem, agreeing, run.tell) if tries else Reading(implausible=implausible(problem, agreeing))
     if reading.misreadings and all(one.mistake is Mistake.ROWS_SHIFTED for one in reading.misreadings):
         late = late_in_place_of_shifted(run, first)
         if late is not None:

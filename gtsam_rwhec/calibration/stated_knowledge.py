@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run
 from gtsam_rwhec.calibration.moved_frames import (
     Measured,
     TwoPoses,
@@ -27,7 +27,6 @@ from gtsam_rwhec.calibration.moved_frames import (
     two_poses,
 )
 from gtsam_rwhec.calibration.noise_choice import estimated
-from gtsam_rwhec.calibration.outliers import Inliers
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
@@ -222,10 +221,10 @@ def doubt_stated_sizes(
 ) -> tuple[TargetSize, ...]:
     """What the motion says about sizes that were said to be known; those that it contradicts are found."""
     problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
-    if problem.scale != "known":
+    if problem.scale != "known" or options.sizes in ("correct", "estimate"):
         return ()
     if options.sizes == "known":
-        record.choose(what, "as stated", "an option says so")
+        record.choose(what, "as stated", run.says_so)
         return ()
     noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
     late = tuple(refined.time_offsets_s)
@@ -256,3 +255,29 @@ def doubt_stated_sizes(
     else:
         record.choose(what, "as stated", "the motion does not tell them, so a wrong size would not show")
     return found
+
+
+def say_estimated_sizes(run: Run, found: Sequence[TargetSize], refined: Refined) -> None:
+    """Stated sizes that the motion contradicts, and that were estimated in their place.
+
+    Where another stated size fits the motion, the unit of A and the focal lengths are right, and the poses rest on it.
+    Where none does, any of the three may be wrong; the focal lengths only where they were not estimated too.
+    """
+    if run.options.sizes != "correct":
+        return
+    told = [size for size in found if size.sigma is not None]
+    doubted = [size for size in told if size.is_doubted]
+    what = "sizes of targets"
+    if not doubted:
+        why = "does not contradict them" if told else "does not tell them, so a wrong size would not show"
+        run.record.choose(what, "as stated", f"the motion {why}")
+        return
+    names = ", ".join(size.target for size in doubted)
+    run.record.choose(what, f"estimated for {names}", "the motion contradicts the stated ones")
+    words = "; ".join(map(str, doubted))
+    if len(doubted) < len(told):
+        run.record.find(Ground.SIZE_ESTIMATED, f"{words}; the poses use the size that the motion gives")
+        return
+    others = "unit of lengths in A" if refined.intrinsics else "unit of lengths in A or the focal lengths"
+    why = f"nothing tells whether the sizes are wrong or the {others}"
+    run.record.find(Ground.NO_SIZE_FITS, f"{words}; the poses use the sizes that the motion gives, and {why}")

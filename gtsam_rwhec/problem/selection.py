@@ -161,11 +161,11 @@ def nearer_poses(
         if camera is not None:
             changed[:] = True
         if changed.any():
-            every[pair] = _with_poses(raw, rows[changed], T[changed], covariance[changed])
+            every[pair] = with_poses(raw, rows[changed], T[changed], covariance[changed])
     return (problem.with_measurements(every), number) if number or cameras else (problem, 0)
 
 
-def _with_poses(raw: Measurements, rows: np.ndarray, T: Array, covariance: Array) -> Measurements:
+def with_poses(raw: Measurements, rows: np.ndarray, T: Array, covariance: Array) -> Measurements:
     """Measurements with other poses and covariances in some rows."""
     assert raw.covariances is not None
     B, covariances = raw.B.copy(), raw.covariances.copy()

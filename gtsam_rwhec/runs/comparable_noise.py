@@ -7,33 +7,47 @@ the residuals of the targets alone.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.errors import RwhecError, RwhecWarning
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import PairNoise
+from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, Pairs, problem_of
+from gtsam_rwhec.solver.solution import solve
 
 
-def with_comparable_noise(rounds: SolvingRounds, given: SynchronisedPairs) -> SynchronisedPairs:
+def with_comparable_noise(
+    pairs: Pairs, rig: Rig, motion: CarrierMotion, offsets_s: Mapping[str, float], tell: Progress
+) -> Pairs:
     """The pairs with covariances of the targets' poses as their own residuals have them.
 
     They stay as they are where the rig file states the noise, where there is no odometry or no target, and where the
     targets alone have no answer.
     """
-    targets = {pair: one for pair, one in given.pairs.items() if not pair.is_motion and one.used.any()}
-    if rounds.rig.noise != "estimate" or not targets or not any(pair.is_motion for pair in given.pairs):
-        return given
-    rounds.progress("finding the noise of the targets' poses")
+    targets = {pair: one for pair, one in pairs.items() if not pair.is_motion and one.used.any()}
+    if rig.noise != "estimate" or not targets or not any(pair.is_motion for pair in pairs):
+        return pairs
+    tell("finding the noise of the targets' poses")
+    problem = problem_of(targets, rig, offsets_s)
+    options = RefineOptions(
+        noise="estimate", robust=rig.cleaning.robust, carrier_noise=motion.noise, carrier_model="propagated"
+    )
     try:
-        noise = rounds.refined(replace(given, pairs=targets), (), "outliers").noise
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            noise = refine(problem, solve(problem), options, progress=tell).noise
     except RwhecError:
-        return given  # all measurements together may have an answer, under weights that are guessed
-    found = {pair: _with_noise(one, noise[pair]) for pair, one in targets.items() if pair in noise}
-    return replace(given, pairs=given.pairs | found)
+        return pairs  # all measurements together may have an answer, under weights that are guessed
+    return pairs | {pair: _with_noise(one, noise[pair]) for pair, one in targets.items() if pair in noise}
 
 
 def _with_noise(measured: MeasuredPairs, noise: PairNoise) -> MeasuredPairs:

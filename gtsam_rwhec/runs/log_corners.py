@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -13,11 +14,13 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log, open_log
+from gtsam_rwhec.problem.corners import check_in_image
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.result_file import parse_result
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, read_pairs
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, Pairs, read_pairs
 from gtsam_rwhec.runs.run_log import (
     RESULT_FILE,
     detections_topic,
@@ -49,21 +52,6 @@ class LogCorners:
         }
         return LogCorners(detections, {target.name: target.corners() for target in rig.target_list})
 
-    def lacking(self, pairs: Mapping[Pair, MeasuredPairs]) -> tuple[Pair, ...]:
-        """Pairs with used measurements none of which has corners."""
-        return tuple(
-            pair for pair, measured in pairs.items() if measured.used.any() and not len(self.seen(measured)[0])
-        )
-
-    def without_corners(self, pairs: Mapping[Pair, MeasuredPairs]) -> dict[Pair, int]:
-        """How many used measurements have no corners, of the pairs of which some have."""
-        missing = {
-            pair: int(measured.used.sum()) - number
-            for pair, measured in pairs.items()
-            if (number := len(self.seen(measured)[0]))
-        }
-        return {pair: number for pair, number in missing.items() if number}
-
     def seen(self, measured: MeasuredPairs) -> tuple[np.ndarray, Array]:
         """A pair's used measurements with corners (V,), and their pixels (V, n, 2), nan where a corner was not seen."""
         number = len(self.targets[measured.target])
@@ -77,6 +65,32 @@ class LogCorners:
             which.append(i)
             pixels.append(corners)
         return np.array(which, dtype=int), np.array(pixels).reshape(-1, number, 2)
+
+    def in_problem(
+        self, problem: Problem, pairs: Mapping[Pair, MeasuredPairs], cameras: Mapping[str, Camera]
+    ) -> Problem:
+        """The problem of the used measurements with their corners, of sensors with intrinsics.
+
+        Raises CameraError where a corner is outside its image, as a driver's may be.
+        """
+        every = {pair: problem.measurements(*pair) for pair in problem.pairs}
+        boards, sensors = {}, {}
+        for pair, raw in every.items():
+            if pair.sensor not in cameras or pair.is_motion:
+                continue
+            seen, pixels = self.seen(pairs[pair])
+            if not len(seen):
+                continue
+            check_in_image(pixels, cameras[pair.sensor], f"the images of {pair.sensor}")
+            corners = np.full((len(raw.A), *pixels.shape[1:]), np.nan)
+            corners[np.searchsorted(np.flatnonzero(pairs[pair].used), seen)] = pixels
+            every[pair] = replace(raw, pixels=corners)
+            boards[pair.target], sensors[pair.sensor] = self.targets[pair.target], cameras[pair.sensor]
+        if not boards:
+            return problem
+        result = problem.with_measurements(every)
+        result.boards, result.cameras = boards, sensors
+        return result
 
     def observations(
         self,
@@ -141,3 +155,33 @@ def _offsets_s(log: Log) -> dict[str, float]:
         return read_cleaning_report(log).time_offsets_s
     result = parse_result(content, f"{log.files[0].path}, attachment {RESULT_FILE}")
     return {} if result.log is None else {offset.sensor: offset.offset_s for offset in result.log.time_offsets}
+
+
+def with_intrinsics(
+    pairs: Mapping[Pair, MeasuredPairs],
+    logged: LogCorners,
+    cameras: Mapping[str, Camera],
+    X: Mapping[str, gtsam.Pose3],
+    Y: Mapping[str, gtsam.Pose3],
+    corner_px: float,
+) -> Pairs:
+    """The pairs with B of their corners by some intrinsics: of a plane's two poses, the one near Y^-1 A X.
+
+    Raises TargetError for a target that is not flat: it has no pose in an image alone.
+    """
+    changed = dict(pairs)
+    for pair, measured in pairs.items():
+        seen, pixels = logged.seen(measured)
+        if not len(seen) or pair.target not in X or pair.sensor not in Y:
+            continue
+        A = measured.A[seen]
+        predicted: Array = np.linalg.inv(Y[pair.sensor].matrix()) @ A @ X[pair.target].matrix()
+        observations = replace(logged.of_views({pair: (A, pixels, None)}, cameras), corner_px=corner_px)
+        poses = observations.poses({pair: predicted}).measurements(*pair)
+        B = measured.B.copy()
+        B[seen] = poses.B
+        covariance = None if measured.covariance is None else measured.covariance.copy()
+        if covariance is not None and poses.covariances is not None:
+            covariance[seen] = poses.covariances
+        changed[pair] = replace(measured, B=B, covariance=covariance)
+    return changed

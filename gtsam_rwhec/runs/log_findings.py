@@ -21,20 +21,16 @@ from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 
 #: A point that is known to this share of its distance only (with 95 %) is known to nothing.
 LARGEST_SHARE = 0.25
-#: Mistakes in rotations that angles of another convention look like, for poses without quaternions or matrices.
-OF_ROTATIONS = (Mistake.QUATERNION_ORDER, Mistake.TRANSPOSED, Mistake.HANDEDNESS)
 #: What to do about it.
 OTHER_ANGLES = (
     "write the axes in the order of the turns, capitals for turning axes (ZYX: yaw, pitch, roll) and small letters for "
     "fixed ones (xyz: roll, pitch, yaw), or rotation_vector"
 )
-#: Other sizes that are estimated, or other clocks, may look like these.
-NOT_OF_DIRECTIONS = (Mistake.UNIT, Mistake.SCALE, Mistake.ROWS_SHIFTED)
 
 
 def is_of_the_poses(misreadings: Sequence[Misreading]) -> bool:
     """Whether poses were misread in a way that neither sizes nor clocks explain: then no round helps."""
-    return bool(misreadings) and all(one.mistake not in NOT_OF_DIRECTIONS for one in misreadings)
+    return bool(misreadings) and all(not one.mistake.may_be_sizes_or_clocks for one in misreadings)
 
 
 def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading, ...]:
@@ -47,15 +43,15 @@ def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading
     said = [replace(one, likely=_exchange(rig), cure=_unless_carried(rig)) for one in exchanged[:1]]
     is_B = [one.mistake is Mistake.INVERTED and bool(exchanged) for one in misreadings]
     others = [one for one, left_out in zip(misreadings, is_B, strict=True) if one not in exchanged and not left_out]
-    if rig.carriers.poses.euler is not None and any(one.mistake in OF_ROTATIONS for one in others):
-        of_angles = next(one for one in others if one.mistake in OF_ROTATIONS)
+    if rig.carriers.poses.euler is not None and any(one.mistake.is_of_rotations for one in others):
+        of_angles = next(one for one in others if one.mistake.is_of_rotations)
         return (*said, replace(of_angles, likely=_other_angles(rig), cure=OTHER_ANGLES))
     return (*said, *(replace(one, cure=_cure(one, rig)) for one in others))
 
 
 def _is_exchange(misreading: Misreading, rig: Rig) -> bool:
     """Whether exchanged carriers explain it. What this library detects in images is never inverted."""
-    if misreading.mistake is Mistake.INVERTED and "A is inverted" in misreading.likely:
+    if misreading.mistake is Mistake.INVERTED and misreading.inverts_A:
         return True
     from_images = all(sensor.images is not None for sensor in rig.sensors.values())
     return from_images and misreading.mistake in (Mistake.INVERTED, Mistake.ROLES_EXCHANGED)
@@ -134,7 +130,7 @@ def moved_of_left_out(
 
 def _cure(misreading: Misreading, rig: Rig) -> str:
     place = rig.source.place
-    also = f"; {_exchange(rig)}" if "A is inverted" in misreading.likely else ""
+    also = f"; {_exchange(rig)}" if misreading.inverts_A else ""
     if rig.carriers.poses.frames is not None and (cure := _cure_of_files(misreading.mistake, rig)):
         return cure + also
     if misreading.mistake is Mistake.INVERTED:

@@ -38,6 +38,28 @@ class MeasuredPairs(Track):
         return replace(self, A=A)
 
 
+#: Measured pairs by (target, sensor).
+Pairs = dict[Pair, MeasuredPairs]
+
+
+def without_marks(pairs: Mapping[Pair, MeasuredPairs], reasons: Collection[str]) -> Pairs:
+    """The pairs with the measurements that these reasons removed."""
+    return {
+        pair: replace(measured, reasons=tuple("" if why in reasons else why for why in measured.reasons))
+        for pair, measured in pairs.items()
+    }
+
+
+def at_offsets(
+    pairs: Mapping[Pair, MeasuredPairs], path: Trajectory, offsets_s: Mapping[str, float], sensors: Collection[str]
+) -> Pairs:
+    """The pairs with A along a path at the time offsets of some sensors; the others stay as they are."""
+    return {
+        pair: measured.at(path, offsets_s[pair.sensor]) if pair.sensor in sensors else measured
+        for pair, measured in pairs.items()
+    }
+
+
 def pair_records(pairs: Iterable[MeasuredPairs]) -> list[PairRecord]:
     """Every measurement that has a pose, in order of time."""
     records = [

@@ -1,48 +1,68 @@
-"""The third stage: from synchronised pairs to a certified, refined calibration with checked sizes and time offsets."""
+"""The third stage: from a cleaned log to its calibration, with what only a log shows of it."""
 
 from __future__ import annotations
 
+import math
+import warnings
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Recording, SizesChoice
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.misreadings import Reading
+from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, exchange_of
 from gtsam_rwhec.calibration.outliers import Outliers
-from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Finding, Ground, Judgement, Verdict
+from gtsam_rwhec.calibration.stages import calibrate
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.cameras.intrinsics_evidence import IntrinsicsEvidence
+from gtsam_rwhec.errors import CameraError, LogError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.fit_options import CornerOptions, RefineOptions
 from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
+from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.logs.mcap_reader import Log, open_log
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.results.log_history import CleaningReport, LogFields, OutlierCount, SizeFields, TimeOffsetFields
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.result_judgement import judge, short_of_measurements
-from gtsam_rwhec.rig import GivenSection, Rig
-from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.rig.odometry_sections import GivenSection
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_solving
+from gtsam_rwhec.runs.clocks_by_turning import late_clocks
 from gtsam_rwhec.runs.comparable_noise import with_comparable_noise
 from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
 from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
-from gtsam_rwhec.runs.first_answer import first_answer
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.log_findings import (
-    estimated_sizes,
-    in_rig_file,
-    known_to_nothing,
-    may_be_exchanged,
-    moved_of_left_out,
-    not_of_late_clocks,
-    not_of_marked_outliers,
-    with_cures,
+from gtsam_rwhec.runs.log_findings import estimated_sizes, in_rig_file, known_to_nothing, may_be_exchanged
+from gtsam_rwhec.runs.measured_pairs import (
+    MeasuredPairs,
+    Pairs,
+    at_offsets,
+    poses_used,
+    problem_of,
+    read_pairs,
+    without_marks,
 )
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
-from gtsam_rwhec.runs.run_log import CLEANING_METADATA, read_cleaning_report, read_metadata
-from gtsam_rwhec.runs.solving_rounds import Pairs, Purpose, SolvingRounds, sigma_of, without_outlier_marks
+from gtsam_rwhec.runs.run_log import CLEANING_METADATA, LogMetadata, read_cleaning_report, read_metadata
 from gtsam_rwhec.runs.turned_images import turned_images
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
+
+#: Reasons for which cleaning removes a measurement that does not agree with the carriers' motion.
+OF_THE_MOTION = (RemovalReason.NO_CONSENSUS, RemovalReason.ROTATION_OFF, RemovalReason.TRANSLATION_OFF)
+#: Findings of ``calibrate`` that a log says in its own words, with the lines of its rig file and the images.
+SAID_BY_THE_LOG = frozenset({
+    Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS, Ground.SIZE_DOUBTED, Ground.SIZE_UNCERTAIN, Ground.SIZE_ESTIMATED,
+    Ground.NO_SIZE_FITS, Ground.MANY_OUTLIERS,
+})  # fmt: skip
+#: What the rig file's word for sizes asks ``calibrate`` for.
+SIZES: dict[str, SizesChoice] = {"known": "check", "check": "correct", "estimate": "estimate"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +113,90 @@ class Calibrated(Solved):
     problem: Problem
 
 
+@dataclass(frozen=True, eq=False)
+class CleanedLog:
+    """What a cleaned log holds for its calibration; offsets in seconds by sensor."""
+
+    rig: Rig
+    metadata: LogMetadata
+    cleaning: CleaningReport
+    pairs: Pairs
+    motion: CarrierMotion
+    corners: LogCorners
+    doubted: Mapping[str, IntrinsicsEvidence]
+    of_shapes: tuple[Finding, ...]
+    estimated: tuple[str, ...]
+
+    @staticmethod
+    def read(log: Log, rig: Rig | None) -> CleanedLog:
+        """Read a log that ``clean_log`` wrote; `LogError` where it cannot be calibrated."""
+        path, rig = log.files[0].path, rig_for_solving(log, rig)
+        if rig.is_of_odometries:
+            raise LogError(f"{path}: no sensor sees a target; solve it with solve_odometries")
+        if rig.given != GivenSection():
+            raise LogError(
+                f"{rig.source.place(('given',))}: what is given is not used where cameras see targets; "
+                "leave it out, or calibrate the odometries alone"
+            )
+        metadata, cleaning = read_metadata(log), read_cleaning_report(log)
+        pairs = without_marks(read_pairs(log, rig), (RemovalReason.OUTLIER,))
+        used = {pair.sensor for pair, measured in pairs.items() if measured.used.any()}
+        if not used:
+            raise LogError(f"{path}: it has no usable pair of measurements")
+        motion = read_carrier_motion(log, rig)
+        corners = LogCorners.of(log, rig, metadata.cameras)
+        doubted = doubted_intrinsics(log, rig, metadata.cameras)
+        of_shapes = doubted_shapes(log, rig, metadata.cameras)
+        of_shapes += continued_boards(metadata.detection.strangers, rig)
+        asked = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used]
+        missing = [name for name in asked if name not in cleaning.time_offsets_s]
+        if missing:
+            raise LogError(f"{path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
+        at = at_offsets(pairs, motion.trajectory, cleaning.time_offsets_s, asked)
+        return CleanedLog(rig, metadata, cleaning, at, motion, corners, doubted, of_shapes, tuple(asked))
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """Stated intrinsics by sensor."""
+        return self.metadata.cameras
+
+    def problem_of(self, pairs: Pairs) -> Problem:
+        """The used measurements, with stamps on the carriers' clock."""
+        problem = problem_of(pairs, self.rig, self.cleaning.time_offsets_s)
+        problem.sensor_carrier, problem.target_carrier = self.rig.carriers.sensors, self.rig.carriers.targets
+        return problem
+
+    def options(self) -> CalibrateOptions:
+        """What the rig file says."""
+        rig, noise = self.rig, self.motion.noise
+        return CalibrateOptions(
+            noise="estimate" if rig.noise == "estimate" else "given",
+            robust="gnc" if rig.cleaning.robust == "gnc" else "none",
+            sizes=SIZES[rig.sizes],
+            carrier_noise=noise,
+            time_offsets=self.estimated or False,
+            carrier_path=self.motion.trajectory if self.estimated else None,
+            corners=CornerOptions(
+                stated={name: rig.sensors[name].stated for name in self.cameras if name in rig.sensors},
+                carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
+                about=self.motion.about,
+            ),
+        )
+
+    def recording(self, pairs: Pairs) -> Recording:
+        """What the log knows beside its measurements."""
+        rig, offsets_s = self.rig, self.cleaning.time_offsets_s
+        used = {pair.sensor for pair, measured in pairs.items() if measured.used.any()}
+        stated = {name: offsets_s.get(name, 0.0) for name in rig.sensors if name in used and name not in self.estimated}
+        return Recording(
+            uncleaned=self.problem_of(without_marks(pairs, OF_THE_MOTION)),
+            is_detected=all(sensor.images is not None for sensor in rig.sensors.values()),
+            is_inverse=rig.carriers.poses.parent_and_child[0] == rig.carriers.targets,
+            late=tuple(late_clocks(pairs, self.motion.trajectory, rig, stated)),
+            far_off=tuple(name for name, one in self.doubted.items() if one.is_far_off),
+        )
+
+
 @one_blas_thread()
 def solve_log(log: Log | str | Path, rig: Rig | None = None, *, progress: Progress | None = None) -> Calibrated:
     """Calibrate from a cleaned log.
@@ -115,136 +219,156 @@ def solve_log(log: Log | str | Path, rig: Rig | None = None, *, progress: Progre
     if not isinstance(log, Log):
         with open_log(log) as opened:
             return solve_log(opened, rig, progress=progress)
-    path = log.files[0].path
-    rig = rig_for_solving(log, rig)
-    if rig.is_of_odometries:
-        raise LogError(f"{path}: no sensor sees a target; solve it with solve_odometries")
-    if rig.given != GivenSection():
-        raise LogError(
-            f"{rig.source.place(('given',))}: what is given is not used where cameras see targets; "
-            "leave it out, or calibrate the odometries alone"
-        )
-    metadata, cleaning = read_metadata(log), read_cleaning_report(log)
-    pairs = read_pairs(log, rig)
-    used_sensors = {measured.sensor for measured in pairs.values() if measured.used.any()}
-    if not used_sensors:
-        raise LogError(f"{path}: it has no usable pair of measurements")
-    motion = read_carrier_motion(log, rig)
-    logged = LogCorners.of(log, rig, metadata.cameras)
-    doubted = doubted_intrinsics(log, rig, metadata.cameras)
-    of_shapes = doubted_shapes(log, rig, metadata.cameras)
-    of_shapes += continued_boards(metadata.detection.strangers, rig)
-    estimated = tuple(
-        name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used_sensors
-    )
-    missing = [name for name in estimated if name not in cleaning.time_offsets_s]
-    if missing:
-        raise LogError(f"{path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
-    rounds = SolvingRounds(rig, motion, estimated, progress or silent)
-    given = with_comparable_noise(rounds, rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s))
-    stated = [name for name in rig.sensors if name in used_sensors and name not in estimated]
-    stated_s = {name: given.offsets_s.get(name, 0.0) for name in stated}
-    first = first_answer(rounds, given, logged, metadata.cameras, stated_s, doubted)
-    poses, of_corners, before, late = first.poses, first.of_corners, first.misreadings, first.late
-    is_misread = first.is_misread
-    settled, sizes = poses.pairs, poses.sizes
-    calibration = rounds.calibrated(settled, poses.free, is_late=bool(late))
-    # Without a refined calibration (the measurements look misread) the poses are refined all the same, for the plots.
-    purpose: Purpose = "plots" if is_misread or late else "answer"
-    refined = calibration.refined or rounds.refined(settled, poses.free, purpose)
-    if calibration.refined is not None and not refined.free_directions:
-        refined = of_corners.refined(refined, calibration.noise.model)
-    # Those that were estimated from the same corners are named by them.
-    of_intrinsics = (
-        () if refined.intrinsics else tuple(finding_against(name, one, rig) for name, one in doubted.items())
-    )
-    offsets = settled.offsets_s | {n: settled.offsets_s[n] + value for n, value in refined.time_offsets_s.items()}
-    outliers = tuple(_outlier_count(measured) for measured in settled.pairs.values())
+    return _solved(CleanedLog.read(log, rig), progress)
+
+
+def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
+    rig, offsets_s = log.rig, log.cleaning.time_offsets_s
+    pairs = with_comparable_noise(log.pairs, rig, log.motion, offsets_s, progress or silent)
+    problem, against = log.problem_of(pairs), []
+    try:
+        problem = log.corners.in_problem(problem, pairs, log.cameras)
+    except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt
+        against.append(Finding(Ground.CORNERS_DOUBTED, str(error)))
+    found = calibrate(problem, log.options(), recording=log.recording(pairs), progress=progress)
+    refined = found.refined or _for_pictures(found, log.options(), progress)
+    whole = {name: offsets_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
+    pairs = _with_outliers_marked(at_offsets(pairs, log.motion.trajectory, offsets_s | whole, whole), found.outliers)
+    outliers = tuple(_outlier_count(measured) for measured in pairs.values())
+    left_out = _outliers(outliers, looked_for=found.outliers.looked_for)
     refined = replace(
-        refined,
-        time_offsets_s={name: offsets[name] for name in refined.time_offsets_s},
-        inlier_counts={
-            count.pair: (count.used, count.used + count.left_out)
-            for count in outliers
-            if rig.cleaning.robust == "gnc" and (count.used or count.left_out)
-        },
+        refined, time_offsets_s=whole, inliers={}, inlier_counts=left_out.counts if left_out.looked_for else {}
     )
-    fields = LogFields(
-        sensor_carrier=rig.carriers.sensors,
-        target_carrier=rig.carriers.targets,
-        detection=metadata.detection,
-        cleaning=cleaning,
-        outliers=outliers,
-        sizes=tuple(_in_the_answer(size, refined) for size in sizes),
-        time_offsets=tuple(
-            TimeOffsetFields(
-                sensor=name,
-                offset_s=offsets[name],
-                sigma_s=sigma_of(refined, Unknown(UnknownKind.TIME_OFFSET, name))
-                if name in refined.time_offsets_s
-                else None,
-            )
-            for name in rig.sensors
-            if name in offsets
-        )
-        + tuple(
-            TimeOffsetFields(
-                sensor=name, offset_s=cleaning.time_offsets_s[name], sigma_s=cleaning.coarse_sigma_s.get(name)
-            )
-            for name in rig.odometries
-            if name in cleaning.time_offsets_s
-        ),
-    )
-    left_out = _outliers(outliers, looked_for=rig.cleaning.robust == "gnc")
-    findings = with_cures(calibration.findings, calibration.misreadings, rig)
-    if left_out.looked_for:
-        findings = not_of_marked_outliers(findings)
-    if late:
-        findings = not_of_late_clocks(findings, calibration.misreadings)
-    findings = (*of_intrinsics, *of_shapes, *findings, *late)
-    findings = (*findings, *estimated_sizes(fields.sizes, rig, with_intrinsics=bool(refined.intrinsics)))
-    if refined.intrinsics or of_corners.corners is None:
-        findings = (*findings, *of_corners.findings)
-    if is_misread:  # as the poses were written, which tells more than A
-        found = Reading(in_rig_file(before, rig)).finding
-        others = (one for one in findings if one.ground not in (Ground.MISREAD, Ground.IMPLAUSIBLE))
-        findings = (*([found] if found is not None else []), *others)
-        calibration = replace(calibration, misreadings=before)
-    findings = (*findings, *(Finding(Ground.IMAGES_BLURRED, words) for words in metadata.detection.blurred))
-    if not (is_misread or late):
-        findings = (*findings, *moved_of_left_out(findings, refined, settled.pairs))
-        findings = (*findings, *turned_images(settled.pairs, refined, rig, metadata.image_names))
-    if not is_misread:  # a misreading makes cleaning remove measurements that are right
-        findings = (*findings, *short_of_measurements(fields, poses_used(settled.pairs.values())))
-        if calibration.judgement.verdict is not Verdict.DO_NOT_USE and rounds.may_be_exchanged(settled):
-            findings = (*findings, may_be_exchanged(rig, sum(count.used for count in outliers)))
-    if calibration.judgement.verdict is not Verdict.DO_NOT_USE:
-        findings = (*findings, *known_to_nothing(calibration.points.values(), rig))
-    judgement = judge(refined.solution, refined, fields, findings)
+    fields = _fields(log, found, refined, outliers, offsets_s | whole)
+    findings = [*against, *log.of_shapes, *_findings(log, found, refined, fields, pairs)]
     calibration = replace(
-        calibration,
-        findings=findings,
-        misreadings=in_rig_file(calibration.misreadings, rig),
+        found,
+        findings=tuple(findings),
+        misreadings=in_rig_file(found.misreadings, rig),
         refined=refined,
         X=refined.X,
         Y=refined.Y,
         scale=refined.scale,
-        time_offsets_s=refined.time_offsets_s,
-        judgement=judgement,
+        time_offsets_s=whole,
+        judgement=judge(refined.solution, refined, fields, findings),
         outliers=left_out,
-        choices=(
-            *_choices_before(rig, estimated, left_out),
-            *_made_in_the_answer(calibration.choices),
-            *of_corners.choices,
-        ),
     )
-    solution, cameras = refined.solution, dict(metadata.cameras)
+    inliers = found.outliers.inliers
     # With B by the stated intrinsics, as it was read: a log that is solved again begins where it began.
-    pairs = {
-        pair: replace(one, B=pairs[pair].B, covariance=pairs[pair].covariance) for pair, one in settled.pairs.items()
+    measured = {
+        pair: replace(one, B=log.pairs[pair].B, covariance=log.pairs[pair].covariance) for pair, one in pairs.items()
     }
-    problem = problem_of(settled.pairs, rig, settled.offsets_s, poses.free)
-    return Calibrated(refined, solution, pairs, fields, cameras, rig, judgement, calibration, problem)
+    counted = selected(found.problem, inliers) if inliers else found.problem
+    return Calibrated(
+        refined, refined.solution, measured, fields, dict(log.cameras), rig, calibration.judgement, calibration, counted
+    )
+
+
+def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progress | None) -> Refined:
+    """A refinement of measurements that were misread, or of which the noise is not known: for the plots alone."""
+    how = RefineOptions(
+        noise="given" if options.noise == "given" else "estimate",
+        carrier_noise=options.carrier_noise,
+        carrier_model="propagated",
+    )
+    problem, inliers = found.problem, found.outliers.inliers
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)
+        kept = selected(problem, inliers) if inliers else problem
+        return refine(kept, found.solution or solve(kept), how, progress=progress)
+
+
+def _findings(
+    log: CleanedLog, found: Calibration, refined: Refined, fields: LogFields, pairs: Pairs
+) -> Iterator[Finding]:
+    """What speaks against the poses, in the words of a log."""
+    rig, is_misread, late = log.rig, bool(found.misreadings), Ground.LATE_CLOCK
+    is_late = any(finding.ground is late for finding in found.findings) and found.refined is None
+    for sensor, one in log.doubted.items():
+        if sensor not in refined.intrinsics:
+            yield finding_against(sensor, one, rig)
+        elif one.is_far_off and refined.intrinsics[sensor].stated_as == "unknown":
+            yield finding_against(sensor, one, rig, refined.intrinsics[sensor].camera)
+    if is_misread and (said := Reading(in_rig_file(found.misreadings, rig)).finding) is not None:
+        yield said
+    dropped = SAID_BY_THE_LOG | ({Ground.MISREAD} if is_misread else set())
+    yield from (finding for finding in found.findings if finding.ground not in dropped)
+    yield from estimated_sizes(fields.sizes, rig, with_intrinsics=bool(refined.intrinsics))
+    yield from (Finding(Ground.IMAGES_BLURRED, words) for words in log.metadata.detection.blurred)
+    if not (is_misread or is_late):
+        yield from turned_images(pairs, refined, rig, log.metadata.image_names)
+    if not is_misread:  # a misreading makes cleaning remove measurements that are right
+        yield from short_of_measurements(fields, poses_used(pairs.values()))
+    if found.judgement.verdict is not Verdict.DO_NOT_USE:
+        if are_too_few_to_tell(found.problem) and exchange_of(found.problem).is_open:
+            yield may_be_exchanged(rig, sum(count.used for count in fields.outliers))
+        yield from known_to_nothing(found.points.values(), rig)
+
+
+def _fields(
+    log: CleanedLog,
+    found: Calibration,
+    refined: Refined,
+    outliers: tuple[OutlierCount, ...],
+    offsets_s: Mapping[str, float],
+) -> LogFields:
+    rig, cleaning, estimated = log.rig, log.cleaning, refined.time_offsets_s
+    offsets = [
+        TimeOffsetFields(
+            sensor=name,
+            offset_s=offsets_s[name],
+            sigma_s=sigma_of(refined, Unknown(UnknownKind.TIME_OFFSET, name)) if name in estimated else None,
+        )
+        for name in rig.sensors
+        if name in offsets_s
+    ]
+    offsets += [
+        TimeOffsetFields(sensor=name, offset_s=cleaning.time_offsets_s[name], sigma_s=cleaning.coarse_sigma_s.get(name))
+        for name in rig.odometries
+        if name in cleaning.time_offsets_s
+    ]
+    return LogFields(
+        sensor_carrier=rig.carriers.sensors,
+        target_carrier=rig.carriers.targets,
+        detection=log.metadata.detection,
+        cleaning=cleaning,
+        outliers=outliers,
+        sizes=_sizes(rig, found, refined),
+        time_offsets=tuple(offsets),
+    )
+
+
+def _sizes(rig: Rig, found: Calibration, refined: Refined) -> tuple[SizeFields, ...]:
+    """What the motion says of the targets' sizes: those that the answer estimates as it has them, and the others."""
+    told = {size.target: (size.scale, size.sigma, False) for size in found.sizes}
+    for name in rig.targets:
+        unknown = Unknown(UnknownKind.SCALE, name)
+        if not isinstance(refined.scale, float) and unknown in refined.joint.slots:
+            told[name] = (refined.scale[name], sigma_of(refined, unknown), True)
+    return tuple(
+        SizeFields(target=one.name, stated_m=one.length_m, scale=scale, sigma=sigma, is_free=is_free)
+        for one in rig.target_list
+        if one.name in told
+        for scale, sigma, is_free in [told[one.name]]
+    )
+
+
+def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
+    """The standard deviation of a scalar, or None if it is infinite."""
+    variance = float(refined.covariance(unknown)[0, 0])
+    return math.sqrt(variance) if math.isfinite(variance) else None
+
+
+def _with_outliers_marked(pairs: Pairs, outliers: Outliers) -> Pairs:
+    """The pairs with their outliers marked; these have a boolean for each used measurement of a pair."""
+    result = {}
+    for pair, measured in pairs.items():
+        reasons = list(measured.reasons)
+        if pair in outliers.inliers:
+            for i in np.flatnonzero(measured.used)[~outliers.inliers[pair]].tolist():
+                reasons[i] = RemovalReason.OUTLIER
+        result[pair] = replace(measured, reasons=tuple(reasons))
+    return result
 
 
 def _outliers(counts: tuple[OutlierCount, ...], *, looked_for: bool) -> Outliers:
@@ -256,33 +380,6 @@ def _outliers(counts: tuple[OutlierCount, ...], *, looked_for: bool) -> Outliers
         left_out=tuple(dict.fromkeys(name for count in counts for name in count.pair if name not in used)),
         looked_for=looked_for,
     )
-
-
-def _choices_before(rig: Rig, estimated: tuple[str, ...], outliers: Outliers) -> tuple[Choice, ...]:
-    """What was chosen in the rounds before the answer."""
-    choices = []
-    if outliers.looked_for:
-        choices.append(outliers.choice("they are farther off than the noise of the others explains"))
-    else:
-        choices.append(Choice(OUTLIERS, "every measurement counts", "the rig file says so"))
-    if estimated:
-        choices.append(
-            Choice("time offsets", f"estimated for {', '.join(estimated)}", "the rig file states none for them")
-        )
-    return tuple(choices)
-
-
-def _made_in_the_answer(choices: tuple[Choice, ...]) -> tuple[Choice, ...]:
-    return tuple(choice for choice in choices if choice.what not in (OUTLIERS, "sizes of targets", "time offsets"))
-
-
-def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:
-    """A free size as the answer has it. The answer takes the sizes that are not free as known."""
-    unknown = Unknown(UnknownKind.SCALE, size.target)
-    if isinstance(refined.scale, float) or unknown not in refined.joint.slots:
-        return size
-    found = {"scale": refined.scale[size.target], "sigma": sigma_of(refined, unknown), "is_free": True}
-    return size.model_copy(update=found)
 
 
 def _outlier_count(measured: MeasuredPairs) -> OutlierCount:

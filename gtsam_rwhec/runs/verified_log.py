@@ -20,16 +20,16 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.results.change_test import LEVEL, checked_level
 from gtsam_rwhec.results.log_history import DetectionReport
+from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.results.verification import Verification, verify
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning, rig_for_solving
 from gtsam_rwhec.runs.cleaning_stage import cleaned
-from gtsam_rwhec.runs.corner_answer import with_intrinsics
 from gtsam_rwhec.runs.detection_stage import detected
-from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
+from gtsam_rwhec.runs.log_corners import LogCorners, with_intrinsics
+from gtsam_rwhec.runs.measured_pairs import Pairs, at_offsets, problem_of, read_pairs, without_marks
 from gtsam_rwhec.runs.old_calibration import OldCalibration, with_cameras
 from gtsam_rwhec.runs.recorded_logs import is_file_of_samples, is_folder_of_images, write_folder_log, write_samples_log
 from gtsam_rwhec.runs.run_log import (
@@ -41,7 +41,6 @@ from gtsam_rwhec.runs.run_log import (
     read_cleaning_report,
     read_metadata,
 )
-from gtsam_rwhec.runs.solving_rounds import Pairs, SolvingRounds, without_outlier_marks
 
 #: Standard deviation of a corner along each axis where the old calibration is not from corners, pixels: what detection
 #: takes before it has measured it. The test finds the noise of poses itself.
@@ -142,13 +141,12 @@ def _verified(
     old: OldCalibration, log: Log, given: Rig | None, *, level: float, targets_may_move: bool, tell: Progress
 ) -> Verification:
     rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
-    pairs, motion = without_outlier_marks(read_pairs(log, rig)), read_carrier_motion(log, rig)
+    pairs, motion = without_marks(read_pairs(log, rig), (RemovalReason.OUTLIER,)), read_carrier_motion(log, rig)
     corners = LogCorners.of(log, rig, metadata.cameras)
     _check_carriers(old.result, rig)
     used = {measured.sensor for measured in pairs.values() if measured.used.any()}
     free = tuple(name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used)
-    rounds = SolvingRounds(rig, motion, free, tell)
-    pairs = rounds.at(pairs, cleaning.time_offsets_s).pairs
+    pairs = at_offsets(pairs, motion.trajectory, cleaning.time_offsets_s, free)
     cameras = {**metadata.cameras, **old.cameras}
     refined = old.result.refined
     if refined is not None and any(_differ(cameras[name], metadata.cameras[name]) for name in metadata.cameras):

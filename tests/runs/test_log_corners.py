@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,19 +13,15 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError, LogWarning
-from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.fitting import held_out_errors
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs.records import DetectionRecord
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs import clean_log, detect_log, read_corners, solve_log, write_folder_log
-from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
-from gtsam_rwhec.runs.corner_answer import corner_answer
-from gtsam_rwhec.runs.log_corners import LogCorners
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.measured_pairs import read_pairs
-from gtsam_rwhec.runs.run_log import read_cameras, read_embedded_rig
-from gtsam_rwhec.runs.settled_poses import SettledPoses
-from gtsam_rwhec.runs.solving_rounds import SolvingRounds, SynchronisedPairs
+from gtsam_rwhec.runs.solving_stage import CleanedLog
 
 
 def corners_of(folder: Path, text: str, out: Path) -> rw.Observations:
@@ -85,22 +82,25 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_l
 
 
 def test_measurements_without_corners_beside_others_are_counted(workcell_log: Path) -> None:
-    with open_log(workcell_log) as log:
-        rig = read_embedded_rig(log)
-        whole, pairs = LogCorners.of(log, rig, rig.sensors), read_pairs(log, rig)
-        cameras, motion = read_cameras(log), read_carrier_motion(log, rig)
-    assert whole.without_corners(pairs) == {}
-    (pair,) = pairs
-    first = min(stamp for _, _, stamp in whole.detections)
-    some = replace(whole, detections={key: one for key, one in whole.detections.items() if key[2] != first})
-    assert some.without_corners(pairs) == {pair: 1}
-    given, rounds = SynchronisedPairs(pairs, {"camera2": 0.0}), SolvingRounds(rig, motion, (), silent)
-    _, found = corner_answer(SettledPoses(given), given, rounds, some, cameras)
-    assert found.corners is not None
-    assert "1 of board-camera2 do not count in the poses" in str(found.choices[-1])
-    none = replace(whole, detections={})
-    assert none.without_corners(pairs) == {}
-    assert none.lacking(pairs) == (pair,)
+    with open_log(workcell_log) as opened:
+        log = CleanedLog.read(opened, None)
+    (pair,) = log.pairs
+    first = min(stamp for _, _, stamp in log.corners.detections)
+    rest = {key: one for key, one in log.corners.detections.items() if key[2] != first}
+
+    def calibrated(detections: Mapping[tuple[str, str, int], DetectionRecord]) -> rw.Calibration:
+        corners = replace(log.corners, detections=detections)
+        problem = corners.in_problem(log.problem_of(log.pairs), log.pairs, log.cameras)
+        return rw.calibrate(problem, log.options(), recording=log.recording(log.pairs))
+
+    some = calibrated(rest)
+    assert some.refined is not None
+    assert some.refined.intrinsics
+    (said,) = (choice for choice in some.choices if choice.what == "measurements without corners")
+    assert said.chosen.startswith(f"1 of {pair} ")
+    none = calibrated({})
+    assert none.refined is not None
+    assert not none.refined.intrinsics
 
 
 def test_intrinsics_of_half_the_resolution_are_replaced_by_what_the_images_tell(

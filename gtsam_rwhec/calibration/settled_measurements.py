@@ -1,0 +1,187 @@
+"""Measurements settled before the answer: A at the clocks' offsets, and sizes in place of stated ones that do not fit.
+
+Where A lies on a path of the carriers, it is known at any instant: A is taken again at the offsets that were found,
+until these stay the same. A wrong size makes outliers, and a late clock too: both are found before outliers count.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of, with_sizes_of
+from gtsam_rwhec.calibration.from_corners import ByCorners, with_estimated_intrinsics
+from gtsam_rwhec.calibration.outliers import refined_with_outliers
+from gtsam_rwhec.calibration.sizes import TargetSize, sizes_in
+from gtsam_rwhec.errors import CountError, NoiseError, OutlierError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refinement_from_poses import refine
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.measurements import Measurements, Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.solver.solution import Solution, solve
+
+#: At most so often A is taken again at new offsets.
+ROUNDS = 6
+#: Offsets that change by less, s, stay: the answer estimates what is left.
+SAME_S = 1e-4
+#: A lies on a path where its entries are those of the path to this.
+ON_PATH = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """A problem with A at the offsets, how much later A is taken, s, and the refinement of the inliers that says so."""
+
+    problem: Problem
+    moved_s: dict[str, float]
+    refined: Refined | None = None
+    inliers: Inliers = field(default_factory=dict)
+
+
+def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorners | None]:
+    """The run with A at the clocks' offsets and with sizes that are estimated; sizes; what a log's corners give.
+
+    As it was where options leave clocks to the data, where A lies on no path, and where nothing agrees.
+    """
+    problem, options = run.problem, run.options
+    if not problem.has_measurements or options.time_offsets == "auto":
+        return run, (), None
+    looks_at_sizes = options.sizes in ("correct", "estimate") and problem.scale != "shared"
+    if not looks_at_sizes and not _asked(problem, run) and run.recording is None:
+        return run, (), None
+    sizes: tuple[TargetSize, ...] = ()
+    targets = [name for name in problem.targets if name not in _estimated(problem)]
+    now = _Settled(problem, dict(run.moved_s))
+    if looks_at_sizes and targets:
+        run.tell("looking at the targets' sizes")
+        free = targets
+        if options.sizes == "correct":
+            told = _told(run, with_free_sizes(problem, targets), now.moved_s)
+            if told is not None and told.refined is not None:
+                sizes = tuple(size for size in sizes_in(told.refined) if size.target in targets)
+                now = replace(told, problem=with_sizes_of(told.problem, problem))
+            free = [size.target for size in sizes if size.is_doubted]
+        if free:
+            now = replace(now, problem=with_free_sizes(now.problem, free))
+    stated = None if now.problem.scale == problem.scale else problem
+    told = _told(run, now.problem, now.moved_s)
+    now = told or now
+    run = replace(run, problem=now.problem, stated=stated, moved_s=now.moved_s)
+    if told is None or told.refined is None:
+        return run, sizes, None
+    by = None
+    if run.recording is not None:
+        better, by = with_estimated_intrinsics(run, told.refined, told.inliers)
+        if better.times > run.times:
+            again, other_sizes, other = settled_measurements(better)
+            if other is not None and other.found.corners is not None:
+                return again, other_sizes, other
+        else:
+            run = better
+    return replace(run, agreed=_agreed(run, told.inliers)), sizes, by
+
+
+def _agreed(run: Run, inliers: Inliers) -> tuple[Solution, Inliers] | None:
+    """The measurements that agree and their certified solution; None where they are to be looked for again."""
+    if run.options.robust == "none" or run.options.noise == "given" or not inliers:
+        return None
+    return solve(selected(run.problem, inliers), options=run.options.solve, progress=run.tell), inliers
+
+
+def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled | None:
+    """A at offsets that stay the same beside outliers that are left out; None where no answer tells."""
+    path, asked = run.options.carrier_path, _asked(problem, run)
+    total = dict(moved_s)
+    noise: Literal["given", "estimate"] = "given" if run.options.noise == "given" else "estimate"
+    how = RefineOptions(
+        noise=noise,
+        carrier_noise=run.options.carrier_noise,
+        carrier_model="propagated",
+        time_offsets=asked,
+        carrier_path=path if asked else None,
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
+            for _ in range(ROUNDS):
+                solution, inliers = _first(run, problem), Inliers()
+                if run.options.robust != "none":
+                    # Cleaning found a log's offsets nearly; those of others may be large, and make outliers.
+                    beside = () if run.recording is not None else asked
+                    agree = refined_with_outliers(replace(run, problem=problem), solution, beside, noise)
+                    solution, inliers = agree.solution, agree.inliers
+                kept = selected(problem, inliers) if inliers else problem
+                refined = refine(kept, solution, how, progress=run.tell)
+                moved = refined.time_offsets_s
+                if path is None or max(map(abs, moved.values()), default=0.0) < SAME_S:
+                    break
+                problem = paired_again(problem, path, moved)
+                total |= {name: total.get(name, 0.0) + more for name, more in moved.items()}
+    except (CountError, NoiseError, OutlierError, ScaleError, UnderdeterminedError):
+        return None
+    return _Settled(problem, total, refined, inliers)
+
+
+def _first(run: Run, problem: Problem) -> Solution | None:
+    """The certified solution of all measurements; None where it has no positive scale, and outliers are looked for."""
+    try:
+        return solve(problem, options=run.options.solve, progress=run.tell)
+    except ScaleError:
+        if run.options.robust == "none":
+            raise
+        return None
+
+
+def _asked(problem: Problem, run: Run) -> tuple[str, ...]:
+    """The sensors whose clocks are asked for, where their A lies on the path."""
+    path, asked = run.options.carrier_path, offsets_of(problem, run.options)
+    names = tuple(problem.sensors) if asked is True else asked or ()
+    return names if path is not None and names and lies_on(problem, path, names) else ()
+
+
+def lies_on(problem: Problem, path: Trajectory, sensors: Collection[str]) -> bool:
+    """Whether A of the sensors' measurements is that of a path at their stamps."""
+    for pair in problem.pairs:
+        if pair.sensor in sensors and not pair.is_motion:
+            raw = problem.measurements(*pair)
+            if raw.stamps_ns is None or not (np.abs(path.at(raw.stamps_ns)[0] - raw.A) < ON_PATH).all():
+                return False
+    return True
+
+
+def paired_again(problem: Problem, path: Trajectory, offsets_s: Mapping[str, float]) -> Problem:
+    """The problem with A of some sensors later by their offsets, s, along a path; their stamps are as much later."""
+
+    def later(pair: Pair) -> Measurements:
+        raw = problem.measurements(*pair)
+        if pair.is_motion or raw.stamps_ns is None or pair.sensor not in offsets_s:
+            return raw
+        stamps_ns = raw.stamps_ns + round(1e9 * offsets_s[pair.sensor])
+        return replace(raw, A=path.at(stamps_ns)[0], stamps_ns=stamps_ns)
+
+    return problem.with_measurements({pair: later(pair) for pair in problem.pairs})
+
+
+def with_free_sizes(problem: Problem, targets: Collection[str]) -> Problem:
+    """The problem with the sizes of some targets estimated, beside those that are already."""
+    free = {*targets, *_estimated(problem)}
+    result = copy.copy(problem)  # the measurements are shared, what was stated is not
+    known = {pair.target: problem.fixed_scales.get(pair.target, 1.0) for pair in problem.pairs}
+    result.scale = "per_target"
+    result.fixed_scales = {name: scale for name, scale in known.items() if name not in free}
+    return result
+
+
+def _estimated(problem: Problem) -> set[str]:
+    """Targets, and sensors with motions, whose scale is estimated."""
+    if problem.scale == "known":
+        return set()
+    return {pair.target for pair in problem.pairs} - set(problem.fixed_scales)
