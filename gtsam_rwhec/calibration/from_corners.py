@@ -238,6 +238,7 @@ def corners_found(
     options: CornerOptions,
     tell: Progress,
     thin: CornersRefined | None = None,
+    far_off: Collection[str] = (),
 ) -> CornersFound:
     """Refine from corners under the options, or with A as exact where that predicts images better.
 
@@ -250,6 +251,8 @@ def corners_found(
     tell : callable
     thin : CornersRefined, optional
         The refinement of ``thinned(observations)`` under the options, where it was made already.
+    far_off : collection of str
+        Sensors whose stated intrinsics do not fit their corners, and count as unknown.
     """
     try:
         tried = chosen_model(observations, X, Y, options, tell, thin)
@@ -277,7 +280,7 @@ def corners_found(
         corners,
         intrinsics,
         numbers_of(observations, corners, tried.options, tried.left_out.errors, _tried_models(tried)),
-        tuple(_corner_choices(observations, corners, tried, intrinsics)),
+        tuple(_corner_choices(observations, corners, tried, intrinsics, far_off)),
         (*_corner_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
         _wider(tried),
     )
@@ -326,7 +329,11 @@ def _tried_models(tried: Tried) -> tuple[TriedModel, ...]:
 
 
 def _corner_choices(
-    observations: Observations, corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, Intrinsics]
+    observations: Observations,
+    corners: CornersRefined,
+    tried: Tried,
+    intrinsics: Mapping[str, Intrinsics],
+    far_off: Collection[str],
 ) -> Iterator[Choice]:
     number = sum(int(view.known.sum()) for view in observations.views.values())
     number -= sum(int(mask.sum()) for mask in corners.left_out.values())
@@ -342,6 +349,8 @@ def _corner_choices(
             "nominal": "the stated ones count as nominal (write stated: calibration where a calibration states them)",
             "unknown": "none are stated",
         }.get(one.stated_as, "")
+        if one.stated_as == "unknown" and name in far_off:
+            known = "the stated ones do not fit the corners, and count as unknown"
         innovation = corners.intrinsics[name].innovation
         if innovation.is_contradicted and one.stated_as != "unknown":
             known = f"the stated ones are contradicted by {innovation.deviations:.2g} deviations"
@@ -481,7 +490,9 @@ def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tupl
     if why:
         return run, ByCorners(CornersFound.none(why), base)
     observations, options, without = _observed(kept, Answer(base.solution, refined=base))
-    by = ByCorners(corners_found(base.X, base.Y, observations, options, run.tell), base, without)
+    far_off = () if run.recording is None else run.recording.far_off
+    found = corners_found(base.X, base.Y, observations, options, run.tell, far_off=far_off)
+    by = ByCorners(found, base, without)
     corners = by.found.corners
     if corners is None:
         return run, by

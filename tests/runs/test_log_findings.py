@@ -164,11 +164,11 @@ def test_in_images_an_inverse_is_an_exchange(found: tuple[str, ...]) -> None:
 def test_other_readings_are_said_beside_an_exchange() -> None:
     rig = parse_rig(made.RIG, "rig.yaml")
     given = [
-        Misreading(mistake, likely, "", (9.0, 1.0), (9.0, 1.0))
+        Misreading(mistake, likely, "", (9.0, 1.0), (9.0, 1.0), inverts_A=mistake is Mistake.INVERTED)
         for mistake, likely in ((Mistake.QUATERNION_ORDER, "quaternions"), (Mistake.INVERTED, "A is inverted"))
     ]
     assert [one.mistake for one in in_rig_file(given, rig)] == [Mistake.INVERTED, Mistake.QUATERNION_ORDER]
-    (of_B,) = in_rig_file([replace(given[1], likely="B is inverted")], rig)
+    (of_B,) = in_rig_file([replace(given[1], likely="B is inverted", of_B=True, inverts_A=False)], rig)
     assert of_B.cure.startswith("let the driver publish the target's pose")
 
 
