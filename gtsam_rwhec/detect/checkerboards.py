@@ -2,8 +2,8 @@
 
 Of 346 rendered boards (whole, squares of 12 pixels and more, blur to 1.5 pixels, shade) lattices of saddles give 342
 that pass the test (`board_evidence`), and none wrong; OpenCV's classic detector reads 288 and its sector-based one
-296, each with boards read one square off or turned. Corners have 0.017 pixels by the model of the edges
-(`saddle_fits`), and 0.057 by ``cornerSubPix``.
+296, each with boards read one square off or turned. Corners have 0.017 pixels by the model of the edges, and 0.057 by
+``cornerSubPix``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Gray pixels from a log's images: compressed (JPEG, PNG, WebP, TIFF, BMP) or in raw encodings of ROS and Foxglove.
 
 The size in the header is read before OpenCV decodes, to refuse huge images: it is never smaller than what OpenCV
-decodes (benchmarks/own_code_against_libraries.py).
+decodes, which of two widths in a TIFF takes the first, and other readers the last.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 OpenCV compares each candidate with one code after another, which takes most of the time of detection in large
 families. So OpenCV searches only for the targets' tags; tags of no target are found and read here, once in each image
-for all families, 40 times as fast (benchmarks/own_code_against_libraries.py).
+for all families, 40 times as fast.
 """
 
 from __future__ import annotations
