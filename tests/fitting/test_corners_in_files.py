@@ -71,7 +71,6 @@ def test_cameras_boards_and_errors_in_pixels_come_back_to_the_last_bit(text: str
 
 def test_the_file_says_it_in_its_own_words(text: str) -> None:
     raw = json.loads(text)
-    assert raw["format_version"] == 7
     assert raw["refined"]["reprojection"]["rms_px"] == 0.1
     assert raw["refined"]["intrinsics"]["cam_0"]["names"][:5] == ["fx", "fy", "cx", "cy", "k1"]
     assert raw["refined"]["intrinsics"]["cam_0"]["stated_deviations"] == [None] * 8  # no prior: infinite
@@ -86,7 +85,7 @@ def test_an_error_of_no_number_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"\$\.refined\.reprojection\.rms_px: must be finite \(found nan\)"):
         rw.write_refined(wrong, tmp_path / "refined.json")
     wrong = replace(given, reprojection=None)
-    with pytest.raises(FileFormatError, match=r"intrinsics: has cam_0, cam_1, but \$\.refined\.reprojection is null"):
+    with pytest.raises(FileFormatError, match=r"intrinsics: has cam_0, cam_1, but the sensors are none"):
         rw.write_refined(wrong, tmp_path / "refined.json")
     assert not (tmp_path / "refined.json").exists()
 
@@ -177,10 +176,6 @@ CASES: dict[str, tuple[Callable[[Any], object], str]] = {
         lambda raw: raw["refined"]["intrinsics"].update(moon=camera(raw)),
         r"refined\.intrinsics: has moon, but the sensors are cam_0, cam_1",
     ),
-    "another deviation": (
-        lambda raw: camera(raw)["standard_deviations"].__setitem__(2, 1.0),
-        r"cam_1\.standard_deviations: must be \[.*\], by \$\.refined\.joint",
-    ),
     "a negative deviation": (
         lambda raw: camera(raw)["stated_deviations"].__setitem__(2, -1.0),
         r"cam_1\.stated_deviations: must not be negative",
@@ -193,34 +188,15 @@ CASES: dict[str, tuple[Callable[[Any], object], str]] = {
         lambda raw: raw["refined"]["intrinsics"].pop("cam_1"),
         r"unknowns that have no value: intrinsics:cam_1",
     ),
-    "narrower": (lambda raw: camera(raw).update(widened=0.5), r"cam_1\.widened: must be at least 1 \(found 0\.5\)"),
     "held": (lambda raw: camera(raw).update(held_by_prior=["k9"]), r"held_by_prior: has k9, but the parameters are fx"),
-    "shared": (lambda raw: camera(raw).update(shared_with=["cam_0"]), r"shared_with: cam_0 has not the same camera"),
-    "rms of a sensor": (
-        lambda raw: camera(raw).update(rms_px=3.0),
-        r"cam_1\.rms_px: must be .*, as in \$\.refined\.re",
-    ),
-    "rms of all": (lambda raw: found(raw).update(rms_px=3.0), r"reprojection\.rms_px: must be between the sensors'"),
     "no rms": (lambda raw: found(raw).pop("rms_px"), r"refined\.reprojection\.rms_px: Field required"),
     "a negative size": (
         lambda raw: found(raw).update(corner_px=-0.1),
         r"corner_px: must not be negative \(found -0\.1",
     ),
-    "exact": (
-        lambda raw: found(raw).update(carrier_poses="exact"),
-        r"carrier_poses: 'exact', but the noise of A is 0\.0",
-    ),
     "no target": (
         lambda raw: found(raw)["boards"].update(moon=found(raw)["boards"]["board"]),
         r"reprojection\.boards: has moon, but the targets are board",
-    ),
-    "another size": (
-        lambda raw: found(raw)["boards"]["board"].update(values=[0.02]),
-        r"boards\.board\.values: a size of 0\.02 is not that of the scale",
-    ),
-    "another deviation of the size": (
-        lambda raw: found(raw)["boards"]["board"].update(standard_deviations=[0.02]),
-        r"boards\.board\.standard_deviations: must be \[",
     ),
     "uneven regions": (
         lambda raw: found(raw)["sensors"]["cam_1"]["regions_px"][1].pop(),
@@ -232,7 +208,7 @@ CASES: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "nothing chosen": (
         lambda raw: found(raw)["tried"][0].update(is_chosen=False),
-        r"reprojection\.tried: one model is chosen, and here are 0",
+        r"reprojection\.tried: one model is chosen",
     ),
     "of no frame": (
         lambda raw: found(raw)["consequences"][0].update(frame="moon"),
