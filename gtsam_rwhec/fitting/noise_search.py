@@ -136,12 +136,10 @@ class Task:
             fit = fitted(thinned(model), sizes, logs)
             logs = fit.logs
             whole = model.evaluate(sizes.values(logs))
+            state = moved(state, self.variables, self.layout, model.basis @ whole.step)
             if whole.farthest < SETTLED:
                 break
-            state = moved(state, self.variables, self.layout, model.basis @ whole.step)
-        else:
-            model = self.model(state, side, walk, systematic=systematic)
-        return Settled(state, model, fit)
+        return Settled(state, self.model(state, side, walk, systematic=systematic), fit)
 
 
 def start_at(sizes: Sizes, near: Fitted | None) -> Array:
