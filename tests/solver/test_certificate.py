@@ -113,8 +113,6 @@ def test_a_bound_of_moments_says_so() -> None:
     )
     of_moments = str(replace(CERTIFIED, basis=Basis.MOMENTS))
     assert of_moments == str(measured).replace("below 99.999999,", "below 99.999999 (of the moments),")
-    of_older = str(replace(CERTIFIED, basis=Basis.REDUCED_FORM))
-    assert of_older == str(measured).replace("below 99.999999,", "below 99.999999 (of the stored form),")
 
 
 def test_a_region_is_the_last_of_what_is_said() -> None:
@@ -156,7 +154,6 @@ class TestMerged:
         assert Certificate.merged(parts[:2]).basis is Basis.MEASUREMENTS
         assert Certificate.merged(parts).region == Region(300.0, 100.0)
         assert Certificate.merged(parts).basis is Basis.MOMENTS
-        assert Certificate.merged([*parts, replace(CERTIFIED, basis=Basis.REDUCED_FORM)]).basis is Basis.REDUCED_FORM
         assert Certificate.merged([parts[0], parts[0]]).region is None
 
     def test_one_is_itself(self) -> None:
