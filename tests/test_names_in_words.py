@@ -39,7 +39,7 @@ OBJECTS = {
 }
 OF_PACKAGES = re.compile(r"(?<![\w./\"-])(gtsam_rwhec|rwhec_factors|rw)((?:\.[A-Za-z_]\w*)+)")
 IN_BACKTICKS = re.compile(r"`([A-Za-z_]\w*)((?:\.[A-Za-z_]\w*)+)(?:\([^`]*)?`")
-FILE_ENDINGS = {"html", "py", "md", "json", "yaml", "toml", "mcap", "xacro", "png", "csv", "txt"}
+FILE_ENDINGS = {"html", "py", "md", "json", "jsonl", "parquet", "yaml", "toml", "mcap", "xacro", "png", "csv", "txt"}
 
 
 def owners() -> dict[str, list[object]]:

@@ -118,19 +118,9 @@ def read_parquet(content: bytes, where: str) -> tuple[RobotRow, ...]:
 
 
 def read_history(urls: Iterable[str]) -> tuple[RobotRow, ...]:
-    """The rows of several runs, in the order given.
+    """The rows of several runs, in the order given: of folders that ``gtsam-rwhec fleet run`` wrote, or files of rows.
 
-    Parameters
-    ----------
-    urls : str
-        Folders that ``gtsam-rwhec fleet run`` wrote, or files of rows (``fleet.json``, ``*.parquet``): paths or URLs.
-
-    Raises
-    ------
-    StoreError, StoreInterruptedError
-        There is no such file, or it is refused.
-    FileFormatError, ResultVersionError
-        It is none of rows, or of another version.
+    Errors as `read_rows`; a StoreError where there is no such file, or it is refused.
     """
     return tuple(row for url in urls for row in _rows_at(url))
 

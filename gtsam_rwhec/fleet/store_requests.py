@@ -120,27 +120,11 @@ def requested(
     how_far: Callable[[], str] | None = None,
     attempts: int | None = None,
 ) -> Answer:
-    """What `ask` gives.
+    """What `ask` gives: it may be called several times, and goes on from where it broke off, if it can.
 
-    Parameters
-    ----------
-    ask
-        May be called several times; it goes on from where it broke off, if it can.
-    what
-        What is asked for, in words, without credentials.
-    url
-        Where: its secrets are taken out of what libraries say.
-    how_far
-        How much has come, in words, for errors.
-    attempts
-        How often it is asked; `ATTEMPTS` if not said.
-
-    Raises
-    ------
-    StoreError
-        The store refuses, or the file is not there.
-    StoreInterruptedError
-        Each attempt broke off.
+    `what` is asked for, in words without credentials, at `url`, whose secrets are taken out of what libraries say;
+    `how_far` says how much has come. A StoreError where the store refuses, or the file is not there; a
+    StoreInterruptedError where each of the attempts (`ATTEMPTS` if not said) broke off.
     """
     most = ATTEMPTS if attempts is None else attempts
     for attempt in range(1, most + 1):

@@ -162,7 +162,7 @@ class Clock:
 
 
 def first_offset(reference: OdometryTrack, track: OdometryTrack, options: OdometryOptions) -> Clock:
-    """By `cleaning.time_offset`: the sensor's start is a target that stands still, the reference's is the world."""
+    """By the turns of both: the sensor's start is a target that stands still, the reference's is the world."""
     first = max(reference.stamps_ns[0], track.stamps_ns[0])
     last = min(reference.stamps_ns[-1], track.stamps_ns[-1])
     middle, half = (int(first) + int(last)) // 2, round(0.5e9 * MOST_S)

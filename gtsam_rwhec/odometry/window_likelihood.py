@@ -107,7 +107,7 @@ class Linear:
     """Residuals and derivatives at a state."""
 
     r: Array  #: (m, n, 6)
-    J: Array  #: (m, n, 6, 8): by the sensor's own columns (`unknowns.COLUMNS`)
+    J: Array  #: (m, n, 6, 8): by the sensor's own columns (`COLUMNS`)
     B: Array  #: (m, n, 6, 6): by the window's motion
 
 
