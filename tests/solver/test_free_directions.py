@@ -161,10 +161,6 @@ def test_many_directions_of_one_frame() -> None:
     assert [each.kind for each in found] == [FreeKind.ROTATION] * 3 + [FreeKind.SCALE] * 2 + [FreeKind.TRANSLATION] * 3
 
 
-def test_words_of_an_old_file_are_kept() -> None:
-    assert str(FreeDirection(FreeKind.WORDS, None, words="cam0: translation along z")) == "cam0: translation along z"
-
-
 @pytest.mark.parametrize(
     ("axes", "turned_deg", "residual_deg", "said"),
     [
