@@ -217,27 +217,9 @@ def synchronise(
 ) -> tuple[Array, Kept]:
     """The carrier's pose at each of a sensor's stamps.
 
-    Parameters
-    ----------
-    carrier : Trajectory
-        Poses of the carrier.
-    stamps_ns : (M,) integers
-        Stamps of the sensor.
-    time_offset_s : float
-        The sensor's stamp t is the carrier's t + offset (Kalibr's convention).
-    max_gap_s : float
-        Poses further apart in time than this are not interpolated.
-    where : str
-        The sensor, for messages.
-    needs_overlap : bool
-        True: it is an error that no stamp is inside the trajectory.
-
-    Returns
-    -------
-    A : (M, 4, 4) array
-        The carrier's poses, metres.
-    kept : Kept
-        Removes stamps outside the trajectory and in its gaps.
+    The sensor's stamp t is the carrier's t + `time_offset_s` (Kalibr's convention). Poses further apart in time than
+    `max_gap_s` are not interpolated. `where` is the sensor, for messages. Returns A (M, 4, 4), metres, and what removes stamps
+    outside the trajectory and in its gaps.
 
     Raises
     ------
@@ -274,14 +256,7 @@ def thin(
     """Keep a measurement if the carrier has turned or moved since the last measurement that was kept.
 
     A hundred images at one pose weigh a hundred times, and they share the error of that pose (A). A covariance that
-    takes the images for independent is then too small.
-
-    Parameters
-    ----------
-    A : (N, 4, 4) array
-        The carrier's poses, in order of time, metres.
-    stamps_ns : (N,) integers
-    min_rotation_rad, min_translation_m : float
+    takes the images for independent is then too small. A (N, 4, 4) has the carrier's poses, in order of time.
     """
     bad = np.zeros(len(A), dtype=bool)
     moved = np.zeros(len(A))
@@ -303,7 +278,7 @@ def without_fast(
 ) -> Kept:
     """Keep the measurements at low speed: fast motion blurs images, and errors of stamps count more.
 
-    `turning_rad_s` and `moving_m_s` (N,) are the carrier's speeds at each measurement.
+    The first two (N,) are the carrier's speeds at each measurement.
     """
     return Kept.within(
         stamps_ns,

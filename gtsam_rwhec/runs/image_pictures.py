@@ -1,4 +1,4 @@
-"""A contact sheet of a run: some of each sensor's images, with what was found, rejected, not seen, or not usable."""
+"""Pictures of a run's images: a contact sheet of some, with what was found, rejected or not seen; and each one drawn."""
 
 from __future__ import annotations
 

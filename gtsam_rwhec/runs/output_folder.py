@@ -1,4 +1,14 @@
-"""Checks of the files and folders that a stage will write, before it begins its work."""
+"""The output folder of a calibration: what it may write there, and what an earlier run left.
+
+The folder has a list of the files that were written into it, with a checksum of each. One rule serves ``calibrate``,
+``demo`` and Python:
+
+- A file that is not on the list, or was changed since, is never replaced.
+- A finished calibration is replaced only on request. An unfinished run is gone on with; one that ended with an error is
+  too, or begun anew where its inputs are other ones: they were mended.
+- Other files beside ours are refused, since the folder may be meant for something else; with a request to replace a
+  calibration that is there, they stay as they are.
+"""
 
 from __future__ import annotations
 

@@ -24,33 +24,15 @@ MOST_FITS = 10
 
 @dataclass(frozen=True)
 class ConsensusOptions:
-    """Limits of agreement; the defaults are the paper's.
+    """Limits of agreement; the defaults are the paper's."""
 
-    Attributes
-    ----------
-    max_translation_m, max_rotation_rad : float
-        A measurement agrees if it is this near to its prediction.
-    min_inlier_share : float
-        If a smaller share of the pair's measurements agrees, all of them are removed.
-    scale_known : bool
-        Whether the target's length is known.
-    max_scale_error : float
-        How far an unknown scale may be from 1: tag sizes are known within 10 %.
-    hypotheses : int
-        Number of samples.
-    sample_size : int
-        Measurements in each sample.
-    seed : int
-        Seed of the generator that draws the samples.
-    """
-
-    max_translation_m: float = 0.6
+    max_translation_m: float = 0.6  #: a measurement agrees if it is this near to its prediction
     max_rotation_rad: float = float(np.radians(60.0))
-    min_inlier_share: float = 1.0 / 3.0
-    scale_known: bool = True
-    max_scale_error: float = 0.1
-    hypotheses: int = 200
-    sample_size: int = 4
+    min_inlier_share: float = 1.0 / 3.0  #: if a smaller share of a pair agrees, all of its measurements are removed
+    scale_known: bool = True  #: whether the target's length is known
+    max_scale_error: float = 0.1  #: how far an unknown scale may be from 1: tag sizes are known within 10 %
+    hypotheses: int = 200  #: number of samples
+    sample_size: int = 4  #: measurements in each sample
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -77,18 +59,9 @@ class Consensus:
 def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptions | None = None) -> Consensus:
     """Keep the measurements of a pair that agree on one hypothesis.
 
-    Parameters
-    ----------
-    A, B : (N, 4, 4) arrays
-        T_sensorcarrier_targetcarrier and T_sensor_target, metres.
-    stamps_ns : (N,) integers
-    options : ConsensusOptions, optional
-
-    Returns
-    -------
-    Consensus
-        A single measurement is removed: nothing can validate it. Two measurements almost always agree with what is
-        fitted to them, but the limits still apply.
+    A and B (N, 4, 4) are T_sensorcarrier_targetcarrier and T_sensor_target, metres; `stamps_ns` is (N,). A single
+    measurement is removed: nothing can validate it. Two measurements almost always agree with what is fitted to them,
+    but the limits still apply.
     """
     options = options or ConsensusOptions()
     N = len(A)

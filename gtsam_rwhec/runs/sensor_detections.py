@@ -1,4 +1,7 @@
-"""Detection in the images of all cameras; a detection gets the one of its two poses that its whole track supports."""
+"""What each sensor detected: in its images, or as its driver says; and the report on the detections of all sensors.
+
+A detection in an image gets the one of its two poses that its whole track supports.
+"""
 
 from __future__ import annotations
 

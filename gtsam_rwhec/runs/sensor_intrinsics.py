@@ -1,4 +1,10 @@
-"""The intrinsics of each sensor, from the topic, file or numbers that the rig file names."""
+"""The intrinsics of each sensor: from the topic, file or numbers that the rig file names, or from its images of boards.
+
+Where none are stated (``intrinsics: estimate``) some of a sensor's images, spread over all of them, are searched with a
+pinhole: what detection tests in a board's plane holds for any focal length. A lens bends boards, and many are rejected
+then; a first camera from those that were read, or from the rejected ones if there are few, reads them in a second look,
+and searches the other images. The same images give the same camera, so an interrupted run goes on.
+"""
 
 from __future__ import annotations
 

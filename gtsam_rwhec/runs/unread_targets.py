@@ -1,6 +1,6 @@
 """Why targets are not read, where most are not: what some of the images say, with what to write in the rig file.
 
-Each cause was tried on images (`vision.clues`) and is named with how many of them show it. Where nothing that was tried
+Each cause was tried on images (`detect.clues`) and is named with how many of them show it. Where nothing that was tried
 explains it, that is said.
 """
 

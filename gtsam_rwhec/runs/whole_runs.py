@@ -239,10 +239,7 @@ def solve_into(
 ) -> Calibrated:
     """Solve from a cleaned log; write ``result.json``, and ``calibration.mcap`` with the solution, into a folder.
 
-    Raises
-    ------
-    RwhecError
-        As `solve_log` does.
+    Raises as `solve_log` does.
     """
     out = made_output_folder(out)
     with open_log(clean_path) as log:
@@ -268,15 +265,8 @@ def export_solved(
 
     Poses that are not to be used get no such files: those of an earlier calibration in this folder are removed.
 
-    Parameters
-    ----------
-    solved_path
-        The log that ``solve_into`` wrote.
-    out
-        The folder; it is made if it does not exist.
-    anyway : bool
-        Whether to write the files of poses that are not to be used too, each with the reason as a comment in its head.
-    progress : callable, optional
+    `solved_path` is the log that ``solve_into`` wrote; the folder is made if it does not exist. With `anyway` the files
+    of poses that are not to be used are written too, each with the reason as a comment in its head.
 
     Raises
     ------
