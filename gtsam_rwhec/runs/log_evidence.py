@@ -1,90 +1,77 @@
 """What the report of a log shows beside the result: frames, corners and images that were seen, inputs; and the page."""
 
 from __future__ import annotations
+
 import shlex
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable
-from collections.abc import Mapping
-from collections.abc import Sequence
-from dataclasses import dataclass
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from os.path import commonpath
-from pathlib import Path
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
+
 import cv2
 import numpy as np
+
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import decode_gray
-from gtsam_rwhec.detect.pictures import draw_errors
-from gtsam_rwhec.detect.pictures import jpeg_of
-from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.errors import LogWarning
-from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.detect.pictures import draw_errors, jpeg_of
+from gtsam_rwhec.errors import ImageError, LogError, LogWarning, TargetError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.logs import ImageRecord
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.report_page import report_page
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results import Evidence
-from gtsam_rwhec.results import write_evidence
+from gtsam_rwhec.results import Evidence, write_evidence
 from gtsam_rwhec.results.contribution import contribution_of
 from gtsam_rwhec.results.derived import derived_of
-from gtsam_rwhec.results.detection_evidence import PIECES
-from gtsam_rwhec.results.detection_evidence import RemovedCount
-from gtsam_rwhec.results.detection_evidence import SeenEvidence
-from gtsam_rwhec.results.detection_evidence import counts_of
-from gtsam_rwhec.results.detection_evidence import removed_list
-from gtsam_rwhec.results.detection_evidence import span_of
-from gtsam_rwhec.results.detection_evidence import tracks_of
-from gtsam_rwhec.results.evidence import Inputs
-from gtsam_rwhec.results.evidence import checksum
-from gtsam_rwhec.results.evidence import input_files
-from gtsam_rwhec.results.evidence import versions
-from gtsam_rwhec.results.image_errors import RatedView
-from gtsam_rwhec.results.image_errors import SeenView
-from gtsam_rwhec.results.image_errors import WorstImage
-from gtsam_rwhec.results.image_errors import board_of
-from gtsam_rwhec.results.image_errors import rated_views
-from gtsam_rwhec.results.image_errors import seen_cameras
-from gtsam_rwhec.results.image_errors import worst_image
-from gtsam_rwhec.results.image_errors import worst_views
-from gtsam_rwhec.results.linear_model import LinearModel
-from gtsam_rwhec.results.linear_model import MeasuredRows
+from gtsam_rwhec.results.detection_evidence import (
+    PIECES,
+    RemovedCount,
+    SeenEvidence,
+    counts_of,
+    removed_list,
+    span_of,
+    tracks_of,
+)
+from gtsam_rwhec.results.evidence import Inputs, checksum, input_files, versions
+from gtsam_rwhec.results.image_errors import (
+    RatedView,
+    SeenView,
+    WorstImage,
+    board_of,
+    rated_views,
+    seen_cameras,
+    worst_image,
+    worst_views,
+)
+from gtsam_rwhec.results.linear_model import LinearModel, MeasuredRows
 from gtsam_rwhec.results.proof_spectrum import proof_of
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.residual_evidence import residuals_of
 from gtsam_rwhec.results.result_judgement import shortage
-from gtsam_rwhec.results.scene_evidence import SceneEvidence
-from gtsam_rwhec.results.scene_evidence import scene_of
+from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
 from gtsam_rwhec.results.weak_poses import weak_directions
-from gtsam_rwhec.rig import CameraLink
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig import RigFrames
-from gtsam_rwhec.rig import rig_text
+from gtsam_rwhec.rig import CameraLink, Rig, RigFrames, rig_text
 from gtsam_rwhec.rig.exported_files import copied_texts
 from gtsam_rwhec.rig.rig_frames import known_cameras
 from gtsam_rwhec.rig.sections import link_of_optical
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.log_corners import with_intrinsics
-from gtsam_rwhec.runs.run_log import EVIDENCE_FILE
-from gtsam_rwhec.runs.run_log import REPORT_FILE
-from gtsam_rwhec.runs.run_log import RESULT_FILE
-from gtsam_rwhec.runs.run_log import detections_topic
-from gtsam_rwhec.runs.run_log import image_name
-from gtsam_rwhec.runs.run_log import image_names
-from gtsam_rwhec.runs.run_log import records_of
-from gtsam_rwhec.runs.solving_stage import Calibrated
-from gtsam_rwhec.runs.solving_stage import Solved
+from gtsam_rwhec.runs.log_corners import LogCorners, with_intrinsics
+from gtsam_rwhec.runs.run_log import (
+    EVIDENCE_FILE,
+    REPORT_FILE,
+    RESULT_FILE,
+    detections_topic,
+    image_name,
+    image_names,
+    records_of,
+)
+from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
 
 #: Of intrinsics that were estimated before detection, and that no refinement from corners made better.
 BOARDS_ALONE = "estimated from views of boards alone, before the poses; standard deviations are not known"
