@@ -218,8 +218,8 @@ def synchronise(
     """The carrier's pose at each of a sensor's stamps.
 
     The sensor's stamp t is the carrier's t + `time_offset_s` (Kalibr's convention). Poses further apart in time than
-    `max_gap_s` are not interpolated. `where` is the sensor, for messages. Returns A (M, 4, 4), metres, and what removes stamps
-    outside the trajectory and in its gaps.
+    `max_gap_s` are not interpolated. `where` is the sensor, for messages. Returns A (M, 4, 4), metres, and what removes
+    stamps outside the trajectory and in its gaps.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Pictures of a run's images: a contact sheet of some, with what was found, rejected or not seen; and each one drawn."""
+"""Pictures of a run's images: a contact sheet of some, with what was found, rejected or not seen; and each drawn."""
 
 from __future__ import annotations
 
