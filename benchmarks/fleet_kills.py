@@ -30,8 +30,8 @@ from gtsam_rwhec import fleet
 from gtsam_rwhec.errors import FleetError
 from gtsam_rwhec.fleet.dask_engine import DaskEngine
 
-#: Files below these hold moments and measurements. Answers have seconds in them.
-FOLDERS = ("partials", "merged")
+#: Files below this hold measurements. Answers have seconds in them.
+FOLDERS = ("partials",)
 
 
 @contextmanager
@@ -45,7 +45,7 @@ def workers_dying(engine: DaskEngine, every_s: float, seed: int, deaths: list[in
             with suppress(psutil.NoSuchProcess, ProcessLookupError):
                 workers = [
                     one
-                    for one in psutil.Process(engine.cluster.workers_pid).children()
+                    for one in psutil.Process(engine.cluster.workers.pid).children()
                     if "resource_tracker" not in " ".join(one.cmdline())
                 ]
                 if workers:
@@ -66,6 +66,7 @@ def killed_run(manifest: str, output: Path, arguments: argparse.Namespace, sched
     """What it said at its end, how many tasks it was told of, how many workers died."""
     deaths: list[int] = []
     with DaskEngine(2, dashboard=False) as engine:
+        engine.start()
         kept = Kept(engine, output / "told")
         total = arguments.robots * arguments.logs
 
@@ -73,7 +74,7 @@ def killed_run(manifest: str, output: Path, arguments: argparse.Namespace, sched
             assert engine.cluster is not None
             if scheduler_too and len(kept.receipts) >= total // 2:
                 with suppress(ProcessLookupError):
-                    os.kill(engine.cluster.scheduler_pid, signal.SIGKILL)
+                    engine.cluster.scheduler.kill()
 
         said = ""
         with workers_dying(engine, arguments.every, arguments.seed + (not scheduler_too), deaths):
@@ -115,7 +116,7 @@ def rows(arguments: argparse.Namespace, folder: Path) -> list[Row]:
     # Each death costs what its worker was at, and the scheduler's costs what the two were at.
     most = deaths + more + 2
     return [
-        Row("files of moments and measurements, bit for bit", "the same" if is_same else "others", "the same", is_same),
+        Row("files of measurements, bit for bit", "the same" if is_same else "others", "the same", is_same),
         Row("tasks done, of all", f"{done} of {all_of_it}", "all", done == all_of_it == tasks),
         Row("tasks done twice", f"{twice}", "0", twice == 0),
         Row("attempts lost with what was killed", f"{lost}", f"<= {most}", lost <= most),

@@ -69,6 +69,7 @@ def measured(manifest: str, output: Path, workers: int) -> Measured:
             at_start.append(all_cpu_s() - sum(receipt.cpu_s for _, receipt in kept.receipts))
 
     with DaskEngine(workers, dashboard=False) as engine:
+        engine.start()
         started = time.monotonic()
         kept = Kept(engine)
         done = fleet.run(fleet.read_manifest(manifest), str(output), engine=kept, progress=first_tasks)
