@@ -196,7 +196,6 @@ def report_page(shown: ShownResult) -> Page:
 #: The functions that make them.
 SECTIONS = (
     verdict_section,
-    choices_section,
     scene_section,
     seen_section,
     determines_section,
@@ -205,6 +204,7 @@ SECTIONS = (
     corners_section,
     uncertainty_section,
     contribution_section,
+    choices_section,
     inputs_section,
 )
 
