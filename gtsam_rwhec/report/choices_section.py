@@ -50,7 +50,7 @@ def _refinement(shown: ShownResult) -> Iterator[Block]:
     if refined is None:
         return
     at = ("refined", "noise")
-    rows = tuple(
+    rows: tuple[tuple[Words, ...], ...] = tuple(
         (
             f"{row['target']}, {row['sensor']}",
             shown.number(*at, i, "rotation_rad", times=float(np.degrees(1.0)), spec=".3g"),

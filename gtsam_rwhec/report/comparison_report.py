@@ -174,7 +174,7 @@ def print_cross_validation(result: CrossValidation, console: Console | None = No
             ("pair", _hold_out_rows(of_pairs)),
         )
     ]
-    blocks = (
+    blocks: tuple[Block, ...] = (
         Paragraph(f"Hold-out error: {split}", "lead"), *tables, Paragraph(HOLD_OUT_LEGEND, "note"),
         Listing(tuple(result.notes), "care"),
     )  # fmt: skip

@@ -312,16 +312,20 @@ def result_json(
     answer: Calibration | Refined | Solution, log: LogFields | None = None, path: str | Path = "the result"
 ) -> bytes:
     """The content of the file of an answer. It is read back here once, so that every written file can be read."""
-    solution, refined, record = answer, None, None
+    refined: Refined | None = None
+    record: CalibrationFields | None = None
     targets, sensors = TARGET_CARRIER, SENSOR_CARRIER
     if isinstance(answer, Calibration):
-        solution, refined, record = answer.solution, answer.refined, CalibrationFields.of(answer)
+        record = CalibrationFields.of(answer)
+        if answer.solution is None:
+            none = {"sensors": [], "targets": [], "conventions": CONVENTIONS}
+            return _encoded({**_heading(answer.judgement), **none, "calibration": to_json(record, "$.calibration")})
+        solution, refined = answer.solution, answer.refined
         targets, sensors = answer.carriers.targets or targets, answer.carriers.sensors or sensors
     elif isinstance(answer, Refined):
         solution, refined = answer.solution, answer
-    if isinstance(answer, Calibration) and solution is None:
-        none = {"sensors": [], "targets": [], "conventions": CONVENTIONS}
-        return _encoded({**_heading(answer.judgement), **none, "calibration": to_json(record, "$.calibration")})
+    else:
+        solution = answer
     if log is not None:
         targets, sensors = log.target_carrier, log.sensor_carrier
     try:

@@ -166,7 +166,7 @@ CASES: dict[str, tuple[str, Change, str, str]] = {
     ),
     "other names": ("parts", renamed, "$.targets", "names"),
     "a strange frame": ("parts", lambda raw: raw["refined"]["frames"].update(x=raw["refined"]["frames"]["target0"]),
-                        "refined.frames", "x"),
+                        "refined.frames", "must have"),
     "a pair of the log twice": ("log", lambda raw: twice(raw["log"]["outliers"]), "log.outliers", "twice"),
     "a size twice": ("log", lambda raw: twice(raw["log"]["sizes"]), "log.sizes", "twice"),
     "a track twice": ("log", lambda raw: twice(raw["log"]["cleaning"]["tracks"]), "log.cleaning.tracks", "twice"),
