@@ -26,7 +26,7 @@ from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseRow, PoseStatement, poses_of, stem_of
 from gtsam_rwhec.logs.pose_tables import pose_text, read_pose_table
-from gtsam_rwhec.logs.pose_trees import PoseReference, read_pose_tree
+from gtsam_rwhec.logs.pose_trees import TREES, PoseReference, read_pose_tree
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 #: Foxglove gives the formats of images these names; the keys are the files' endings.
@@ -229,8 +229,8 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:MOST_NAMED]) + (", ..." if len(names) > MOST_NAMED else "")
 
 
-#: Files of trees, and files of tables.
-TREES, TABLES = (".json", ".yaml", ".yml", ".xml", ".samples"), (".csv", ".txt", ".tum", ".dat", ".tsv", ".asc")
+#: Files of tables of poses.
+TABLES = (".csv", ".txt", ".tum", ".dat", ".tsv", ".asc")
 
 
 def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPoses:

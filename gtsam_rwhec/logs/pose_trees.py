@@ -17,6 +17,8 @@ from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_storage
 from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
 
+#: Files of trees.
+TREES = (".json", ".yaml", ".yml", ".xml", ".samples")
 _POSITION = ("position", "translation", "t", "tvec", "xyz", "pos", "trans", "translationvector")
 _ROTATION = (
     "orientation", "rotation", "quaternion", "q", "quat", "r", "rot", "rotationmatrix", "rotmat", "rvec", "rotvec",
