@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
-import cv2
 import gtsam
 import numpy as np
 from pydantic import Field
@@ -27,7 +26,7 @@ from gtsam_rwhec.cameras.targets import (
     grid,
     square,
 )
-from gtsam_rwhec.detect.tags import dictionary, modules
+from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
@@ -366,6 +365,8 @@ def drawn_points(points: Array, scale: float = 1.0) -> DrawnBoard:
 
 def _parts(target: Target, has_modules: bool) -> tuple[Array, list[Array]]:
     """The paper (4, 3) or (0, 3), and the dark polygons, as stated."""
+    with extra_named():  # a scene without tags is drawn without OpenCV
+        from gtsam_rwhec.detect.tags import modules
     if isinstance(target, Tag):
         paper = square(target.size_m * (1.0 + 2.0 / modules(target.family)))
         return paper, _tag(target, target.corners(), 0, has_modules)
@@ -392,6 +393,10 @@ def _parts(target: Target, has_modules: bool) -> tuple[Array, list[Array]]:
 
 def _tag(target: Tag | Bundle | TagGrid | AprilGrid, corners: Array, index: int, has_modules: bool) -> list[Array]:
     """The dark parts of a tag whose corners (4, 3) are top left, top right, bottom right, bottom left as printed."""
+    with extra_named():
+        import cv2
+
+        from gtsam_rwhec.detect.tags import dictionary, modules
     if not has_modules:
         return [corners] if len(target.ids) > 1 else _ring(corners, modules(target.family))
     across = modules(target.family)
