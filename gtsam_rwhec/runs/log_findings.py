@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.misreadings import Misreading, Reading
-from gtsam_rwhec.calibration.moved_frames import Measured, moved_with_outliers
+from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import SizeFields
-from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 
 #: A point that is known to this share of its distance only (with 95 %) is known to nothing.
 LARGEST_SHARE = 0.25
@@ -26,11 +21,6 @@ OTHER_ANGLES = (
     "write the axes in the order of the turns, capitals for turning axes (ZYX: yaw, pitch, roll) and small letters for "
     "fixed ones (xyz: roll, pitch, yaw), or rotation_vector"
 )
-
-
-def is_of_the_poses(misreadings: Sequence[Misreading]) -> bool:
-    """Whether poses were misread in a way that neither sizes nor clocks explain: then no round helps."""
-    return bool(misreadings) and all(not one.mistake.may_be_sizes_or_clocks for one in misreadings)
 
 
 def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading, ...]:
@@ -90,42 +80,6 @@ def may_be_exchanged(rig: Rig, measurements: int) -> Finding:
         f"{measurements} measurements are too few to tell whether the poses were read right, and whether `sensors` and "
         f"`targets` are exchanged ({place}): measure at 10 poses or more",
     )
-
-
-def with_cures(findings: Sequence[Finding], before: tuple[Misreading, ...], rig: Rig) -> tuple[Finding, ...]:
-    """The findings, with the cures for a log in that of the misreadings."""
-    said, now = Reading(before).finding, Reading(in_rig_file(before, rig)).finding
-    return tuple(now if now is not None and finding == said else finding for finding in findings)
-
-
-def not_of_late_clocks(findings: Sequence[Finding], misreadings: Sequence[Misreading]) -> tuple[Finding, ...]:
-    """The findings without those that late clocks make, which rotations tell better: large residuals, shifted rows."""
-    made = {Ground.IMPLAUSIBLE, Ground.COVARIANCE_DOUBTED, Ground.LATE_CLOCK}
-    if all(one.mistake is Mistake.ROWS_SHIFTED for one in misreadings):
-        made.add(Ground.MISREAD)
-    return tuple(finding for finding in findings if finding.ground not in made)
-
-
-def not_of_marked_outliers(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """The findings without measurements that look wrong: outliers were looked for, under each detection's own noise."""
-    return tuple(finding for finding in findings if finding.ground is not Ground.OUTLIERS_KEPT)
-
-
-def moved_of_left_out(
-    findings: Sequence[Finding], refined: Refined, pairs: Mapping[Pair, MeasuredPairs]
-) -> list[Finding]:
-    """A frame that was elsewhere when the outliers were measured; nothing where one is said to have moved already.
-
-    Where half of the measurements were left out, which half is right is open; how far apart both are is not.
-    """
-    if any(finding.ground is Ground.MOVED for finding in findings):
-        return []
-    measured = {}
-    for pair, one in pairs.items():
-        asked = one.used | np.array([reason == RemovalReason.OUTLIER for reason in one.reasons], dtype=bool)
-        measured[pair] = Measured(one.A[asked], one.B[asked], one.used[asked])
-    found = moved_with_outliers(refined, measured)
-    return [] if found is None else [Finding(Ground.MOVED, str(found))]
 
 
 def _cure(misreading: Misreading, rig: Rig) -> str:

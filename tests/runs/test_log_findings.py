@@ -14,10 +14,10 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
-from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.runs.log_findings import in_rig_file, known_to_nothing, not_of_marked_outliers
+from gtsam_rwhec.runs.log_findings import in_rig_file, known_to_nothing
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
 EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")
@@ -128,13 +128,6 @@ def test_what_cannot_be_written_is_told_before_anything_is_computed(tmp_path: Pa
 
 def _nothing_is_done(stage: str) -> None:
     raise AssertionError(stage)
-
-
-def test_measurements_that_look_wrong_are_no_finding_where_outliers_were_looked_for() -> None:
-    """Under each detection's own noise: the advice would be to look for them."""
-    kept = Finding(Ground.OUTLIERS_KEPT, "4 of 200 measurements look wrong")
-    size = Finding(Ground.SIZE_DOUBTED, "the stated size of tag_0 is 3 % larger than the motion says")
-    assert not_of_marked_outliers((kept, size)) == (size,)
 
 
 def test_points_that_are_known_to_nothing_are_no_success_and_others_are() -> None:
