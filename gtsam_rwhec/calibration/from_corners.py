@@ -554,11 +554,11 @@ def _why_not(run: Run, base: Refined) -> str:
 
 def _with_corners(problem: Problem) -> dict[Pair, np.ndarray]:
     """Which measurements of each pair (N,) have corners."""
-    found = {}
+    found: dict[Pair, np.ndarray] = {}
     for pair in problem.pairs:
         pixels = problem.measurements(*pair).pixels
         none = np.zeros(problem.moments(*pair).count, dtype=bool)
-        found[pair] = none if pixels is None else np.isfinite(pixels).any(axis=(1, 2))
+        found[pair] = none if pixels is None else np.asarray(np.isfinite(pixels).any(axis=(1, 2)))
     return found
 
 
