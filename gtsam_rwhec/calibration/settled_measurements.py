@@ -18,7 +18,15 @@ from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of, 
 from gtsam_rwhec.calibration.from_corners import ByCorners, with_estimated_intrinsics
 from gtsam_rwhec.calibration.outliers import refined_with_outliers
 from gtsam_rwhec.calibration.sizes import TargetSize, sizes_in
-from gtsam_rwhec.errors import CountError, NoiseError, OutlierError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.errors import (
+    CountError,
+    NoiseError,
+    OutlierError,
+    RwhecError,
+    RwhecWarning,
+    ScaleError,
+    UnderdeterminedError,
+)
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
@@ -79,6 +87,8 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorne
         return run, sizes, None
     by = None
     if run.recording is not None:
+        if options.sizes == "check" and problem.scale == "known":
+            sizes = _sizes_as_seen(run, told.inliers)
         better, by = with_estimated_intrinsics(run, told.refined, told.inliers)
         if better.times > run.times:
             again, other_sizes, other = settled_measurements(better)
@@ -87,6 +97,26 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorne
         else:
             run = better
     return replace(run, agreed=_agreed(run, told.inliers)), sizes, by
+
+
+def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
+    """What the measurements that agree say of sizes that count as known; empty where they do not tell."""
+    kept = selected(run.problem, inliers) if inliers else run.problem
+    free = with_free_sizes(kept, kept.targets)
+    asked = _asked(kept, run)
+    how = RefineOptions(
+        noise="given" if run.options.noise == "given" else "estimate",
+        carrier_noise=run.options.carrier_noise,
+        carrier_model="propagated",
+        time_offsets=asked,
+        carrier_path=run.options.carrier_path if asked else None,
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)  # the answer takes the stated sizes
+            return tuple(sizes_in(refine(free, solve(free, options=run.options.solve), how)))
+    except RwhecError:
+        return ()
 
 
 def _agreed(run: Run, inliers: Inliers) -> tuple[Solution, Inliers] | None:
