@@ -48,8 +48,8 @@ from simulated_arms import ARM, BENT_RAD, Arm, moved_by, white
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.results.change_test import change_test
+from gtsam_rwhec.results.changed_frames import as_result, without_constant_errors
 from gtsam_rwhec.results.common_quantities import Quantities, quantities
-from gtsam_rwhec.results.difference import as_result, without_constant_errors
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.simulate.simulated_rigs import Motion, carrier_poses
 

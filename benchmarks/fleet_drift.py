@@ -39,7 +39,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.fleet.fleet_rows import RobotRow, RowFrame
 from gtsam_rwhec.fleet.watching import DAY_NS, Watched, watch
-from gtsam_rwhec.results.difference import as_result, without_constant_errors
+from gtsam_rwhec.results.changed_frames import as_result, without_constant_errors
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 FloatArray = NDArray[np.float64]

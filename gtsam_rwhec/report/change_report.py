@@ -11,8 +11,8 @@ from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.report_blocks import Listing, Page, Paragraph, Section, Table, Words
 from gtsam_rwhec.report.terminal_report import print_blocks, print_heading, report_console
 from gtsam_rwhec.results.change_test import ChangeTest
+from gtsam_rwhec.results.changed_frames import Difference, share_words
 from gtsam_rwhec.results.common_quantities import Movement
-from gtsam_rwhec.results.difference import Difference, share_words
 from gtsam_rwhec.results.verification import Verification
 
 MOVED_HEADINGS = ("mm", "°", "deviations", "chance", "changed")

@@ -30,9 +30,9 @@ from .change_test import GroupChange as GroupChange
 from .common_quantities import Movement as Movement
 from .control_chart import RATE as RATE
 from .control_chart import checked_rate as checked_rate
-from .difference import Difference as Difference
-from .difference import NumberChange as NumberChange
-from .difference import difference as difference
+from .changed_frames import Difference as Difference
+from .changed_frames import NumberChange as NumberChange
+from .changed_frames import difference as difference
 from .verification import SensorCheck as SensorCheck
 from .verification import Verification as Verification
 from .verification import verify as verify

@@ -444,7 +444,7 @@ def _warp(shape: BoardShape | None) -> Array:
 
 
 def _bent(points: Array, reach: float, warp: Array) -> Array:
-    """Points of a flat board (n, 3) on the warped one, by the formula of `reprojection.corner_views.shaped`."""
+    """Points of a flat board (n, 3) on the warped one, by the formula of `corner_residuals.shaped`."""
     bent: Array = points + np.outer((points[:, :2] / reach) ** 2 @ warp, [0.0, 0.0, 1.0])
     return bent
 

@@ -19,8 +19,8 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
+from gtsam_rwhec.results.changed_frames import as_result, share_words, without_constant_errors
 from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
-from gtsam_rwhec.results.difference import as_result, share_words, without_constant_errors
 from gtsam_rwhec.results.near_answer import NearAnswer, near, stated_as
 from gtsam_rwhec.results.result_file import Result
 

@@ -13,7 +13,7 @@ from two_logs import KNOCKED, calibrated, log_of
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, FrameError, OptionError
 from gtsam_rwhec.fitting.unknowns import Unknown
-from gtsam_rwhec.results.difference import without_constant_errors
+from gtsam_rwhec.results.changed_frames import without_constant_errors
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport, LogFields
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.results.schema import CalibrationFields
