@@ -29,40 +29,26 @@ Part = tuple[slice, Mapping[int, ArrayLike]]
 
 @dataclass(frozen=True)
 class Linearization:
-    """Residuals of N measurements and their derivatives.
+    """Residuals of N measurements and their derivatives."""
 
-    Attributes
-    ----------
-    residual : (N, 6) array
-        [rotation (rad), translation (m)].
-    target, sensor, carrier : (N, 6, 6) arrays
-        By right perturbations of X, Y and A.
-    scale, offset : (N, 6) arrays
-        By the scale and by the time offset (s).
-    """
-
-    residual: Array
+    residual: Array  #: (N, 6): [rotation (rad), translation (m)]
+    #: (N, 6, 6): by right perturbations of X, Y and A
     target: Array
     sensor: Array
+    #: (N, 6): by the scale and by the time offset (s)
     scale: Array
     offset: Array
-    carrier: Array
+    carrier: Array  #: (N, 6, 6): by right perturbations of X, Y and A
 
 
 @dataclass(frozen=True)
 class BatchResiduals:
-    """Measurements of one pair, A X = Y B, with the residual Log(B^-1 S(Y^-1 A X)), S(R, t) = (R, scale t).
+    """Measurements of one pair, A X = Y B, with the residual Log(B^-1 S(Y^-1 A X)), S(R, t) = (R, scale t)."""
 
-    Attributes
-    ----------
-    A, B : (N, 4, 4) arrays
-        T_sensorcarrier_targetcarrier and T_sensor_target; metres (B's times the scale).
-    twists : (N, 6) array, optional
-        Velocities of the carriers: A(t + d) = A Expmap(d twist), [omega rad/s, v m/s].
-    """
-
+    #: (N, 4, 4): T_sensorcarrier_targetcarrier and T_sensor_target; metres (B's times the scale)
     A: Array
     B: Array
+    #: (N, 6): velocities of the carriers: A(t + d) = A Expmap(d twist), [omega rad/s, v m/s]
     twists: Array | None = None
 
     def linearize(self, X: Array, Y: Array, scale: float = 1.0, offset_s: float = 0.0) -> Linearization:

@@ -30,21 +30,13 @@ T_X, T_Y, SCALE, R_X, R_Y = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16,
 
 @dataclass(frozen=True)
 class EdgeSummary:
-    """A pair's measurements as one quadratic form. ``a + b`` holds the measurements of both, about a's origins.
+    """A pair's measurements as one quadratic form. ``a + b`` holds the measurements of both, about a's origins."""
 
-    Attributes
-    ----------
-    form : (25, 25) array
-        Q: x' Q x is the cost 1/2 sum (kappa |R_A R_X - R_Y R_B|_F^2
-        + |s (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2).
-    count : int
-        Number of measurements.
-    target_origin, sensor_origin : (3,) arrays
-        c and a, in metres: t_X and t_Y are relative to them. Origins near the poses keep the form's digits.
-    """
-
+    #: (25, 25): Q: x' Q x is the cost 1/2 sum (kappa |R_A R_X - R_Y R_B|_F^2 + |s (R_A t_X + t_A - t_Y) - R_Y t_B|^2 /
+    #: sigma^2)
     form: Array
-    count: int
+    count: int  #: Number of measurements
+    #: (3,): c and a, in metres: t_X and t_Y are relative to them. Origins near the poses keep the form's digits.
     target_origin: Array = field(default_factory=lambda: np.zeros(3))
     sensor_origin: Array = field(default_factory=lambda: np.zeros(3))
 

@@ -151,64 +151,37 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a log knows beside its measurements, and ``calibrate`` asks of it.
+    """What a log knows beside its measurements, and ``calibrate`` asks of it."""
 
-    Attributes
-    ----------
-    uncleaned : Problem, optional
-        The measurements with those that cleaning removed because they contradict the carriers' motion: a misreading
-        makes these.
-    is_detected : bool
-        Whether this library found B in images: it was not misread.
-    is_inverse : bool
-        Whether A is the inverse of the carriers' poses as they were written: these may be what was misread.
-    late : tuple of Finding
-        Stated clocks that the carriers' turning contradicts: nothing else is computed then.
-    far_off : tuple of str
-        Sensors whose corners contradict their stated intrinsics by far: where these lead nowhere, they are unknown.
-    """
-
+    #: The measurements with those that cleaning removed because they contradict the carriers' motion: a misreading
+    #: makes these
     uncleaned: Problem | None = None
-    is_detected: bool = False
+    is_detected: bool = False  #: Whether this library found B in images: it was not misread
+    #: Whether A is the inverse of the carriers' poses as they were written: these may be what was misread
     is_inverse: bool = False
+    #: Stated clocks that the carriers' turning contradicts: nothing else is computed then
     late: tuple[Finding, ...] = ()
+    #: Sensors whose corners contradict their stated intrinsics by far: where these lead nowhere, they are unknown
     far_off: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of ``calibrate``, or an attempt within it.
-
-    Attributes
-    ----------
-    problem : Problem
-    options : CalibrateOptions
-    tell : Progress
-        Is called with the name of each step.
-    recording : Recording or None
-        None for measurements of no log.
-    record : Record
-    times : int
-        How often it was begun, since poses of targets were computed again.
-    cameras : dict of str to Camera
-        The intrinsics by which they were, where these are not the stated ones.
-    stated : Problem or None
-        The problem with sizes as they were stated, where some are estimated in their place.
-    moved_s : dict of str to float
-        By sensor: how much later than its stamps said A was taken along the carriers' path.
-    agreed : (Solution, inliers) or None
-        The measurements that agree, where clocks and sizes told already, and their certified solution.
-    """
+    """One run of ``calibrate``, or an attempt within it."""
 
     problem: Problem
     options: CalibrateOptions
-    tell: Progress
-    recording: Recording | None = None
+    tell: Progress  #: Is called with the name of each step
+    recording: Recording | None = None  #: None for measurements of no log
     record: Record = field(default_factory=Record)
-    times: int = 1
+    times: int = 1  #: How often it was begun, since poses of targets were computed again
+    #: The intrinsics by which they were, where these are not the stated ones
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    #: The problem with sizes as they were stated, where some are estimated in their place
     stated: Problem | None = None
+    #: By sensor: how much later than its stamps said A was taken along the carriers' path
     moved_s: Mapping[str, float] = field(default_factory=dict)
+    #: The measurements that agree, where clocks and sizes told already, and their certified solution
     agreed: tuple[Solution, Inliers] | None = None
 
     @property

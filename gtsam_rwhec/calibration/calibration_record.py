@@ -27,71 +27,37 @@ from gtsam_rwhec.solver.solution import Solution
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result of ``calibrate``.
+    """The result of ``calibrate``."""
 
-    Attributes
-    ----------
-    X, Y : dict of str to gtsam.Pose3
-        The poses to use: T_targetcarrier_target and T_sensorcarrier_sensor, metres. They are the refined ones if there
-        are any, else the certified ones.
-    scale : float or dict of str to float
-        Measured length / true length.
-    time_offsets_s : dict of str to float
-        By sensor, if estimated: the sensor's stamp t is the carriers' t + offset.
-    judgement : Judgement
-        The verdict with its grounds; ``str()`` is one sentence.
-    solution : Solution or None
-        The certified solution of the measurements that were kept. None where there is no answer with a positive scale;
-        then there are no poses either.
-    refined : Refined or None
-        The refined calibration: graph, values, joint covariance. None if it could not be made, or was not because the
-        measurements were misread; ``choices`` say why.
-    noise : NoiseFound
-        The noise that was found.
-    outliers : Outliers
-        The measurements that were left out.
-    misreadings : tuple of Misreading
-        Likely mistakes in the reading of A and B, each with its cure; two or more fit alike.
-    implausible : Implausible or None
-        Residuals that no sensor has.
-    sizes : tuple of TargetSize
-        What the motion says about sizes that were said to be known.
-    cannot_tell : tuple of str
-        Mistakes in the reading of A and B that would change no residual: no data can show them.
-    findings : tuple of Finding
-        What was found against the poses besides what certificate and free directions say.
-    choices : tuple of Choice
-        Every choice, with its evidence.
-    notes : tuple of str
-        Warnings on the way that change no choice.
-    views : dict of str to SensorView
-        Where each sensor saw its targets.
-    carriers : Carriers
-    options : CalibrateOptions
-    problem : Problem
-        The measurements that were calibrated: A at the clocks' offsets where it was taken again along a path, poses of
-        targets by the intrinsics that count, and sizes that are estimated in place of stated ones.
-    """
-
+    #: The poses to use: T_targetcarrier_target and T_sensorcarrier_sensor, metres. They are the refined ones if there
+    #: are any, else the certified ones.
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
-    scale: float | dict[str, float]
-    time_offsets_s: dict[str, float]
-    judgement: Judgement
+    scale: float | dict[str, float]  #: Measured length / true length
+    time_offsets_s: dict[str, float]  #: By sensor, if estimated: the sensor's stamp t is the carriers' t + offset
+    judgement: Judgement  #: The verdict with its grounds; ``str()`` is one sentence
+    #: The certified solution of the measurements that were kept. None where there is no answer with a positive scale;
+    #: then there are no poses either.
     solution: Solution | None
+    #: The refined calibration: graph, values, joint covariance. None if it could not be made, or was not because the
+    #: measurements were misread; ``choices`` say why.
     refined: Refined | None
-    noise: NoiseFound
-    outliers: Outliers
+    noise: NoiseFound  #: The noise that was found
+    outliers: Outliers  #: The measurements that were left out
+    #: Likely mistakes in the reading of A and B, each with its cure; two or more fit alike
     misreadings: tuple[Misreading, ...]
-    implausible: Implausible | None
-    sizes: tuple[TargetSize, ...]
+    implausible: Implausible | None  #: Residuals that no sensor has
+    sizes: tuple[TargetSize, ...]  #: What the motion says about sizes that were said to be known
+    #: Mistakes in the reading of A and B that would change no residual: no data can show them
     cannot_tell: tuple[str, ...]
-    findings: tuple[Finding, ...]
-    choices: tuple[Choice, ...]
-    notes: tuple[str, ...]
-    views: dict[str, SensorView] = field(repr=False)
+    findings: tuple[Finding, ...]  #: What was found against the poses besides what certificate and free directions say
+    choices: tuple[Choice, ...]  #: Every choice, with its evidence
+    notes: tuple[str, ...]  #: Warnings on the way that change no choice
+    views: dict[str, SensorView] = field(repr=False)  #: Where each sensor saw its targets
     carriers: Carriers
     options: CalibrateOptions = field(repr=False)
+    #: The measurements that were calibrated: A at the clocks' offsets where it was taken again along a path, poses of
+    #: targets by the intrinsics that count, and sizes that are estimated in place of stated ones
     problem: Problem = field(repr=False)
 
     @property

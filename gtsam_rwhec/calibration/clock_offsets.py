@@ -49,21 +49,12 @@ BLOCKS_OF_TIME = 8
 
 @dataclass(frozen=True)
 class Clock:
-    """What the data say about one sensor's clock; ``str()`` is one sentence.
-
-    Attributes
-    ----------
-    sensor : str
-    is_worth_estimating : bool
-    evidence : str
-        Why, in words.
-    offset_s, sigma_s : float or None
-        A first estimate of the offset, one step from the certified solution, and its standard deviation.
-    """
+    """What the data say about one sensor's clock; ``str()`` is one sentence."""
 
     sensor: str
     is_worth_estimating: bool
-    evidence: str
+    evidence: str  #: Why, in words
+    #: A first estimate of the offset, one step from the certified solution, and its standard deviation
     offset_s: float | None = None
     sigma_s: float | None = None
 

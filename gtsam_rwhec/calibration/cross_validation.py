@@ -78,23 +78,15 @@ def _halves(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
 
 @dataclass(frozen=True)
 class PredictionError:
-    """The distance of predicted measurements from the measured ones.
+    """The distance of predicted measurements from the measured ones."""
 
-    Attributes
-    ----------
-    count : int
-        Number of predicted measurements.
-    translation_rms_mm, translation_median_mm, translation_95_mm : float
-        Root mean square, median and 95th percentile of |t_measured / scale - t_predicted|, true millimetres; nan if
-        no measurement was predicted.
-    rotation_rms_deg, rotation_median_deg, rotation_95_deg : float
-        Root mean square, median and 95th percentile of the angle of R_measured' R_predicted, degrees.
-    """
-
-    count: int
+    count: int  #: Number of predicted measurements
+    #: Root mean square, median and 95th percentile of |t_measured / scale - t_predicted|, true millimetres; nan if no
+    #: measurement was predicted
     translation_rms_mm: float
     translation_median_mm: float
     translation_95_mm: float
+    #: Root mean square, median and 95th percentile of the angle of R_measured' R_predicted, degrees
     rotation_rms_deg: float
     rotation_median_deg: float
     rotation_95_deg: float
@@ -109,20 +101,13 @@ class PredictionError:
 
 @dataclass(frozen=True)
 class HoldOutError:
-    """The errors of held-out measurements, and of the same measurements with a calibration from all measurements.
+    """The errors of held-out measurements, and of the same measurements with a calibration from all measurements."""
 
-    Attributes
-    ----------
-    held_out, training : PredictionError
-        If the two differ much, there are too few measurements, or too many unknowns, for the noise. If both are large,
-        there are outliers, a wrong model (intrinsics, a size, a delay), or much noise.
-    not_predicted : int
-        Number of measurements of frames that the other measurements do not determine.
-    """
-
+    #: If the two differ much, there are too few measurements, or too many unknowns, for the noise. If both are large,
+    #: there are outliers, a wrong model (intrinsics, a size, a delay), or much noise.
     held_out: PredictionError
     training: PredictionError
-    not_predicted: int
+    not_predicted: int  #: Number of measurements of frames that the other measurements do not determine
 
 
 def prediction_errors(problem: Problem, answer: Solution | RefinedPoses, pair: Pair, one: Measurements) -> Array:
@@ -151,33 +136,21 @@ def _rms_median_95(values: Array) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """The result of ``cross_validate``.
-
-    Attributes
-    ----------
-    by : "time", "pair" or "sensor"
-    number_of_folds : int
-    ordered_by : "stamps" or "order"
-        The time of measurements: their stamps, or, for pairs without stamps, the order in which they were added.
-    overall : HoldOutError
-    sensors, targets : dict of str to HoldOutError
-        A sensor's error includes its own motions.
-    pairs : dict of (target, sensor) to HoldOutError
-    translation_errors_m, rotation_errors_rad : dict of (target, sensor) to (N,) array
-        The error of each held-out measurement, in the order of ``problem.measurements``; nan where not predicted.
-    notes : tuple of str
-        The measurements that could not be predicted, with the reason, and the warnings of the calibrations.
-    """
+    """The result of ``cross_validate``."""
 
     by: Split
     number_of_folds: int
+    #: The time of measurements: their stamps, or, for pairs without stamps, the order in which they were added
     ordered_by: Literal["stamps", "order"]
     overall: HoldOutError
+    #: A sensor's error includes its own motions
     sensors: dict[str, HoldOutError]
     targets: dict[str, HoldOutError]
     pairs: dict[Pair, HoldOutError]
+    #: The error of each held-out measurement, in the order of ``problem.measurements``; nan where not predicted.
     translation_errors_m: dict[Pair, Array]
     rotation_errors_rad: dict[Pair, Array]
+    #: The measurements that could not be predicted, with the reason, and the warnings of the calibrations
     notes: tuple[str, ...]
 
 

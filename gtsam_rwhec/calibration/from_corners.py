@@ -73,25 +73,13 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """The model that was chosen.
-
-    Attributes
-    ----------
-    options : CornerOptions
-    words : str
-        What it takes as known of A and of sizes.
-    evidence : str
-    scores : tuple of Score
-        Of all models, the chosen one first; empty where images are too few.
-    left_out : LeftOut
-        Of the chosen one; empty where images are too few.
-    """
+    """The model that was chosen."""
 
     options: CornerOptions
-    words: str
+    words: str  #: What it takes as known of A and of sizes
     evidence: str
-    scores: tuple[Score, ...]
-    left_out: LeftOut
+    scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
+    left_out: LeftOut  #: Of the chosen one; empty where images are too few
 
 
 def chosen_model(
@@ -187,26 +175,15 @@ SURE_SIGMAS = 5.0
 
 @dataclass(frozen=True, eq=False)
 class CornersFound:
-    """What the corners gave.
+    """What the corners gave."""
 
-    Attributes
-    ----------
-    corners : CornersRefined or None
-        None where they give no better answer than the poses.
-    intrinsics : dict of str to Intrinsics
-    reprojection : Reprojection or None
-    choices : tuple of Choice
-    findings : tuple of Finding
-    wider : dict of (letter, name) to float
-        By how much each unknown's deviations are widened, since images that were left out are farther off than the
-        covariances say; empty where they are not.
-    """
-
-    corners: CornersRefined | None
+    corners: CornersRefined | None  #: None where they give no better answer than the poses
     intrinsics: dict[str, Intrinsics]
     reprojection: Reprojection | None
     choices: tuple[Choice, ...]
     findings: tuple[Finding, ...]
+    #: By how much each unknown's deviations are widened, since images that were left out are farther off than the
+    #: covariances say; empty where they are not
     wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @staticmethod

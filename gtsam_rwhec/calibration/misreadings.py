@@ -113,28 +113,17 @@ FEWEST_ROWS = 8
 
 @dataclass(frozen=True)
 class Misreading:
-    """A likely mistake in reading the poses; ``str()`` is one sentence with both residuals and the cure.
-
-    Attributes
-    ----------
-    mistake : Mistake
-    likely, cure : str
-        What was likely misread, and what to do.
-    rotation_deg, translation_mm : (float, float)
-        The median residuals as read, and if read otherwise.
-    of_B : bool
-        Whether B was misread.
-    inverts_A : bool
-        Whether A, alone, is the inverse of what was meant: the carriers are exchanged.
-    """
+    """A likely mistake in reading the poses; ``str()`` is one sentence with both residuals and the cure."""
 
     mistake: Mistake
+    #: What was likely misread, and what to do
     likely: str
     cure: str
+    #: The median residuals as read, and if read otherwise
     rotation_deg: tuple[float, float]
     translation_mm: tuple[float, float]
-    of_B: bool = False
-    inverts_A: bool = False
+    of_B: bool = False  #: Whether B was misread
+    inverts_A: bool = False  #: Whether A, alone, is the inverse of what was meant: the carriers are exchanged
 
     def __str__(self) -> str:
         before, after = (
@@ -411,18 +400,12 @@ EXCHANGE_OPEN = 3.0
 
 @dataclass(frozen=True)
 class Exchange:
-    """What the measurements say of exchanged carriers.
+    """What the measurements say of exchanged carriers."""
 
-    Attributes
-    ----------
-    misreading : Misreading or None
-        The exchange, where it fits far better, and where a frame that moved once does not fit far better still.
-    is_open : bool
-        Whether measurements that are too few for any other test do not tell the two apart, or leave residuals that are
-        not small.
-    """
-
+    #: The exchange, where it fits far better, and where a frame that moved once does not fit far better still
     misreading: Misreading | None = None
+    #: Whether measurements that are too few for any other test do not tell the two apart, or leave residuals that are
+    #: not small
     is_open: bool = False
 
 

@@ -33,29 +33,19 @@ SMALLEST_GROUP, FEWEST_OF_GROUPS = 0.25, 20
 
 @dataclass(frozen=True)
 class TwoPoses:
-    """A frame whose measurements fall into two groups; ``str()`` is a sentence's part.
-
-    Attributes
-    ----------
-    frame : str
-    first, second : int
-        How many measurements each group has.
-    angle_rad, distance_m : float
-        How far apart the two poses of the frame are.
-    from_row : int or None
-        The first measurement of the second group among those of its pair, counted from one, where the frame is in one
-        pair and one group follows the other; else None.
-    is_sensor : bool
-        Whether it is a sensor: then its mount gave way.
-    """
+    """A frame whose measurements fall into two groups; ``str()`` is a sentence's part."""
 
     frame: str
+    #: How many measurements each group has
     first: int
     second: int
+    #: How far apart the two poses of the frame are
     angle_rad: float
     distance_m: float
+    #: The first measurement of the second group among those of its pair, counted from one, where the frame is in one
+    #: pair and one group follows the other; else None
     from_row: int | None
-    is_sensor: bool = False
+    is_sensor: bool = False  #: Whether it is a sensor: then its mount gave way
 
     def __str__(self) -> str:
         when = "" if self.from_row is None else f" from measurement {self.from_row} on"

@@ -26,31 +26,18 @@ from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """The noise that a calibration counts with, one standard deviation an axis; ``str()`` is a sentence.
+    """The noise that a calibration counts with, one standard deviation an axis; ``str()`` is a sentence."""
 
-    Attributes
-    ----------
-    source : str
-        Where it comes from: "estimated from the residuals", "as given".
-    rotation_rad, translation_m : dict of (target, sensor) to float
-        Of B, by pair: of the pair's median measurement, root mean square over axes.
-    carriers : str
-        The noise of A, in words.
-    model : NoiseInData or None
-        All that the data say of their noise, of A's, in time and over the configuration; None where B's alone was
-        estimated, or noise was given.
-    simple : str
-        Why B's alone was estimated; empty with a model.
-    has_failed : bool
-        Whether the model of all noise could not be computed, or the noise that was stated for A not used.
-    """
-
-    source: str
+    source: str  #: Where it comes from: "estimated from the residuals", "as given"
+    #: Of B, by pair: of the pair's median measurement, root mean square over axes
     rotation_rad: dict[Pair, float]
     translation_m: dict[Pair, float]
-    carriers: str
+    carriers: str  #: The noise of A, in words
+    #: All that the data say of their noise, of A's, in time and over the configuration; None where B's alone was
+    #: estimated, or noise was given
     model: NoiseInData | None = None
-    simple: str = ""
+    simple: str = ""  #: Why B's alone was estimated; empty with a model
+    #: Whether the model of all noise could not be computed, or the noise that was stated for A not used
     has_failed: bool = False
 
     def __str__(self) -> str:

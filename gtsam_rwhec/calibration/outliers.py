@@ -99,24 +99,13 @@ FEWEST_OF_A_FRAME = 3
 
 @dataclass(frozen=True)
 class Outliers:
-    """The measurements that were left out because they contradict the others.
+    """The measurements that were left out because they contradict the others."""
 
-    Attributes
-    ----------
-    inliers : dict of (target, sensor) to (N,) booleans
-        The measurements that were kept, in the order of ``problem.measurements``; empty if none were looked for.
-    counts : dict of (target, sensor) to (int, int)
-        The number kept, and the number of all.
-    left_out : tuple of str
-        Sensors and targets that have no measurement left, and so no pose.
-    looked_for : bool
-        Whether outliers were looked for.
-    """
-
+    #: The measurements that were kept, in the order of ``problem.measurements``; empty if none were looked for.
     inliers: dict[Pair, np.ndarray]
-    counts: dict[Pair, tuple[int, int]]
-    left_out: tuple[str, ...]
-    looked_for: bool
+    counts: dict[Pair, tuple[int, int]]  #: The number kept, and the number of all
+    left_out: tuple[str, ...]  #: Sensors and targets that have no measurement left, and so no pose
+    looked_for: bool  #: Whether outliers were looked for
 
     @staticmethod
     def of(problem: Problem, inliers: dict[Pair, np.ndarray]) -> Outliers:
@@ -186,15 +175,10 @@ FEWEST_ASKED = 8
 
 @dataclass(frozen=True)
 class GrossErrors:
-    """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part.
+    """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part."""
 
-    Attributes
-    ----------
-    number, looked_at, in_all : int
-        Measurements that look wrong, those that were looked at, and those of the problem: of large problems a sample is
-        looked at, and pairs with a few measurements are left out.
-    """
-
+    #: Measurements that look wrong, those that were looked at, and those of the problem: of large problems a sample is
+    #: looked at, and pairs with a few measurements are left out
     number: int
     looked_at: int
     in_all: int

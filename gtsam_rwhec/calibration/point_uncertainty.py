@@ -36,42 +36,23 @@ NODES = (48, 24)
 
 @dataclass(frozen=True, eq=False)
 class PointUncertainty:
-    """How far off a point is that is seen in one frame and expressed in another.
+    """How far off a point is that is seen in one frame and expressed in another."""
 
-    Attributes
-    ----------
-    point_m : (3,) array
-        The point in ``frame``, metres.
-    frame, seen_from : str
-        The frame of the point, and the frame in which it is expressed.
-    level : float
-        Probability of the ellipsoid and of the ball.
-    centre_m : (3,) array
-        The point in ``seen_from``, metres.
-    covariance_m2 : (3, 3) array
-        Covariance of the centre from the calibration's errors, in the axes of ``seen_from``, m^2; infinite in rows that
-        a free direction moves.
-    axes : (3, 3) array
-        Columns: the ellipsoid's axes in ``seen_from``, the longest first.
-    half_lengths_mm : (3,) array
-        The ellipsoid's half axes at the level, millimetres.
-    radius_mm : float
-        The true point is within this distance of the centre with probability ``level``, millimetres.
-    measurement_mm : float or None
-        The same radius for the noise of one new measurement alone, which is not in ``radius_mm``: of the sensor, and of
-        A where the point is expressed on the other carrier. None where nothing is measured, and where the noise is not
-        known.
-    """
-
-    point_m: Array
+    point_m: Array  #: (3,): the point in ``frame``, metres
+    #: The frame of the point, and the frame in which it is expressed
     frame: str
     seen_from: str
-    level: float
-    centre_m: Array
+    level: float  #: Probability of the ellipsoid and of the ball
+    centre_m: Array  #: (3,): the point in ``seen_from``, metres
+    #: (3, 3): covariance of the centre from the calibration's errors, in the axes of ``seen_from``, m^2; infinite in
+    #: rows that a free direction moves
     covariance_m2: Array
-    axes: Array
-    half_lengths_mm: Array
-    radius_mm: float
+    axes: Array  #: (3, 3): columns: the ellipsoid's axes in ``seen_from``, the longest first
+    half_lengths_mm: Array  #: (3,): the ellipsoid's half axes at the level, millimetres
+    radius_mm: float  #: The true point is within this distance of the centre with probability ``level``, millimetres
+    #: The same radius for the noise of one new measurement alone, which is not in ``radius_mm``: of the sensor, and of
+    #: A where the point is expressed on the other carrier. None where nothing is measured, and where the noise is not
+    #: known.
     measurement_mm: float | None
 
     def __str__(self) -> str:
@@ -196,38 +177,20 @@ class Carriers:
 
 @dataclass(frozen=True)
 class Side:
-    """The frames on one carrier.
-
-    Attributes
-    ----------
-    kind : "sensor" or "target"
-    poses : dict of str to gtsam.Pose3
-        On the carrier.
-    words : tuple of str
-        What the carrier is called.
-    """
+    """The frames on one carrier."""
 
     kind: str
-    poses: Mapping[str, gtsam.Pose3]
-    words: tuple[str, ...]
+    poses: Mapping[str, gtsam.Pose3]  #: On the carrier
+    words: tuple[str, ...]  #: What the carrier is called
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a point is expressed.
-
-    Attributes
-    ----------
-    name : str
-    frame : gtsam.Pose3 or None
-        The pose of the frame on its carrier; None for the carrier itself.
-    is_across : bool
-        Whether it is on the other carrier than the point's own frame.
-    """
+    """Where a point is expressed."""
 
     name: str
-    frame: gtsam.Pose3 | None
-    is_across: bool
+    frame: gtsam.Pose3 | None  #: The pose of the frame on its carrier; None for the carrier itself
+    is_across: bool  #: Whether it is on the other carrier than the point's own frame
 
 
 def sides_of(refined: RefinedPoses, frame: object, carriers: Carriers, *, has_A: bool) -> tuple[Side, Side]:

@@ -70,21 +70,11 @@ def _is_off(scale: float, sigma: float | None, sigmas: float) -> bool:
 
 @dataclass(frozen=True)
 class TargetSize:
-    """What the motion says about the size of a target that was taken as known; ``str()`` is one sentence.
+    """What the motion says about the size of a target that was taken as known; ``str()`` is one sentence."""
 
-    Attributes
-    ----------
-    target : str
-        The target; or a sensor, for the lengths of its own motions.
-    scale : float
-        Lengths in B over true lengths: the stated over the true size.
-    sigma : float or None
-        Standard deviation of the scale; None where the motion does not determine it.
-    """
-
-    target: str
-    scale: float
-    sigma: float | None
+    target: str  #: The target; or a sensor, for the lengths of its own motions
+    scale: float  #: Lengths in B over true lengths: the stated over the true size
+    sigma: float | None  #: Standard deviation of the scale; None where the motion does not determine it
 
     @property
     def is_doubted(self) -> bool:
@@ -107,17 +97,10 @@ class TargetSize:
 
 @dataclass(frozen=True)
 class CommonFactor:
-    """One factor by which all stated sizes are wrong; ``str()`` is one sentence.
+    """One factor by which all stated sizes are wrong; ``str()`` is one sentence."""
 
-    Attributes
-    ----------
-    targets : int
-        How many targets' sizes the motion tells.
-    scale, sigma : float
-        As of a ``TargetSize``.
-    """
-
-    targets: int
+    targets: int  #: How many targets' sizes the motion tells
+    #: As of a ``TargetSize``
     scale: float
     sigma: float
 
@@ -282,17 +265,10 @@ LONG_ARM_M = 50.0
 
 @dataclass(frozen=True)
 class DoubtedLengths:
-    """Lengths that no rig has; ``str()`` is one sentence. Residuals do not show the unit that A and B share.
+    """Lengths that no rig has; ``str()`` is one sentence. Residuals do not show the unit that A and B share."""
 
-    Attributes
-    ----------
-    distance_m : float
-        The median distance of targets from their sensors.
-    arm_m : float
-        How far frames are from their carriers, as a median of the side where they are closer; nan if not determined.
-    """
-
-    distance_m: float
+    distance_m: float  #: The median distance of targets from their sensors
+    #: How far frames are from their carriers, as a median of the side where they are closer; nan if not determined
     arm_m: float
 
     def __str__(self) -> str:

@@ -61,15 +61,10 @@ class Turning:
     Tsai and Lenz (1989), section IV: the error of a hand-eye rotation falls with the sine of the angle between the axes
     of two motions, and that of its translation with the angle of the motions. So an arm that hardly turns magnifies
     every error that does not average out, and no residual shows it.
-
-    Attributes
-    ----------
-    spread_rad : (3,) array
-    along_m, across_m : float
-        Standard deviations of what it moved along the axis with most turning, and across it.
     """
 
-    spread_rad: Array
+    spread_rad: Array  #: (3,)
+    #: Standard deviations of what it moved along the axis with most turning, and across it
     along_m: float
     across_m: float
 

@@ -56,24 +56,14 @@ LOOSE_M, LOOSE_RAD = 10.0, 1.0
 
 @dataclass(frozen=True)
 class StatedPose:
-    """A stated pose that the measurements contradict; ``str()`` is one sentence.
-
-    Attributes
-    ----------
-    frame : str
-    rotation_deg, translation_m : float
-        How far the pose that the measurements give is from it; 0 for a part that was not stated.
-    sigmas : float
-        The same in standard deviations of their difference.
-    is_surely_off : bool
-        Whether the measurements contradict it beyond chance; otherwise it fits them badly.
-    """
+    """A stated pose that the measurements contradict; ``str()`` is one sentence."""
 
     frame: str
+    #: How far the pose that the measurements give is from it; 0 for a part that was not stated
     rotation_deg: float
     translation_m: float
-    sigmas: float
-    is_surely_off: bool = True
+    sigmas: float  #: The same in standard deviations of their difference
+    is_surely_off: bool = True  #: Whether the measurements contradict it beyond chance; otherwise it fits them badly
 
     @property
     def is_small(self) -> bool:

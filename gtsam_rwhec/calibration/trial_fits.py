@@ -63,24 +63,13 @@ class Spread:
 
 @dataclass(frozen=True)
 class TrialFit:
-    """A robust fit of a reading.
+    """A robust fit of a reading."""
 
-    Attributes
-    ----------
-    residual : Spread
-        Of B against its prediction, in the unit that B has.
-    scale : float or dict of str to float
-        Lengths in B over true lengths; negative where A and B are of different handedness.
-    errors : (2, N) array
-        Of each measurement, pair after pair: angle (rad) and distance (in B's unit).
-    frames : dict of str to (4, 4) array
-        The poses of targets and sensors.
-    """
-
-    residual: Spread
+    residual: Spread  #: Of B against its prediction, in the unit that B has
+    #: Lengths in B over true lengths; negative where A and B are of different handedness
     scale: float | dict[str, float]
-    errors: Array
-    frames: dict[str, Array]
+    errors: Array  #: (2, N): of each measurement, pair after pair: angle (rad) and distance (in B's unit)
+    frames: dict[str, Array]  #: The poses of targets and sensors
 
     @property
     def log_likelihoods(self) -> Array:
@@ -379,20 +368,13 @@ class Unlikely(StrEnum):
 
 @dataclass(frozen=True)
 class Implausible:
-    """Residuals that no sensor has; ``str()`` is one sentence.
-
-    Attributes
-    ----------
-    why : Unlikely
-    rotation_deg, translation_mm : float
-        The median residuals; root mean squares where measurements were not kept.
-    varies_deg, varies_mm : float
-        What B varies by within its pairs, medians; nan where measurements were not kept.
-    """
+    """Residuals that no sensor has; ``str()`` is one sentence."""
 
     why: Unlikely
+    #: The median residuals; root mean squares where measurements were not kept
     rotation_deg: float
     translation_mm: float
+    #: What B varies by within its pairs, medians; nan where measurements were not kept
     varies_deg: float
     varies_mm: float
 

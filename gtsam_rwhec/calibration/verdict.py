@@ -287,20 +287,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict with its grounds.
+    """A verdict with its grounds."""
 
-    Attributes
-    ----------
-    verdict : Verdict
-        What to do with the poses.
-    grounds : tuple of Ground
-        Reasons not to use the poses, the most serious first; empty for ``Verdict.USE``.
-    reason : str
-        The grounds in words, and what to do about the first; where all of them ask for care only, about each.
-    """
-
-    verdict: Verdict
-    grounds: tuple[Ground, ...]
+    verdict: Verdict  #: What to do with the poses
+    grounds: tuple[Ground, ...]  #: Reasons not to use the poses, the most serious first; empty for ``Verdict.USE``.
+    #: The grounds in words, and what to do about the first; where all of them ask for care only, about each
     reason: str
 
     def __str__(self) -> str:
@@ -405,21 +396,11 @@ OUTLIERS = "outliers"
 
 @dataclass(frozen=True)
 class Choice:
-    """One choice that ``calibrate`` made, or could not make; ``str()`` is one sentence.
+    """One choice that ``calibrate`` made, or could not make; ``str()`` is one sentence."""
 
-    Attributes
-    ----------
-    what : str
-        What was to be chosen: "outliers", "noise of B", "time offsets", ...
-    chosen : str
-        What was chosen, in words.
-    evidence : str
-        Why: what the data show, what an option said, or why no choice could be made.
-    """
-
-    what: str
-    chosen: str
-    evidence: str
+    what: str  #: What was to be chosen: "outliers", "noise of B", "time offsets", ...
+    chosen: str  #: What was chosen, in words
+    evidence: str  #: Why: what the data show, what an option said, or why no choice could be made
 
     def __str__(self) -> str:
         return f"{self.what[:1].upper()}{self.what[1:]}: {self.chosen}, because {self.evidence}."

@@ -40,17 +40,10 @@ class CorrelatedNoise:
     w I + s K with w + s = 1 and K_ij = exp(-|t_i - t_j| / tau) (Ornstein-Uhlenbeck). K^-1 is tridiagonal (Rue and Held,
     Gaussian Markov Random Fields, Section 1.1): all below takes time proportional to n, by Sigma^-1 =
     K^-1 (s I + w K^-1)^-1 and log|Sigma| = log|s I + w K^-1| + log|K|.
-
-    Attributes
-    ----------
-    share : float
-        Part of the variance that fades, s.
-    time_constant_s : float
-        tau.
     """
 
-    share: float
-    time_constant_s: float
+    share: float  #: Part of the variance that fades, s
+    time_constant_s: float  #: tau
 
     @staticmethod
     def white() -> CorrelatedNoise:
@@ -120,34 +113,17 @@ MEDIAN = 2.366
 
 @dataclass(frozen=True)
 class RotationFit:
-    """The fit at its optimum.
+    """The fit at its optimum."""
 
-    Attributes
-    ----------
-    offset_s, sigma_s : float
-        The offset and its standard deviation: 1.96 of them hold 95 %.
-    noise_share : float
-        The part of the carrier's squared turning rate that is noise.
-    rms_rad : float
-        Root mean square of the rotations' residuals about an axis.
-    used : int
-        Detections that agree.
-    squares : (N,) array
-        Squared residuals of all detections, rad^2; NaN where the carrier's pose is not known.
-    block : (N,) integers
-        The block of each detection.
-    noise : CorrelatedNoise
-        Correlation of the residuals in time.
-    """
-
+    #: The offset and its standard deviation: 1.96 of them hold 95 %.
     offset_s: float
     sigma_s: float
-    noise_share: float
-    rms_rad: float
-    used: int
-    squares: Array
-    block: np.ndarray
-    noise: CorrelatedNoise
+    noise_share: float  #: The part of the carrier's squared turning rate that is noise
+    rms_rad: float  #: Root mean square of the rotations' residuals about an axis
+    used: int  #: Detections that agree
+    squares: Array  #: (N,): squared residuals of all detections, rad^2; NaN where the carrier's pose is not known
+    block: np.ndarray  #: (N,): the block of each detection
+    noise: CorrelatedNoise  #: Correlation of the residuals in time
 
 
 @dataclass(frozen=True)
@@ -340,22 +316,13 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Turns:
-    """The intervals of all tracks of a sensor.
+    """The intervals of all tracks of a sensor."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : (N,) integers
-        The sensor's stamps.
-    turn : (N, 3) array
-        Log(R_B,end R_B,start'), rad, in the sensor's axes.
-    noise_rad : float
-        Robust standard deviation of a turn about each axis, from the detections.
-    """
-
+    #: (N,): the sensor's stamps
     start_ns: np.ndarray
     end_ns: np.ndarray
-    turn: Array
-    noise_rad: float
+    turn: Array  #: (N, 3): log(R_B,end R_B,start'), rad, in the sensor's axes
+    noise_rad: float  #: Robust standard deviation of a turn about each axis, from the detections
 
     @staticmethod
     def of(tracks: Sequence[tuple[np.ndarray, Array]]) -> Turns:
@@ -428,23 +395,14 @@ CLEARLY = 3.0
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """A sensor's stamp t is its carrier's t + offset_s.
+    """A sensor's stamp t is its carrier's t + offset_s."""
 
-    Attributes
-    ----------
-    offset_s, sigma_s : float
-        The offset and its standard deviation: offset_s +- 1.96 sigma_s holds the truth in 95 % of cases. It contains
-        residuals that are correlated in time, and the noise of the carrier's poses.
-    measurements : int
-        Detections that agree with the offset.
-    rms_rad : float
-        Root mean square of their rotations' residuals about an axis.
-    """
-
+    #: The offset and its standard deviation: offset_s +- 1.96 sigma_s holds the truth in 95 % of cases. It contains
+    #: residuals that are correlated in time, and the noise of the carrier's poses.
     offset_s: float
     sigma_s: float
-    measurements: int
-    rms_rad: float
+    measurements: int  #: Detections that agree with the offset
+    rms_rad: float  #: Root mean square of their rotations' residuals about an axis
 
 
 def estimate_time_offset(

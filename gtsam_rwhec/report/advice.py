@@ -29,21 +29,11 @@ SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMAT
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do about a calibration, in sentences.
+    """What to do about a calibration, in sentences."""
 
-    Attributes
-    ----------
-    undetermined : tuple of str
-        What the measurements leave free.
-    cures : tuple of str
-        What settles it.
-    doubts : tuple of str
-        What is odd about the log or its rig file.
-    """
-
-    undetermined: tuple[str, ...]
-    cures: tuple[str, ...]
-    doubts: tuple[str, ...]
+    undetermined: tuple[str, ...]  #: What the measurements leave free
+    cures: tuple[str, ...]  #: What settles it
+    doubts: tuple[str, ...]  #: What is odd about the log or its rig file
 
     @staticmethod
     def of(free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None) -> Advice:

@@ -35,24 +35,13 @@ LEVEL = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame in the scene.
-
-    Attributes
-    ----------
-    name : str
-    kind : "carrier", "sensor" or "target"
-    T : (4, 4) array
-        Pose in the scene, metres.
-    words : tuple of str
-        What is known of it, line by line.
-    covariance : (3, 3) array or None
-        Of its position, in the scene's axes, m^2; None where it is not known, or not finite.
-    """
+    """A frame in the scene."""
 
     name: str
     kind: Kind
-    T: Array
-    words: tuple[str, ...]
+    T: Array  #: (4, 4): pose in the scene, metres
+    words: tuple[str, ...]  #: What is known of it, line by line
+    #: (3, 3): of its position, in the scene's axes, m^2; None where it is not known, or not finite
     covariance: Array | None = None
 
 
@@ -75,40 +64,21 @@ class PlacedBoard:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A rig, or the frames on one of its carriers.
+    """A rig, or the frames on one of its carriers."""
 
-    Attributes
-    ----------
-    world : str
-        The carrier whose axes the scene has.
-    frames : tuple of Frame
-    views : tuple of View
-    boards : tuple of PlacedBoard
-    path : (n, 7) array
-        x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps.
-    moving : str
-        Its name; empty where there is none.
-    low, high : (3,) arrays
-        The box that holds all of it.
-    times : float
-        Ellipsoids are drawn so many times as large.
-    radius : float
-        Deviations to the border of an ellipsoid of `LEVEL`.
-    out_of_sight : tuple of str
-        Carriers whose origins are too far away.
-    """
-
-    world: str
+    world: str  #: The carrier whose axes the scene has
     frames: tuple[Frame, ...]
     views: tuple[View, ...]
     boards: tuple[PlacedBoard, ...]
+    #: (n, 7): x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps
     path: Array
-    moving: str
+    moving: str  #: Its name; empty where there is none
+    #: (3,): the box that holds all of it
     low: Array
     high: Array
-    times: float
-    radius: float
-    out_of_sight: tuple[str, ...]
+    times: float  #: Ellipsoids are drawn so many times as large
+    radius: float  #: Deviations to the border of an ellipsoid of `LEVEL`
+    out_of_sight: tuple[str, ...]  #: Carriers whose origins are too far away
 
     @property
     def extent(self) -> float:
@@ -288,27 +258,14 @@ MOST_FRAMES, MOST_LINES = 40, 200
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A direction of a frame.
-
-    Attributes
-    ----------
-    frame : str
-    label : str
-        "free 1" or "weak 2"; the list below the scene has the same.
-    words : str
-        The sentence.
-    is_free : bool
-    pieces : tuple of (n, 3) arrays
-        Lines to be drawn: the direction itself first.
-    moves, about : (3,) arrays or None
-        The unit vector in the scene along which it moves, or about which it turns.
-    """
+    """A direction of a frame."""
 
     frame: str
-    label: str
-    words: str
+    label: str  #: "free 1" or "weak 2"; the list below the scene has the same
+    words: str  #: The sentence
     is_free: bool
-    pieces: tuple[Array, ...]
+    pieces: tuple[Array, ...]  #: Lines to be drawn: the direction itself first
+    #: (3,): the unit vector in the scene along which it moves, or about which it turns
     moves: Array | None = field(default=None)
     about: Array | None = field(default=None)
 

@@ -74,29 +74,16 @@ def _first_rows(table: Table, number: int, marked: frozenset[str]) -> Table:
 
 @dataclass(frozen=True)
 class ShortReport:
-    """What the short report says.
-
-    Attributes
-    ----------
-    judgement : Judgement
-    advice : tuple of Styled
-        What to do besides.
-    points : tuple of PointUncertainty
-        How far off a point is, by sensor.
-    poses : tuple of PoseTables
-        The poses, in the choices of columns that there are, the most telling one first.
-    sentences : tuple of Styled
-        Frames whose pose is not to be used, warnings, scales, clocks: as many as fit, with their styles.
-    marked : frozenset of str
-        Labels of frames whose poses are not to be used: they are among the rows.
-    """
+    """What the short report says."""
 
     judgement: Judgement
-    advice: tuple[Styled, ...] = ()
-    points: tuple[PointUncertainty, ...] = ()
+    advice: tuple[Styled, ...] = ()  #: What to do besides
+    points: tuple[PointUncertainty, ...] = ()  #: How far off a point is, by sensor
+    #: The poses, in the choices of columns that there are, the most telling one first
     poses: tuple[PoseTables, ...] = ()
+    #: Frames whose pose is not to be used, warnings, scales, clocks: as many as fit, with their styles
     sentences: tuple[Styled, ...] = ()
-    marked: frozenset[str] = frozenset()
+    marked: frozenset[str] = frozenset()  #: Labels of frames whose poses are not to be used: they are among the rows
 
     def print(self, console: Console, *, lines: int = LINES, page: Path | None = None, whole: str) -> None:
         """Print at most so many lines; ``whole`` is how to see everything, and ``page`` the page that was written."""

@@ -22,31 +22,15 @@ from gtsam_rwhec.solver.solution import Solution
 
 @dataclass(frozen=True, eq=False)
 class ShownResult:
-    """A result as its report shows it.
+    """A result as its report shows it."""
 
-    Attributes
-    ----------
-    tree : dict
-        The result's JSON.
-    result : Result or None
-        The same as records; None where the calibration has no answer.
-    evidence : Evidence or None
-    name : str
-        Of the result's file.
-    images : bool
-        Whether the page may show what cameras saw; images may be confidential.
-    warnings : tuple of str
-        What could not be shown although it is there.
-    findings : tuple of Finding
-        What is known against a solution that was not calibrated, beside what the file holds.
-    """
-
-    tree: Mapping[str, Any]
-    result: Result | None
+    tree: Mapping[str, Any]  #: The result's JSON
+    result: Result | None  #: The same as records; None where the calibration has no answer
     evidence: Evidence | None
-    name: str
-    images: bool = True
-    warnings: tuple[str, ...] = ()
+    name: str  #: Of the result's file
+    images: bool = True  #: Whether the page may show what cameras saw; images may be confidential
+    warnings: tuple[str, ...] = ()  #: What could not be shown although it is there
+    #: What is known against a solution that was not calibrated, beside what the file holds
     findings: tuple[Finding, ...] = ()
 
     @staticmethod

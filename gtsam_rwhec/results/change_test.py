@@ -38,58 +38,27 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class GroupChange:
-    """What the test says of one group of quantities: the pose of a frame, a size, a clock, the intrinsics of a camera.
+    """What the test says of one group of quantities: a frame's pose, a size, a clock, a camera's intrinsics."""
 
-    Attributes
-    ----------
-    dimension : int
-        Directions that were compared; 0 where both estimates leave all of them free.
-    deviations : float
-        The group's own difference, in joint (Mahalanobis) deviations: the root of d' C^-1 d, correlations counted.
-    chance : float
-        How often the difference is so large without a change.
-    corrected : float
-        The same where the largest of all groups is looked at (Holm 1979).
-    alone : float
-        How often "only this changed" looks so well supported without a change.
-    explains : bool
-        Whether nothing more than chance is left if only this group changed.
-    """
-
-    dimension: int
+    dimension: int  #: Directions that were compared; 0 where both estimates leave all of them free
+    #: The group's own difference, in joint (Mahalanobis) deviations: the root of d' C^-1 d, correlations counted
     deviations: float
-    chance: float
-    corrected: float
-    alone: float
-    explains: bool
+    chance: float  #: How often the difference is so large without a change
+    corrected: float  #: The same where the largest of all groups is looked at (Holm 1979)
+    alone: float  #: How often "only this changed" looks so well supported without a change
+    explains: bool  #: Whether nothing more than chance is left if only this group changed
 
 
 @dataclass(frozen=True)
 class ChangeTest:
-    """The result of the test.
-
-    Attributes
-    ----------
-    level : float
-    dimension : int
-        Directions that were compared together.
-    deviations : float
-        The root of the joint statistic.
-    degrees_of_freedom : float
-        Of the noise, which was estimated; infinite for chi-square quantiles.
-    joint_chance : float
-        How often the joint statistic is so large without a change.
-    chance : float
-        The same of the alarm.
-    groups : dict of str to GroupChange
-    """
+    """The result of the test."""
 
     level: float
-    dimension: int
-    deviations: float
-    degrees_of_freedom: float
-    joint_chance: float
-    chance: float
+    dimension: int  #: Directions that were compared together
+    deviations: float  #: The root of the joint statistic
+    degrees_of_freedom: float  #: Of the noise, which was estimated; infinite for chi-square quantiles
+    joint_chance: float  #: How often the joint statistic is so large without a change
+    chance: float  #: The same of the alarm
     groups: dict[str, GroupChange]
 
     @property

@@ -22,45 +22,24 @@ from gtsam_rwhec.results.schema import CalibrationFields
 
 @dataclass(frozen=True)
 class NumberChange:
-    """How a number changed that both calibrations estimated: a scale, a time offset, a camera's parameter.
+    """How a number changed that both calibrations estimated: a scale, a time offset, a camera's parameter."""
 
-    Attributes
-    ----------
-    name : str
-        "scale:board", "time_offset:cam", "fx of cam".
-    old, new : float
-    """
-
-    name: str
+    name: str  #: "scale:board", "time_offset:cam", "fx of cam"
     old: float
     new: float
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What changed from an old calibration to a new one; ``str()`` is the verdict.
+    """What changed from an old calibration to a new one; ``str()`` is the verdict."""
 
-    Attributes
-    ----------
-    movements : dict of str to Movement
-        Of every frame that both have; sensors first.
-    numbers : dict of str to tuple of NumberChange
-        By group ("scale:board", "time_offset:cam", "intrinsics:cam"), of what both estimated.
-    test : ChangeTest or None
-        None where it does not apply; ``why_no_test`` says why.
-    why_no_test : str
-    not_compared : dict of str to str
-        What the test leaves out, with the reason.
-    remarks : tuple of str
-        Frames that only one has, other ways to count sizes, what was assumed.
-    """
-
-    movements: dict[str, Movement]
+    movements: dict[str, Movement]  #: Of every frame that both have; sensors first
+    #: By group ("scale:board", "time_offset:cam", "intrinsics:cam"), of what both estimated
     numbers: dict[str, tuple[NumberChange, ...]]
-    test: ChangeTest | None
+    test: ChangeTest | None  #: None where it does not apply; ``why_no_test`` says why
     why_no_test: str
-    not_compared: dict[str, str]
-    remarks: tuple[str, ...]
+    not_compared: dict[str, str]  #: What the test leaves out, with the reason
+    remarks: tuple[str, ...]  #: Frames that only one has, other ways to count sizes, what was assumed
     is_same: bool = field(default=False)
 
     @property

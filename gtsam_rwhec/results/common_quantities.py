@@ -21,15 +21,9 @@ from gtsam_rwhec.geometry.poses import Array
 
 @dataclass(frozen=True)
 class Movement:
-    """How a frame moved: old pose Expmap(xi) = new pose.
+    """How a frame moved: old pose Expmap(xi) = new pose."""
 
-    Attributes
-    ----------
-    xi : (6,) array
-        [omega (rad), v (m)], in the frame's own old axes.
-    """
-
-    xi: Array
+    xi: Array  #: (6,): [omega (rad), v (m)], in the frame's own old axes
 
     @staticmethod
     def of(old: gtsam.Pose3, new: gtsam.Pose3) -> Movement:
@@ -52,25 +46,13 @@ class Movement:
 
 @dataclass(frozen=True)
 class Quantities:
-    """The common quantities as vectors, in units in which all are of similar size.
+    """The common quantities as vectors, in units in which all are of similar size."""
 
-    Attributes
-    ----------
-    difference : (m,) array
-        New less old.
-    covariances : two (m, m) arrays
-    free : (m, k) array
-        Directions of infinite variance of either.
-    slots : dict of Unknown to slice
-    not_compared : dict of Unknown to str
-        What both have and is not in the vectors, with the reason.
-    """
-
-    difference: Array
+    difference: Array  #: (m,): new less old
     covariances: tuple[Array, Array]
-    free: Array
+    free: Array  #: (m, k): directions of infinite variance of either
     slots: dict[Unknown, slice]
-    not_compared: dict[Unknown, str]
+    not_compared: dict[Unknown, str]  #: What both have and is not in the vectors, with the reason
 
     @property
     def groups(self) -> dict[str, slice]:

@@ -41,23 +41,12 @@ OF_ALL = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """What the nights say of changes, one for each profile c.
+    """What the nights say of changes, one for each profile c."""
 
-    Attributes
-    ----------
-    S : (K, m, m) array
-        Information of the change beside an unknown baseline.
-    u : (K, m) array
-        Its score.
-    seen : (K, m) array of bool
-        Rows that nights before and after it determine; others are not tested.
-    squares, dimensions : float, int
-        Residual squares without a change, and their number.
-    """
-
-    S: Array
-    u: Array
-    seen: np.ndarray
+    S: Array  #: (K, m, m): information of the change beside an unknown baseline
+    u: Array  #: (K, m): its score
+    seen: np.ndarray  #: (K, m): rows that nights before and after it determine; others are not tested
+    #: Residual squares without a change, and their number
     squares: float
     dimensions: int
 
@@ -88,30 +77,14 @@ class Shifts:
 
 @dataclass(frozen=True)
 class NightTest:
-    """What the chart says at the last night.
+    """What the chart says at the last night."""
 
-    Attributes
-    ----------
-    nights : int
-        In the chart, with those that are its reference.
-    chance : float
-        The smallest chance over moments and frames; 1 where nothing can be tested.
-    limit : float
-        An alarm is below it.
-    moment : int
-        Index of the first night after the change that explains the nights best.
-    group : str
-        The frame that explains it best alone; empty for all together.
-    ratio : float
-        Its likelihood ratio: squared joint deviations, stated covariances taken as they are.
-    """
-
-    nights: int
-    chance: float
-    limit: float
-    moment: int = 0
-    group: str = field(default="")
-    ratio: float = 0.0
+    nights: int  #: In the chart, with those that are its reference
+    chance: float  #: The smallest chance over moments and frames; 1 where nothing can be tested
+    limit: float  #: An alarm is below it
+    moment: int = 0  #: Index of the first night after the change that explains the nights best
+    group: str = field(default="")  #: The frame that explains it best alone; empty for all together
+    ratio: float = 0.0  #: Its likelihood ratio: squared joint deviations, stated covariances taken as they are
 
     @property
     def is_alarm(self) -> bool:
@@ -291,38 +264,22 @@ BETTER = 2.0
 
 @dataclass(frozen=True, eq=False)
 class ChangeFound:
-    """What changed in a series of nights.
+    """What changed in a series of nights."""
 
-    Attributes
-    ----------
-    first : int
-        Index of the first night after the change: it was between the night before and this one. Of a drift: the first
-        night that it moved.
-    earliest, latest : int
-        The same of the other moments that are hardly less likely.
-    groups : tuple of str
-        The fewest frames whose movement alone explains everything, the surest first.
-    is_of_all : bool
-        Whether these are all frames that were tested: something that all of them share moved, such as the arm's base.
-    change : dict of str to (6,) array
-        How each of these moved (for a drift: by the last night), in the nights' units.
-    deviations : dict of str to float
-        The same in joint deviations of the estimated movement; nan where its covariance says nothing.
-    kind : "step", "drift" or "step or drift"
-        Which fits better, or that neither does.
-    drift_gain : float
-        Log likelihood of the best drift less that of the best step.
-    """
-
+    #: Index of the first night after the change: it was between the night before and this one. Of a drift: the first
+    #: night that it moved.
     first: int
+    #: The same of the other moments that are hardly less likely
     earliest: int
     latest: int
-    groups: tuple[str, ...]
+    groups: tuple[str, ...]  #: The fewest frames whose movement alone explains everything, the surest first
+    #: Whether these are all frames that were tested: something that all of them share moved, such as the arm's base
     is_of_all: bool
-    change: dict[str, Array]
+    change: dict[str, Array]  #: How each of these moved (for a drift: by the last night), in the nights' units
+    #: The same in joint deviations of the estimated movement; nan where its covariance says nothing
     deviations: dict[str, float]
-    kind: str
-    drift_gain: float
+    kind: str  #: Which fits better, or that neither does
+    drift_gain: float  #: Log likelihood of the best drift less that of the best step
 
 
 def change_of(nights: Nights, test: NightTest, spread: Spread) -> ChangeFound:
@@ -403,37 +360,20 @@ def _own(found: Shifts, k: int, rows: np.ndarray, place: slice, variance: float)
 
 @dataclass(frozen=True, eq=False)
 class Alarm:
-    """An alarm.
+    """An alarm."""
 
-    Attributes
-    ----------
-    found : ChangeFound
-        When it was, what moved, and how; its indices are of `nights`.
-    nights : Nights
-        Those of the chart at the alarm.
-    is_back : bool
-        Whether the frames are where they were before the alarm before this one: a few nights were off, and are over.
-    """
-
-    found: ChangeFound
-    nights: Nights
+    found: ChangeFound  #: When it was, what moved, and how; its indices are of `nights`
+    nights: Nights  #: Those of the chart at the alarm
+    #: Whether the frames are where they were before the alarm before this one: a few nights were off, and are over
     is_back: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """The chart of one series as it stands.
+    """The chart of one series as it stands."""
 
-    Attributes
-    ----------
-    nights : Nights
-        Since the last change; the first of them are the reference.
-    before : Nights or None
-        Those between the change before it and the last one.
-    """
-
-    nights: Nights
-    before: Nights | None = None
+    nights: Nights  #: Since the last change; the first of them are the reference
+    before: Nights | None = None  #: Those between the change before it and the last one
 
     def next(
         self, day: float, x: Array, information: Array, spread: Spread, rate: float = RATE

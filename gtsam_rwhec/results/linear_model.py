@@ -33,44 +33,19 @@ OWN = 13
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """All measurements of frames that the answer has, pair after pair.
-
-    Attributes
-    ----------
-    pairs : tuple of Pair
-    pair : (N,) int
-        Each measurement's place in ``pairs``.
-    within : (N,) int
-        Its place among the measurements of its pair.
-    stamps_ns : (N,) int or None
-        None where a pair has none.
-    used : (N,) bool
-    residual : (N, 6)
-        [rad, m], in the target's axes, lengths as measured.
-    noise : (N, 6, 6)
-        Its covariance before the fit.
-    J : (N, 6, 13)
-        The change of the prediction by the measurement's own unknowns.
-    places : (N, 13) int
-        Where these are among all unknowns; ``dimension`` stands for one that is known.
-    A : (N, 4, 4)
-        The carriers' poses.
-    frames : dict of str to slice
-        Where the frames' six unknowns are.
-    dimension : int
-    """
+    """All measurements of frames that the answer has, pair after pair."""
 
     pairs: tuple[Pair, ...]
-    pair: np.ndarray
-    within: np.ndarray
-    stamps_ns: np.ndarray | None
+    pair: np.ndarray  #: Each measurement's place in ``pairs``
+    within: np.ndarray  #: Its place among the measurements of its pair
+    stamps_ns: np.ndarray | None  #: None where a pair has none
     used: np.ndarray
-    residual: Array
-    noise: Array
-    J: Array
-    places: np.ndarray
-    A: Array
-    frames: dict[str, slice]
+    residual: Array  #: [rad, m], in the target's axes, lengths as measured
+    noise: Array  #: Its covariance before the fit
+    J: Array  #: The change of the prediction by the measurement's own unknowns
+    places: np.ndarray  #: Where these are among all unknowns; ``dimension`` stands for one that is known
+    A: Array  #: The carriers' poses
+    frames: dict[str, slice]  #: Where the frames' six unknowns are
     dimension: int
 
     @staticmethod
@@ -203,24 +178,15 @@ def _noise_of_A(noise: CarrierNoise | None, A: Array, X: Array, as_measured: Arr
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRows:
-    """The measurements of a pair, used or not.
+    """The measurements of a pair, used or not."""
 
-    Attributes
-    ----------
-    A, B : (N, 4, 4)
-        T_sensorcarrier_targetcarrier at the final time offsets, and T_sensor_target, metres.
-    stamps_ns : (N,) int or None
-    covariance : (N, 6, 6) or None
-        Of B's right perturbation [omega (rad), v (m)], as it was stated; None where a log has none.
-    reasons : tuple of str
-        Why a measurement is not used; empty where it is.
-    """
-
+    #: T_sensorcarrier_targetcarrier at the final time offsets, and T_sensor_target, metres
     A: Array
     B: Array
     stamps_ns: np.ndarray | None
+    #: Of B's right perturbation [omega (rad), v (m)], as it was stated; None where a log has none
     covariance: Array | None
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]  #: Why a measurement is not used; empty where it is
 
     @property
     def used(self) -> np.ndarray:

@@ -15,21 +15,11 @@ from gtsam_rwhec.geometry.poses import Array
 
 @dataclass(frozen=True)
 class Spread:
-    """How the nights scatter beside what their covariances say.
+    """How the nights scatter beside what their covariances say."""
 
-    Attributes
-    ----------
-    variance : float
-        Of the nights over what their covariances say, before the series' own nights are looked at.
-    freedom : float
-        The degrees of freedom with which that is known; infinite for exactly.
-    correlation : float
-        Of the errors of successive nights.
-    """
-
-    variance: float = 1.0
-    freedom: float = math.inf
-    correlation: float = 0.0
+    variance: float = 1.0  #: Of the nights over what their covariances say, before the series' own nights are looked at
+    freedom: float = math.inf  #: The degrees of freedom with which that is known; infinite for exactly
+    correlation: float = 0.0  #: Of the errors of successive nights
 
 
 #: Nights between which a change is sought; earlier ones are one estimate together.
@@ -38,32 +28,15 @@ MOST_NIGHTS = 60
 
 @dataclass(frozen=True, eq=False)
 class Nights:
-    """Successive estimates of the same numbers, in units in which all are of similar size.
+    """Successive estimates of the same numbers, in units in which all are of similar size."""
 
-    Attributes
-    ----------
-    days : (n,) array
-        When, days.
-    x : (n, m) array
-        Zero in rows that a night does not determine.
-    information : (n, m, m) array
-        Zero in these rows and columns.
-    root : (n, m, m) array
-        R with R' R the information.
-    groups : dict of str to slice
-        The rows of each frame.
-    earlier : int
-        Nights that are in the first one together.
-    squares, dimensions : float, int
-        The residual squares of these, and their number.
-    """
-
-    days: Array
-    x: Array
-    information: Array
-    root: Array
-    groups: Mapping[str, slice]
-    earlier: int = 0
+    days: Array  #: (n,): when, days
+    x: Array  #: (n, m): zero in rows that a night does not determine
+    information: Array  #: (n, m, m): zero in these rows and columns
+    root: Array  #: (n, m, m): R with R' R the information
+    groups: Mapping[str, slice]  #: The rows of each frame
+    earlier: int = 0  #: Nights that are in the first one together
+    #: The residual squares of these, and their number
     squares: float = 0.0
     dimensions: int = 0
 
@@ -158,22 +131,11 @@ OVERLAP = 1.5
 
 @dataclass
 class SpreadPool:
-    """The differences of successive nights of all robots so far.
+    """The differences of successive nights of all robots so far."""
 
-    Attributes
-    ----------
-    robots : list of int
-        The robot of each difference, as its number.
-    lags : list of int
-        1 for successive nights, 2 for every second.
-    squares : list of float
-        By the sum of both covariances.
-    dimensions : list of int
-    """
-
-    robots: list[int] = field(default_factory=list)
-    lags: list[int] = field(default_factory=list)
-    squares: list[float] = field(default_factory=list)
+    robots: list[int] = field(default_factory=list)  #: The robot of each difference, as its number
+    lags: list[int] = field(default_factory=list)  #: 1 for successive nights, 2 for every second
+    squares: list[float] = field(default_factory=list)  #: By the sum of both covariances
     dimensions: list[int] = field(default_factory=list)
 
     def add(self, robot: int, lag: int, difference: Array, covariance: Array) -> None:
@@ -210,22 +172,13 @@ class SpreadPool:
 
 @dataclass(frozen=True, eq=False)
 class FoundSpread:
-    """What the differences say.
+    """What the differences say."""
 
-    Attributes
-    ----------
-    sums, sizes : (robots,) arrays
-        Squares over the stated variance, of each robot, and their number.
-    correlation : float
-        Of the errors of successive nights.
-    differing : float
-        How much robots' variances differ: the variance of their logarithm.
-    """
-
+    #: (robots,): squares over the stated variance, of each robot, and their number
     sums: Array
     sizes: Array
-    correlation: float
-    differing: float
+    correlation: float  #: Of the errors of successive nights
+    differing: float  #: How much robots' variances differ: the variance of their logarithm
 
     @property
     def variance(self) -> float:

@@ -33,23 +33,12 @@ class RemovalReason(StrEnum):
 
 @dataclass(frozen=True)
 class Removed:
-    """One measurement that a step removed.
+    """One measurement that a step removed."""
 
-    Attributes
-    ----------
-    reason : RemovalReason
-        Why the step removed it.
-    index : int
-        Row of the measurement in the step's input.
-    stamp_ns : int
-        Stamp of the measurement, nanoseconds.
-    value, limit : float
-        The value that was compared, and its limit, in the unit that `reason` names.
-    """
-
-    reason: RemovalReason
-    index: int
-    stamp_ns: int
+    reason: RemovalReason  #: Why the step removed it
+    index: int  #: Row of the measurement in the step's input
+    stamp_ns: int  #: Stamp of the measurement, nanoseconds
+    #: The value that was compared, and its limit, in the unit that `reason` names
     value: float
     limit: float
 

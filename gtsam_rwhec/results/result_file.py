@@ -57,24 +57,12 @@ LIMITS = ("basis", "region")
 
 @dataclass(frozen=True)
 class Result:
-    """The content of a result file.
+    """The content of a result file."""
 
-    Attributes
-    ----------
-    solution : Solution
-        The certified solution.
-    refined : RefinedPoses or None
-        The refined calibration; None if the solution was not refined.
-    log : LogFields or None
-        What became of the measurements; None if they do not come from a log.
-    calibration : CalibrationFields or None
-        What ``calibrate`` found and chose; None if it did not run.
-    """
-
-    solution: Solution
-    refined: RefinedPoses | None
-    log: LogFields | None
-    calibration: CalibrationFields | None = None
+    solution: Solution  #: The certified solution
+    refined: RefinedPoses | None  #: The refined calibration; None if the solution was not refined
+    log: LogFields | None  #: What became of the measurements; None if they do not come from a log
+    calibration: CalibrationFields | None = None  #: What ``calibrate`` found and chose; None if it did not run
 
     @property
     def judgement(self) -> Judgement:

@@ -183,36 +183,18 @@ class JointFields(JointCovariance):
 
 @dataclass(frozen=True)
 class FrameFields:
-    """How well a refined frame is known. This is for people; only the joint covariance is read back.
+    """How well a refined frame is known. This is for people; only the joint covariance is read back."""
 
-    Attributes
-    ----------
-    standard_deviations_deg : 3 float
-        Of rotations about the frame's own x, y and z axes, degrees; null: infinite, because a direction is free.
-    standard_deviations_mm : 3 float
-        Of translations along the same axes, millimetres; null as above.
-    covariance : 6 x 6
-        Of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign.
-    """
-
+    #: Of rotations about the frame's own x, y and z axes, degrees; null: infinite, because a direction is free
     standard_deviations_deg: Triple
-    standard_deviations_mm: Triple
+    standard_deviations_mm: Triple  #: Of translations along the same axes, millimetres; null as above
+    #: Of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign
     covariance: list[list[float | None]]
 
 
 @dataclass(frozen=True)
 class RefinedFields(RefinedPoses):
-    """The refined calibration in a file; its poses and scale stand at the top of the file.
-
-    Attributes
-    ----------
-    residual : str
-        "geodesic" or "chordal".
-    robust : str
-        The robust loss; "gnc" if outliers were left out; or "none".
-    frames : dict of str to FrameFields
-        How well each target and sensor is known.
-    """
+    """The refined calibration in a file; its poses and scale stand at the top of the file."""
 
     X: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="targets")]
     Y: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="sensors")]
@@ -220,9 +202,9 @@ class RefinedFields(RefinedPoses):
     noise: dict[PairKey, PairNoise]
     inlier_counts: dict[PairKey, tuple[int, int]]
     joint: Annotated[JointCovariance, _told_as(JointFields)]
-    residual: str
-    robust: str
-    frames: dict[str, FrameFields]
+    residual: str  #: "geodesic" or "chordal"
+    robust: str  #: The robust loss; "gnc" if outliers were left out; or "none"
+    frames: dict[str, FrameFields]  #: How well each target and sensor is known
 
 
 class ResultFile(BaseModel):
@@ -309,28 +291,15 @@ CONVENTIONS = {
 
 @dataclass(frozen=True)
 class PointFields:
-    """How far off a point is that a sensor sees; ``str()`` is a sentence.
+    """How far off a point is that a sensor sees; ``str()`` is a sentence."""
 
-    Attributes
-    ----------
-    frame, seen_from : str
-        The sensor's frame, and the frame in which the point is expressed.
-    point_m : 3 float
-        The point in ``frame``, metres.
-    level : float
-        The true point is within ``radius_mm`` of the given one with this probability.
-    radius_mm : float
-        Millimetres; infinite (null) where a free direction moves the point.
-    measurement_mm : float or None
-        The same for the noise of one new measurement alone; None where it is not known.
-    """
-
+    #: The sensor's frame, and the frame in which the point is expressed
     frame: str
     seen_from: str
-    point_m: tuple[float, float, float]
-    level: float
-    radius_mm: float
-    measurement_mm: float | None
+    point_m: tuple[float, float, float]  #: The point in ``frame``, metres
+    level: float  #: The true point is within ``radius_mm`` of the given one with this probability
+    radius_mm: float  #: Millimetres; infinite (null) where a free direction moves the point
+    measurement_mm: float | None  #: The same for the noise of one new measurement alone; None where it is not known
 
     def __str__(self) -> str:
         distance_m = math.hypot(*self.point_m)
@@ -345,38 +314,20 @@ class PointFields:
 
 @dataclass(frozen=True)
 class CalibrationFields:
-    """What ``calibrate`` found and chose.
+    """What ``calibrate`` found and chose."""
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        What it found against the poses, besides what certificate, free directions and log say; the verdict counts it.
-    choices : tuple of Choice
-        Every choice, with its evidence.
-    points : tuple of PointFields
-        How far off a point is, where each sensor typically saw its targets.
-    noise : str
-        The noise that the answer counts with, in words.
-    outliers : str
-        How many measurements were left out, in words.
-    notes : tuple of str
-        Warnings on the way that changed no choice.
-    constant_errors : two tuples of 6 float, or empty
-        Deviations of a constant error of the carriers' poses, which the covariance holds although no residual shows
-        it: [omega (rad), v (m)] of the targets' carrier in its own axes, and of the sensors'. Another calibration with
-        the same carriers has the same error.
-    cannot_tell : tuple of str
-        What no residual shows, so that nobody checked it.
-    """
-
+    #: What it found against the poses, besides what certificate, free directions and log say; the verdict counts it
     findings: tuple[Finding, ...]
-    choices: tuple[Choice, ...]
-    points: tuple[PointFields, ...]
-    noise: str
-    outliers: str
-    notes: tuple[str, ...]
+    choices: tuple[Choice, ...]  #: Every choice, with its evidence
+    points: tuple[PointFields, ...]  #: How far off a point is, where each sensor typically saw its targets
+    noise: str  #: The noise that the answer counts with, in words
+    outliers: str  #: How many measurements were left out, in words
+    notes: tuple[str, ...]  #: Warnings on the way that changed no choice
+    #: Deviations of a constant error of the carriers' poses, which the covariance holds although no residual shows it:
+    #: [omega (rad), v (m)] of the targets' carrier in its own axes, and of the sensors'. Another calibration with the
+    #: same carriers has the same error.
     constant_errors: tuple[tuple[float, ...], ...] = ()
-    cannot_tell: tuple[str, ...] = ()
+    cannot_tell: tuple[str, ...] = ()  #: What no residual shows, so that nobody checked it
 
     @staticmethod
     def of(calibration: Calibration) -> CalibrationFields:

@@ -31,53 +31,31 @@ UNSEEN_TARGET = "the new log has no measurement of it"
 
 @dataclass(frozen=True)
 class SensorCheck:
-    """How well the old poses predict what a sensor saw in the new log.
+    """How well the old poses predict what a sensor saw in the new log."""
 
-    Attributes
-    ----------
-    held : PredictionError
-        Of the old poses: what a robot that uses them is off by, with the noise of the measurements.
-    best : PredictionError or None
-        Of the poses that fit the new log best: the noise of the measurements. None where none near the old ones fit.
-    outliers : int
-        Measurements that agree with no others; they count in neither.
-    noise_ratio : float or None
-        `best`'s root mean square translation over that of the old log's residuals; None where that has none.
-    held_px : float or None
-        Median distance of corners from where the old poses say that they are, pixels; None without images.
-    """
-
+    #: Of the old poses: what a robot that uses them is off by, with the noise of the measurements
     held: PredictionError
+    #: Of the poses that fit the new log best: the noise of the measurements. None where none near the old ones fit.
     best: PredictionError | None
-    outliers: int
+    outliers: int  #: Measurements that agree with no others; they count in neither
+    #: `best`'s root mean square translation over that of the old log's residuals; None where that has none
     noise_ratio: float | None
+    #: Median distance of corners from where the old poses say that they are, pixels; None without images
     held_px: float | None = None
 
 
 @dataclass(frozen=True)
 class Verification:
-    """Whether an old calibration still holds; ``str()`` is the verdict.
+    """Whether an old calibration still holds; ``str()`` is the verdict."""
 
-    Attributes
-    ----------
-    test : ChangeTest or None
-        Of the old poses against those that fit the new log best, by the sum of both covariances. None where the
-        predictions are so far off that no test is needed, and none is possible.
-    movements : dict of str to Movement
-        From the old pose of each frame to the one that fits the new log best.
-    sensors : dict of str to SensorCheck
-    not_checked : dict of str to str
-        Sensors and targets of the old calibration that the new log tells nothing of, with the reason.
-    targets_may_move : bool
-        Whether targets were left out of the test.
-    remarks : tuple of str
-    """
-
+    #: Of the old poses against those that fit the new log best, by the sum of both covariances. None where the
+    #: predictions are so far off that no test is needed, and none is possible.
     test: ChangeTest | None
-    movements: dict[str, Movement]
+    movements: dict[str, Movement]  #: From the old pose of each frame to the one that fits the new log best
     sensors: dict[str, SensorCheck]
+    #: Sensors and targets of the old calibration that the new log tells nothing of, with the reason
     not_checked: dict[str, str]
-    targets_may_move: bool
+    targets_may_move: bool  #: Whether targets were left out of the test
     remarks: tuple[str, ...]
 
     @property

@@ -17,20 +17,11 @@ from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, RESULT_FILE, read_cameras,
 
 @dataclass(frozen=True, eq=False)
 class OldCalibration:
-    """An old calibration of a log, as its output folder holds it.
-
-    Attributes
-    ----------
-    result : Result
-    rig : Rig or None
-        The rig file in its solved log.
-    cameras : dict of sensor to Camera
-        Intrinsics as it has them: estimated where they were.
-    """
+    """An old calibration of a log, as its output folder holds it."""
 
     result: Result
-    rig: Rig | None
-    cameras: dict[str, Camera]
+    rig: Rig | None  #: The rig file in its solved log
+    cameras: dict[str, Camera]  #: Intrinsics as it has them: estimated where they were
 
     @staticmethod
     def read(path: str | Path) -> OldCalibration:

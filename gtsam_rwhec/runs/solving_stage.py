@@ -67,50 +67,26 @@ SIZES: dict[str, SizesChoice] = {"known": "check", "check": "correct", "estimate
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """A calibration from a log, as a solved log holds it.
+    """A calibration from a log, as a solved log holds it."""
 
-    Attributes
-    ----------
-    refined : RefinedPoses
-        Poses, covariances, scales; ``time_offsets_s`` has the whole offsets, not changes of a first estimate.
-    solution : Solution
-        The certified solution, with its certificate.
-    pairs : dict of (target, sensor) to MeasuredPairs
-        Every measurement, with A at the final time offsets, and the reason if it is not used.
-    log : LogFields
-        The reports of all stages.
-    cameras : dict of sensor to Camera
-        Intrinsics.
-    rig : Rig
-        The rig file that was used.
-    judgement : Judgement
-        The verdict, with its grounds.
-    """
-
+    #: Poses, covariances, scales; ``time_offsets_s`` has the whole offsets, not changes of a first estimate
     refined: RefinedPoses
-    solution: Solution
-    pairs: Pairs
-    log: LogFields
-    cameras: dict[str, Camera]
-    rig: Rig
-    judgement: Judgement
+    solution: Solution  #: The certified solution, with its certificate
+    pairs: Pairs  #: Every measurement, with A at the final time offsets, and the reason if it is not used
+    log: LogFields  #: The reports of all stages
+    cameras: dict[str, Camera]  #: Intrinsics
+    rig: Rig  #: The rig file that was used
+    judgement: Judgement  #: The verdict, with its grounds
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated(Solved):
-    """A calibration that was just computed: `refined` is a `Refined`, with all that refinement found.
-
-    Attributes
-    ----------
-    calibration : Calibration
-        What ``calibrate`` found and chose; its refined poses, time offsets and outliers are those of the whole log.
-    problem : Problem
-        The measurements of the certified solution, with their weights.
-    """
+    """A calibration that was just computed: `refined` is a `Refined`, with all that refinement found."""
 
     refined: Refined
+    #: What ``calibrate`` found and chose; its refined poses, time offsets and outliers are those of the whole log
     calibration: Calibration
-    problem: Problem
+    problem: Problem  #: The measurements of the certified solution, with their weights
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,30 +56,22 @@ class SolvedPart:
 
 @dataclass(frozen=True)
 class Solution:
-    """A calibration; ``str()`` is a few lines: what is proven, the counts, and the scale.
+    """A calibration; ``str()`` is a few lines: what is proven, the counts, and the scale."""
 
-    Attributes
-    ----------
-    X, Y : dict of str to gtsam.Pose3
-        T_targetcarrier_target of each target and T_sensorcarrier_sensor of each sensor, metres.
-    scale : float or dict of str to float
-        t_B = scale * true length. It is 1 when known and one number when shared. Else it is one number for each target
-        (and for each sensor with motions of its own).
-    cost : float
-        J; half a chi-square when the weights are true. ``is_relative``: all weights are 1, and it has no such meaning.
-    parts : tuple of SolvedPart
-        The unconnected parts, which were solved separately; one part when all frames are connected.
-    """
-
+    #: T_targetcarrier_target of each target and T_sensorcarrier_sensor of each sensor, metres
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
+    #: t_B = scale * true length. It is 1 when known and one number when shared. Else it is one number for each target
+    #: (and for each sensor with motions of its own).
     scale: float | dict[str, float]
     scale_mode: ScaleMode
+    #: J; half a chi-square when the weights are true. ``is_relative``: all weights are 1, and it has no such meaning.
     cost: float
     is_relative: bool
     certificate: Certificate
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
+    #: The unconnected parts, which were solved separately; one part when all frames are connected
     parts: tuple[SolvedPart, ...]
 
     @property

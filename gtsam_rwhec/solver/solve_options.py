@@ -22,39 +22,23 @@ Method = Literal["auto", "sdp", "local"]
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """How to solve; the defaults suit all ordinary problems.
+    """How to solve; the defaults suit all ordinary problems."""
 
-    Attributes
-    ----------
-    relative_tolerance : float
-        A gap of at most this times max(cost, 1) counts as zero: the cost is half a chi-square, so 1 is little. With
-        unit weights, at most this times the cost.
-    max_descent_iterations : int
-        Riemannian Newton steps from one start; three to ten are usual.
-    random_starts : int
-        Number of random starts that are tried before the relaxation, when the first answer is not proven; in a part
-        with more than ``max_dense_frames`` frames, after the relaxation of a few of them.
-    seed : int
-        Seed of the random starts. The same problem gives the same answer.
-    max_dense_frames : int
-        So many frames at once have the multipliers of all constraints (small dual, semidefinite relaxation), which are
-        dense. In a part with more free frames these are the frames where the multipliers of R'R = I do not suffice,
-        and those that help them most; all others are eliminated.
-    relaxation_tolerance : float
-        Relative gap at which the semidefinite solver stops; a descent follows anyway.
-    max_relaxation_iterations : int
-        Interior-point iterations.
-    nonnegative_scale : bool
-        Constrain the shared scale to at least zero (Section 4.3), for very noisy data; a relaxation solves it.
-    """
-
+    #: A gap of at most this times max(cost, 1) counts as zero: the cost is half a chi-square, so 1 is little. With unit
+    #: weights, at most this times the cost.
     relative_tolerance: float = 1e-6
-    max_descent_iterations: int = 200
+    max_descent_iterations: int = 200  #: Riemannian Newton steps from one start; three to ten are usual
+    #: Number of random starts that are tried before the relaxation, when the first answer is not proven; in a part with
+    #: more than ``max_dense_frames`` frames, after the relaxation of a few of them
     random_starts: int = 8
-    seed: int = 0
+    seed: int = 0  #: Seed of the random starts. The same problem gives the same answer.
+    #: So many frames at once have the multipliers of all constraints (small dual, semidefinite relaxation), which are
+    #: dense. In a part with more free frames these are the frames where the multipliers of R'R = I do not suffice, and
+    #: those that help them most; all others are eliminated.
     max_dense_frames: int = 120
-    relaxation_tolerance: float = 1e-9
-    max_relaxation_iterations: int = 100
+    relaxation_tolerance: float = 1e-9  #: Relative gap at which the semidefinite solver stops; a descent follows anyway
+    max_relaxation_iterations: int = 100  #: Interior-point iterations
+    #: Constrain the shared scale to at least zero (Section 4.3), for very noisy data; a relaxation solves it.
     nonnegative_scale: bool = False
 
     def __post_init__(self) -> None:
