@@ -212,7 +212,7 @@ def _as_if_fitted(
     information, gradient = np.zeros((size, size)), np.zeros(size)
     for pair, variance in zip(pairs, variances, strict=True):
         kept = keep[pair.rows]
-        J = (pair.J[kept] / np.sqrt(variance)[:, None]).reshape(-1, len(pair.unknowns))
+        J = np.concatenate(pair.J[kept] / np.sqrt(variance)[:, None]) if kept.any() else pair.J[:0, 0]
         information[np.ix_(pair.unknowns, pair.unknowns)] += J.T @ J
         gradient[pair.unknowns] += J.T @ (pair.e[kept] / np.sqrt(variance)).ravel()
     C = _inverse(information)

@@ -97,6 +97,8 @@ def spectral_start(part: Part, rotation: BlockMatrix) -> list[Array]:
     and the cost decides.
     """
     n, of_h = len(rotation.frames), rotation.tails[:, :, 1:]
+    if n == 0:  # every rotation is known
+        return [np.zeros((0, 3, 3))]
     is_anchored = bool(of_h.any())
     tail = rotation.tail[1:, 1:] if is_anchored else np.ones((1, 1))
     matrix = BlockMatrix(rotation.order, rotation.frames, rotation.couplings, of_h, tail)
@@ -125,7 +127,7 @@ def unconstrained_start(form: SearchForm) -> list[Array]:
 
     Q' has the translation residuals too, so these starts can be better where rotations alone are poorly excited.
     """
-    solved = form.solver(1e-12 * form.magnitude)
+    solved = form.solver(1e-12 * form.magnitude) if form.rotations else None
     if solved is None:
         return []
     linear = form.apply(np.append(np.zeros(form.size - 1), 1.0))[:-1]

@@ -144,6 +144,8 @@ def generalised_inverse_factor(M: Array) -> tuple[Array, Array]:
     """
     diagonal = np.diagonal(M)
     used = np.flatnonzero(diagonal > ABSENT * diagonal.max(initial=0.0))
+    if not len(used):
+        return np.zeros((len(M), 0)), np.zeros((len(M), 0))
     unit = 1.0 / np.sqrt(diagonal[used])
     scaled = M[used[:, None], used] * unit[:, None] * unit
     np.fill_diagonal(scaled, 1.0)
