@@ -92,8 +92,8 @@ class Model:
 
     def seen(self, stack: Stack, point: Point) -> Seen:
         """A stack's corners on their way to the camera."""
-        X, Y, A, _, *board = self._arguments(stack, point)
-        return seen(stack, X, Y, A, *board)
+        X, Y, A, _, shape, offset_s, corners = self._arguments(stack, point)
+        return seen(stack, X, Y, A, shape, offset_s, corners)
 
     def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float, Array | None]:
         camera = point.cameras[self.camera_of[stack.sensor]]
