@@ -26,7 +26,7 @@ GIVEN = {
 }
 #: Pages whose blocks are no sessions, and why.
 NOT_RUN = {
-    "docs/changes.md": "it compares folders of two calibrations; tests/changes has its calls",
+    "docs/changes.md": "it compares folders of two calibrations; tests/results has its calls",
     "docs/corners.md": "the corners are the reader's; examples/from_corners.py goes this way, and is tested",
     "docs/from_a_log.md": "it takes a minute of detection; tests/runs goes the same way",
     "docs/refinement.md": "the corners are the reader's; examples/from_corners.py goes this way, and is tested",
