@@ -519,9 +519,12 @@ def _why_not(run: Run, base: Refined) -> str:
         return "no measurement has corners and a camera's intrinsics"
     if any(pair.is_motion for pair in problem.pairs):
         return "the poses of targets are solved together with the motions of odometries"
-    lacking = [str(pair) for pair, has in _with_corners(problem).items() if not has.any()]
-    if lacking:
-        return f"the measurements of {', '.join(lacking[:5])} have no corners"
+    # A driver may leave out the corners of a few detections of a log; nothing else that was stated is passed over.
+    few = {pair: has for pair, has in _with_corners(problem).items() if not has.all()}
+    if lacking := [
+        f"{pair} ({(~has).sum()} of {len(has)})" for pair, has in few.items() if run.recording is None or not has.any()
+    ]:
+        return f"measurements without corners: {', '.join(lacking[:5])}"
     try:
         check_corners_can_hold(problem)
     except OptionError as error:

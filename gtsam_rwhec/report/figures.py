@@ -143,6 +143,7 @@ def shortened(text: str, most: int = LONGEST_NAME) -> str:
 
 def plain_decades(axis: Axis, low: float, high: float) -> None:
     """Label a logarithmic axis with plain numbers; for a ratio below 30 also between the powers of ten."""
+    low = max(low, 1e-6 * high)  # an error may be zero
     few = high < 30.0 * low
     powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
     for steps, minor in (((1.0, 2.0, 5.0) if few else (1.0,), False), (() if few else (2.0, 5.0), True)):
@@ -160,6 +161,8 @@ def image_axes(axes: Axes, size: tuple[float, float]) -> None:
 
 
 def round_down(number: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above a positive number."""
+    """The largest 1, 2 or 5 times a power of ten that is not above a positive number; 1 for zero (there are no errors)."""
+    if number <= 0.0:
+        return 1.0
     power = 10.0 ** np.floor(np.log10(number))
     return float(max(step * power for step in (0.5, 1.0, 2.0, 5.0) if step * power <= number * (1.0 + 1e-12)))

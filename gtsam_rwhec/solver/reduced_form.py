@@ -19,7 +19,7 @@ from gtsam_rwhec.solver.rotations import tangent_curvature
 
 #: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding error. The pseudo-inverse of eq. 48
 #: leaves its direction out.
-RANK_TOLERANCE = 1e-12
+RANK_TOLERANCE = 1e-14
 #: A variable with a smaller diagonal, relative to the largest, is absent. This is the square of the rounding of a zero,
 #: and it is far below any ratio of weights.
 ABSENT = 1e-26

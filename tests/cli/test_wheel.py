@@ -63,7 +63,7 @@ def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> N
     assert sorted(path.name for path in shipped.iterdir()) == ["rig.yaml", "robot_cell.mcap", "truth.json"]
     for path in shipped.iterdir():
         assert path.read_bytes() == (CELL / path.name).read_bytes()
-    assert (unpacked_wheel / "gtsam_rwhec" / "datasets" / "utias_files.txt").is_file()
+    assert (unpacked_wheel / "gtsam_rwhec" / "utias_files.txt").is_file()
     assert (unpacked_wheel / "gtsam_rwhec" / "py.typed").is_file()
     assert not list(unpacked_wheel.rglob("*.csv"))
 

@@ -34,10 +34,11 @@ def other_opencv(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("share", ["a few", pytest.param("all", marks=pytest.mark.engine)])
 def test_the_other_opencv(share: str, other_opencv: Path) -> None:
-    tests = sorted(path for path in Path(__file__).parent.glob("test_*.py") if path.name != Path(__file__).name)
+    folders = (REPOSITORY / "tests" / "detect", REPOSITORY / "tests" / "cameras")
+    tests = sorted(path for folder in folders for path in folder.glob("test_*.py") if path != Path(__file__))
     assert len(tests) >= 8
     if share == "a few":
-        tests = [path for path in tests if path.stem in ("test_codes", "test_intrinsics_files", "test_targets")]
+        tests = [path for path in tests if path.stem in ("test_tags", "test_intrinsics_files", "test_targets")]
         assert len(tests) == 3
     if OTHER == 4:
         tests += [REPOSITORY / "tests" / "methods" / "test_beside_opencv4.py"]

@@ -91,8 +91,8 @@ def test_a_problem_of_poses_has_no_other_ones() -> None:
     given, _, calibration = made()
     assert calibration.refined is not None
     answer = Answer(calibration.solution, {}, calibration.refined, calibration.noise)
-    assert with_better_poses(Run(given.observations.poses(), rw.CalibrateOptions(), print), answer) is None
-    better = with_better_poses(Run(problem_of(given.observations), rw.CalibrateOptions(), lambda _: None), answer)
+    assert with_better_poses(Run(given.observations.poses(), rw.CalibrateOptions(), print), answer)[0] is None
+    better, _ = with_better_poses(Run(problem_of(given.observations), rw.CalibrateOptions(), lambda _: None), answer)
     assert better is not None
     assert abs(better.cameras["cam_0"].K[0, 2] - given.cameras["cam_0"].K[0, 2]) < 4.0
-    assert with_better_poses(better, answer) is None
+    assert with_better_poses(better, answer)[0] is None
