@@ -161,7 +161,7 @@ def image_axes(axes: Axes, size: tuple[float, float]) -> None:
 
 
 def round_down(number: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above a positive number; 1 for zero (there are no errors)."""
+    """The largest 1, 2 or 5 times a power of ten that is not above a positive number; 1 for zero."""
     if number <= 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(number))
