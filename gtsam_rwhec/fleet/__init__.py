@@ -1,4 +1,4 @@
-"""Many robots, many logs: one small partial result a log, merged and solved robot by robot, on one machine or many."""
+"""Calibrate many robots: each log gives a small partial result; then each robot is solved. One machine or many."""
 
 from gtsam_rwhec.files.optional_packages import lazy_names
 

@@ -1,8 +1,8 @@
 """A cluster of Dask on this machine: a scheduler, and workers of one thread and bounded memory.
 
-Their processes are commands (``python -m gtsam_rwhec.fleet.dask_cluster``) and not made by multiprocessing: the script
-that calls the library is not imported again, so it needs no ``if __name__ == "__main__"``. They read from the standard
-input, and end when it ends: no process outlives a caller that was killed.
+The processes are started by ``python -m gtsam_rwhec.fleet.dask_cluster`` and not by multiprocessing. So the user's
+script is not imported again, and needs no ``if __name__ == "__main__"``. Each process reads its standard input and
+ends when the input ends, so no process outlives a caller that was killed.
 """
 
 from __future__ import annotations
@@ -23,39 +23,39 @@ from typing import Any
 
 from gtsam_rwhec.errors import FleetError
 
-#: Seconds. A scheduler is ready after one, on a busy machine after ten.
+#: Seconds to wait for the scheduler. It needs one second, on a busy machine ten.
 START_S = 60.0
-#: Seconds that processes have to end by themselves.
+#: Seconds in which processes must end by themselves.
 END_S = 3.0
-#: The processes' environment: one thread of linear algebra in each, and nothing that costs without use.
+#: Environment variables of the processes: one thread of linear algebra in each.
 _ENVIRONMENT = {
     **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"),
-    # A task is on one worker only, so one that kills its worker is the only one to blame.
+    # A worker holds one task at a time: when a worker dies, its task is the cause.
     "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
     "DASK_DISTRIBUTED__SCHEDULER__WORK_STEALING": "False",
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
-    # A worker that died is not waited for, as on one machine nothing is slow to answer.
+    # Do not wait for a dead worker to come back: on one machine answers are never slow.
     "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s",
-    # Results are small: what takes memory is the task, and to pause or to spill would not help.
+    # Results are small and the task itself takes the memory: pausing or spilling would not help.
     "DASK_DISTRIBUTED__WORKER__MEMORY__TARGET": "False",
     "DASK_DISTRIBUTED__WORKER__MEMORY__SPILL": "False",
     "DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE": "False",
     "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "1.0",
 }
-#: How the file of the processes' words is opened: its end is where all of them write.
+#: How the processes' log file is opened: all of them append to it.
 _APPENDING = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 
 
 class DaskCluster:
-    """A scheduler and workers in processes of their own. Their words are in a file that messages quote.
+    """A scheduler and workers, each in its own process. They write to a log file, which error messages quote.
 
-    Each worker has `memory_bytes`; one that has more is ended and started anew. A task whose worker died
+    A worker that takes more than `memory_bytes` is stopped and restarted. A task whose worker died
     `allowed_failures` times is tried once more.
 
     Raises
     ------
     FleetError
-        The processes do not start; the message has their last words.
+        The processes do not start; the message has the end of their output.
     """
 
     def __init__(self, workers: int, memory_bytes: int, allowed_failures: int, dashboard: bool) -> None:
@@ -72,7 +72,7 @@ class DaskCluster:
             told = json.loads(self._first_line())
             self.address, self.dashboard = str(told["address"]), str(told["dashboard"])
             assert self.workers.stdin is not None
-            with suppress(BrokenPipeError):  # they ended: whoever waits for them says so
+            with suppress(BrokenPipeError):  # the process has ended: the caller that waits for it reports this
                 self.workers.stdin.write(f"{self.address}\n".encode())
                 self.workers.stdin.flush()
         except BaseException:
@@ -80,14 +80,14 @@ class DaskCluster:
             raise
 
     def gone(self) -> str:
-        """Which process has ended, and its last words; empty while all run."""
+        """Which process has ended, and the end of its output; empty while all run."""
         for process, name in ((self.scheduler, "scheduler"), (self.workers, "process of the workers")):
             if process.poll() is not None:
                 return f"the {name} ended (status {process.returncode}). {self.last_words()}"
         return ""
 
     def last_words(self) -> str:
-        """The end of what the processes said."""
+        """The end of the processes' output."""
         said = (self.folder / "said").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return f"It said: {' | '.join(said[-3:])}" if said else "It said nothing."
 
@@ -110,7 +110,7 @@ class DaskCluster:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _started(self, *arguments: str) -> subprocess.Popen[bytes]:
-        # What this process can import the others can: functions of tasks are found by name.
+        # The other processes can import what this one can: they find the tasks' functions by name.
         paths = [os.getcwd() if path == "" else path for path in sys.path]
         environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(paths)}
         process = subprocess.Popen(
@@ -122,7 +122,7 @@ class DaskCluster:
         return process
 
     def _first_line(self) -> bytes:
-        """What the scheduler says when it is ready."""
+        """The first line of the scheduler's output: it is ready."""
         assert self.scheduler.stdout is not None
         ready, _, _ = select.select([self.scheduler.stdout], [], [], START_S)
         line = self.scheduler.stdout.readline() if ready else b""
@@ -142,7 +142,7 @@ async def _scheduler(options: dict[str, Any]) -> None:
 
 
 async def _workers(address: str, count: int, options: dict[str, Any]) -> None:
-    """Workers, each with a nanny that starts it anew when it dies or takes more memory than it may."""
+    """Workers, each with a nanny that restarts it when it dies or exceeds its memory."""
     from distributed import Nanny
 
     nannies = [await Nanny(address, name=f"worker-{number}", **options) for number in range(count)]
@@ -150,23 +150,23 @@ async def _workers(address: str, count: int, options: dict[str, Any]) -> None:
 
 
 def _end_with_the_caller() -> None:
-    """Read until the caller closes the other end, or ends."""
+    """Read the standard input until the caller closes it or ends; then end this process."""
     while os.read(0, 1024):
         pass
     os._exit(1)
 
 
 def main() -> None:
-    """Run what the arguments say: ``scheduler OPTIONS``, or ``workers COUNT OPTIONS`` with the address on a line."""
+    """Run ``scheduler OPTIONS``, or ``workers COUNT OPTIONS``, which reads the scheduler's address from a line."""
     what, *words = sys.argv[1:]
     if what == "scheduler":
         running = _scheduler(json.loads(words[0]))
     else:
-        import distributed  # noqa: F401  # while the scheduler starts, which tells the address when it has
+        import distributed  # noqa: F401  # imported while the scheduler starts
 
         address = ""
         while not address.endswith("\n"):
-            letter = os.read(0, 1).decode()  # not more: the rest is read by the thread
+            letter = os.read(0, 1).decode()  # one byte only: the thread reads the rest
             if not letter:
                 return
             address += letter

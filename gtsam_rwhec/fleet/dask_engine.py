@@ -1,8 +1,7 @@
-"""The engine on Dask: processes of this machine, or any scheduler by address.
+"""The engine that runs tasks on Dask: on processes of this machine, or on a running scheduler by its address.
 
-Dask tries again what breaks off (``retries``) and what kills its worker (``allowed-failures``), and bounds the workers'
-memory. The scheduler has at most a few tasks for each thread at a time, so a run of 100,000 tasks costs it no more
-memory than one of 100.
+Dask repeats tasks that fail (``retries``) or kill their worker (``allowed-failures``), and limits the workers' memory.
+The scheduler holds only a few tasks for each thread at a time, so 100,000 tasks take no more of its memory than 100.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ from gtsam_rwhec.fleet.store_requests import without_secrets
 from gtsam_rwhec.fleet.tasks import ATTEMPTS, Failed, Receipt, Task, carried_out, failed
 
 _CLIENT_LOG = logging.getLogger("distributed.client")
-#: The scheduler has so many tasks for each thread at a time, and at least this many.
+#: Tasks at the scheduler at a time: for each thread, and at least.
 TASKS_OF_A_THREAD, FEWEST_TASKS = 4, 16
-#: Seconds between two looks at how many threads there are, and whether the processes live.
+#: Seconds between two checks of the number of threads and of the processes.
 LOOK_S = 2.0
-#: Seconds that a scheduler has to answer; the same on this machine.
+#: Seconds in which a scheduler must answer; and one on this machine.
 CONNECT_S, LOCAL_S = 15.0, 3.0
-#: Bytes of memory that a worker may have, if not said: a log of 1 GB in detection takes less than half of it.
+#: Default memory of a worker, bytes: detection in a log of 1 GB takes less than half of it.
 MEMORY_BYTES = 2 << 30
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) *([kMGT]?)(i?)B?", re.IGNORECASE)
 
 
 def bytes_of(size: str) -> int:
-    """The bytes of a size in words: "2GB", "500 MB", "1.5GiB"; an OptionError for anything else."""
+    """The bytes of a size such as "2GB", "500 MB" or "1.5GiB"; an OptionError for any other text."""
     found = _SIZE.fullmatch(size.strip())
     if found is None or float(found[1]) == 0.0:
         raise OptionError(f"{size!r} is no size of memory; give a number with MB or GB, such as 2GB")
@@ -47,22 +46,22 @@ def bytes_of(size: str) -> int:
 
 
 class DaskEngine:
-    """Carries out tasks on Dask's workers, which start with the first task. A context manager stops what it started.
+    """Runs tasks on Dask's workers, which start with the first task. As a context manager it stops what it started.
 
     Parameters
     ----------
     workers
         How many processes of this machine, each with one thread and one thread of BLAS.
     memory_bytes
-        Memory of each worker. A task that needs more is a Failed.
+        Memory of each worker. A task that needs more ends as a Failed.
     scheduler
-        The address of a scheduler that runs already (``"tcp://10.0.0.1:8786"``). Its workers need this library of this
-        version, have the memory that whoever started them said, and count how often a task kills them by the
-        scheduler's own ``allowed-failures``; `workers` is not used.
+        The address of a running scheduler (``"tcp://10.0.0.1:8786"``). Its workers must have the same version of this
+        library. Their memory, and how many workers a task may kill (``allowed-failures``), were set when they were
+        started; `workers` is not used.
     dashboard
-        Whether a scheduler of this machine has Dask's page.
+        Whether a scheduler of this machine shows Dask's web page.
     progress
-        Is told that workers start, and where Dask's page is.
+        Called when workers start, and with the address of Dask's page.
 
     Raises
     ------
@@ -89,7 +88,7 @@ class DaskEngine:
         self._is_gone, self._numbers, self._level = False, count(), _CLIENT_LOG.level
 
     def start(self) -> None:
-        """Start the processes, or look for the scheduler, if that is still to be done.
+        """Start the processes, or connect to the scheduler, unless this is already done.
 
         Raises
         ------
@@ -108,7 +107,7 @@ class DaskEngine:
         if not self.address:
             self.cluster = DaskCluster(self.workers, self.memory_bytes, ATTEMPTS - 1, self.dashboard)
             self.address = self.cluster.address
-        # What it says of a scheduler that is gone, with tracebacks, an error of this engine says in words.
+        # Dask logs a lost scheduler with tracebacks; this engine raises an error with a clear message instead.
         _CLIENT_LOG.setLevel(logging.CRITICAL)
         try:
             self._client = self._connected()
@@ -120,13 +119,13 @@ class DaskEngine:
             self.tell(Remark(f"Dask's dashboard: {page}"))
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Receipt | Failed]:
-        """Yield one receipt or failure for each task, as they end.
+        """Yield one receipt or failure for each task, in the order in which they end.
 
         Raises
         ------
         FleetError
-            The scheduler is gone, or all workers are; or it cannot start. What is done is on disk: the same run goes on
-            from there.
+            The scheduler cannot start, or the scheduler or all workers are lost. Finished tasks stay: the same run
+            continues from there.
         """
         self.start()
         tasks = list(tasks)
@@ -160,7 +159,7 @@ class DaskEngine:
                     self._client.cancel([future for _, future in running.values()], force=True)
 
     def close(self) -> None:
-        """Stop what was started; a scheduler by address goes on."""
+        """Stop the processes that this engine started; a scheduler given by its address keeps running."""
         if self._client is not None:
             with suppress(OSError, asyncio.CancelledError):
                 self._client.close(timeout=2)
@@ -196,16 +195,16 @@ class DaskEngine:
     def _submitted(self, batch: list[Task]) -> list[Any]:
         graph = {}
         for task in batch:
-            # Dask groups tasks, and learns how long they take, by the words before the hyphen.
-            # Of tasks that are sent together, those whose keys come first are done first.
+            # Dask groups tasks by the part of the key before the hyphen, and learns how long each group takes.
+            # Of tasks that are sent together, Dask runs those with the first keys first.
             key = f"{task.function.__name__}-{next(self._numbers):08x}{uuid.uuid4().hex[8:]}"
-            # Tasks that read data wait at the scheduler, not at a worker: so a task that kills its worker is alone
-            # there, and no other is blamed.
+            # Tasks that read data wait at the scheduler, not at a worker. So a task that kills its worker is alone
+            # on this worker.
             graph[key] = self._spec(key, carried_out, task, _data_producer=True)
         return list(self._client.get(graph, list(graph), sync=False, retries=ATTEMPTS - 1)) if graph else []
 
     def _most_tasks(self, of_all: str) -> int:
-        """How many tasks the scheduler should have now. A FleetError if it is gone."""
+        """How many tasks the scheduler should have now. A FleetError if the scheduler is lost."""
         self._check(of_all)
         try:
             threads: int = sum(self._client.nthreads().values())
@@ -216,7 +215,7 @@ class DaskEngine:
     def _outcomes(
         self, futures: list[Any], running: dict[str, tuple[Task, Any]], of_all: str
     ) -> list[tuple[Any, Receipt | Failed]]:
-        """Each future with its outcome. A FleetError if the scheduler is gone."""
+        """Each future with its outcome. A FleetError if the scheduler is lost."""
         self._check(of_all)
         finished = [future for future in futures if future.status == "finished"]
         try:
@@ -246,7 +245,7 @@ class DaskEngine:
         return Failed(task.key, without_secrets(words))
 
     def _check(self, of_all: str) -> None:
-        """Raise a FleetError if the scheduler or all workers are gone."""
+        """Raise a FleetError if the scheduler or all workers are lost."""
         gone = self.cluster.gone() if self.cluster is not None else ""
         if gone or self._client.status != "running":
             raise self._gone(of_all, gone or f"nobody answers at {self.address}.")

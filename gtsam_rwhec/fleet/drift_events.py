@@ -1,7 +1,7 @@
-"""What the watch of a fleet says, one event a line: as records, and as JSON lines, which programs read.
+"""The events of a fleet's drift watch: as records, and as JSON lines for other programs, one event a line.
 
-The stream begins with a line ``"event": "watch"`` with the format's name and version and how it was counted, and ends
-with ``"event": "end"``. Times are UTC, as ISO 8601 text and as nanoseconds (``_ns``). docs/drift.md has every field.
+The first line, ``"event": "watch"``, has the format's name, version and settings; the last is ``"event": "end"``.
+Times are UTC, as ISO 8601 text and as nanoseconds (``_ns``). docs/drift.md describes every field.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from gtsam_rwhec.files.terminal_text import rounded, shown
 
 @dataclass(frozen=True)
 class NightEvent:
-    """What a robot's chart says at one night."""
+    """The state of a robot's control chart after one night."""
 
     robot: str
     when_ns: int  #: The night's first measurement
     nights: int  #: Nights in the chart since the last change
-    #: chance, limit: the statistic, and the limit below which it is an alarm. The limit is 0 at the first night:
-    #: nothing is tested
+    #: chance, limit: the statistic, and the limit below which it raises an alarm. The limit is 0 at the first night,
+    #: when nothing is tested
     chance: float
     limit: float
 
 
 @dataclass(frozen=True)
 class NoAnswerEvent:
-    """A night that says nothing of where the frames are, and why; without a time where nothing was measured."""
+    """A night that does not determine any frame, and why; without a time if nothing was measured."""
 
     robot: str
     when_ns: int | None
@@ -40,7 +40,7 @@ class NoAnswerEvent:
 
 @dataclass(frozen=True)
 class FramesEvent:
-    """Frames that the night before did not have, and that only that one had."""
+    """Frames that are new in this night, and frames that only the night before had."""
 
     robot: str
     when_ns: int
@@ -50,7 +50,7 @@ class FramesEvent:
 
 @dataclass(frozen=True)
 class FreeEvent:
-    """What a night leaves free of frames that it has, where that is another than at the night before."""
+    """What a night leaves free of its frames, if this differs from the night before."""
 
     robot: str
     when_ns: int
@@ -59,7 +59,7 @@ class FreeEvent:
 
 @dataclass(frozen=True)
 class MovedFrame:
-    """How a frame moved: old pose Expmap(xi) = new pose, xi = [omega (rad), v (m)]; how many deviations that is."""
+    """How a frame moved: old pose Expmap(xi) = new pose, xi = [omega (rad), v (m)]; and its size in deviations."""
 
     name: str
     translation_mm: float
@@ -73,24 +73,24 @@ class MovedFrame:
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """A robot's frames moved; ``str()`` says it."""
+    """A robot's frames moved; ``str()`` gives the sentence."""
 
     robot: str
     when_ns: int  #: The night of the alarm
-    #: last_unchanged_ns, first_changed_ns: it was between these two nights. Of a drift: it began there
+    #: last_unchanged_ns, first_changed_ns: the frames moved, or began to drift, between these two nights
     last_unchanged_ns: int
     first_changed_ns: int
-    #: earliest_ns, latest_ns: first changed nights that are hardly less likely
+    #: earliest_ns, latest_ns: the range of first changed nights that are almost as likely
     earliest_ns: int
     latest_ns: int
-    frames: tuple[MovedFrame, ...]  #: The fewest whose movement explains everything, the surest first
+    frames: tuple[MovedFrame, ...]  #: The smallest set whose movement explains the change, the most certain first
     is_of_all: bool  #: Whether these are all frames that were tested
     kind: str
-    drift_gain: float  #: Log likelihood of a drift less that of a step
+    drift_gain: float  #: Log likelihood of a drift minus that of a step
     #: chance, limit: as in `NightEvent`
     chance: float
     limit: float
-    is_back: bool  #: Whether the frames are back where they were before the alarm before this one
+    is_back: bool  #: Whether the frames are back where they were before the previous alarm
     unit: str  #: The row's unit, which names its result
 
     def __str__(self) -> str:
@@ -103,7 +103,7 @@ class AlarmEvent:
 
     @property
     def between(self) -> str:
-        """Between which nights, in words."""
+        """The nights between which the frames moved, in words."""
         return f"between {day_text(self.last_unchanged_ns)} and {day_text(self.first_changed_ns)}"
 
 
@@ -163,7 +163,7 @@ def event_fields(event: Event) -> dict[str, Any]:
 
 
 def time_fields(name: str, when_ns: int | None) -> dict[str, Any]:
-    """A time as the lines have it: as text, and in nanoseconds."""
+    """A time as two fields: as text, and in nanoseconds."""
     return {name: None if when_ns is None else time_text(when_ns), f"{name}_ns": when_ns}
 
 

@@ -1,4 +1,4 @@
-"""The page of a fleet: how many calibrations may be used, what moved over time, the worst, what failed, costs."""
+"""The HTML page of a fleet: usable calibrations, what moved over time, the worst robots, failures, costs."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from gtsam_rwhec.report.report_blocks import Block, Chart, Link, Listing, Number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Robots that are named one by one.
+#: The most robots that are named one by one.
 MOST_WORST = 10
-#: Robots with a control chart, and names in a cell.
+#: The most control charts, and the most names in a table cell.
 MOST_CHARTS, MOST_NAMES = 24, 12
-#: The page, below a run's output.
+#: The page's path in a run's output.
 PAGE_FILE = "summary.html"
 MADE_BY = "Written by gtsam-rwhec fleet."
-#: Blue that is seen on dark as well as on light.
+#: A blue that is visible on dark and on light.
 BLUE = "#2C8CC9"
-#: Chances below are drawn here.
+#: Chances below this are drawn at this value.
 LEAST_CHANCE = 1e-16
 _WORDS = {Verdict.USE: "use", Verdict.CARE: "with care", Verdict.DO_NOT_USE: "do not use"}
 
 
 def put_page(rows: Sequence[RobotRow], output: str) -> str:
-    """Write the page into a run's output, a folder or a URL, and give its place there.
+    """Write the page into a run's output (a folder or a URL); return its path there.
 
-    Where a robot has several calibrations (``--each day``), the page says what moved between them. A StoreError where
-    the output cannot be written.
+    If a robot has several calibrations (``--each day``), the page shows what moved between them. Raises StoreError
+    if the output cannot be written.
     """
     times = Counter(row.robot for row in rows if row.begin_ns is not None)
     watched = watch(rows) if max(times.values(), default=0) > 1 else None
@@ -54,14 +54,14 @@ def put_page(rows: Sequence[RobotRow], output: str) -> str:
 
 
 def write_fleet_page(rows: Sequence[RobotRow], watched: Watched, path: str | Path, since_ns: int = 0) -> None:
-    """Write the page of several runs as one HTML file that needs no network; alarms from a time on count."""
+    """Write the page of several runs as one HTML file that needs no network; older alarms do not count."""
     write_page(fleet_page(rows, watched, since_ns), checked_path(path))
 
 
 def fleet_page(
     rows: Sequence[RobotRow], watched: Watched | None = None, since_ns: int = 0, *, has_results: bool = False
 ) -> Page:
-    """The page. With `has_results` it lies in a run's output, and leads to the results of `rows` there."""
+    """The page. With `has_results` it is in a run's output, and links to the results of `rows` there."""
     counts = Counter(row.verdict for row in rows)
     alarms = [] if watched is None else [one for one in reversed(watched.alarms) if one.when_ns >= since_ns]
     is_bad = bool(counts[None] or counts[Verdict.DO_NOT_USE])
@@ -125,7 +125,7 @@ def _failures(rows: Sequence[RobotRow]) -> tuple[Block, ...]:
 
 
 def _costs(rows: Sequence[RobotRow]) -> str:
-    """What a log costs, in a sentence."""
+    """What a log costs: one sentence."""
     counted = [row for row in rows if row.logs + len(row.failed_logs) and row.cpu_s > 0.0]
     if not counted:
         return ""
@@ -209,7 +209,7 @@ def _alarm_table(alarms: list[AlarmEvent]) -> Table:
 
 
 def _drift_charts(watched: Watched, alarms: list[AlarmEvent]) -> list[Block]:
-    """A small control chart of each robot that changed, the last one first."""
+    """A small control chart of each robot that changed, the latest change first."""
     names = list(dict.fromkeys(alarm.robot for alarm in alarms))
     charts: list[Block] = [
         Paragraph(
@@ -257,7 +257,7 @@ def _drift_chart(number: int, name: str, robot: RobotChart) -> Chart:
 
 
 def _millimetres(robot: RobotChart, frame: str, alarm: AlarmEvent) -> np.ndarray:
-    """How far a frame is from where it was before the last change, of each night; nan where a night does not say it."""
+    """For each night, the distance (mm) of a frame from its position before the last change; nan if unknown."""
     own = np.stack([x[robot.frames.groups[frame]] for x in robot.x])
     known = np.asarray(np.isfinite(own).all(axis=1))
     earlier = [each.first_changed_ns for each in robot.alarms[:-1]]

@@ -1,8 +1,8 @@
 """Rows of a fleet as Parquet: one line for each calibration, every number exact.
 
-Columns have their unit in their names, and their meaning in the fields' metadata. Poses are T row by row (16 numbers),
-the joint covariance of all frames is row by row too: 6 n numbers to a row, n the number of frames; infinite along free
-directions. Text that is no UTF-8, such as some names of files, has backslashes in the place of such bytes.
+A column's name has its unit; the field's metadata has its meaning. A pose is T row by row (16 numbers). The joint
+covariance of all n frames is also row by row: rows of 6 n numbers, infinite along free directions. In text that is
+not UTF-8, such as some file names, backslash escapes replace the invalid bytes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from gtsam_rwhec.fleet.store_requests import shown
 from gtsam_rwhec.fleet.stores import exists, read_bytes
 from gtsam_rwhec.solver.certificate import Status
 
-#: Column, type, what it is, and the row's own name of what is kept as it is. Types are names of functions of pyarrow,
-#: or made in `_schema`.
+#: Column, type, meaning, and the row's attribute if the value is kept unchanged. A type is the name of a pyarrow
+#: function, or is made in `_schema`.
 COLUMNS = (
     ("unit", "string", "what was solved together", "unit"),
     ("robot", "string", "the robot's name", "robot"),
@@ -79,7 +79,7 @@ COLUMNS = (
 
 
 def rows_parquet(rows: Iterable[RobotRow]) -> bytes:
-    """A Parquet file of rows."""
+    """The bytes of a Parquet file of rows."""
     pa, pq = _pyarrow()
     schema = _schema(pa)
     fields = [_fields(row) for row in rows]
@@ -90,14 +90,14 @@ def rows_parquet(rows: Iterable[RobotRow]) -> bytes:
 
 
 def read_parquet(content: bytes, where: str) -> tuple[RobotRow, ...]:
-    """The rows of a Parquet file, which `where` names.
+    """The rows of a Parquet file; `where` is its name in messages.
 
     Raises
     ------
     ResultVersionError
         The rows are of another version of this library.
     FileFormatError
-        It is no Parquet file of rows, or a damaged one.
+        The file is damaged, or is not a Parquet file of rows.
     """
     pa, pq = _pyarrow()
     try:
@@ -118,9 +118,9 @@ def read_parquet(content: bytes, where: str) -> tuple[RobotRow, ...]:
 
 
 def read_history(urls: Iterable[str]) -> tuple[RobotRow, ...]:
-    """The rows of several runs, in the order given: of folders that ``gtsam-rwhec fleet run`` wrote, or files of rows.
+    """The rows of several runs, in the given order: from outputs of ``gtsam-rwhec fleet run``, or from files of rows.
 
-    Errors as `read_rows`; a StoreError where there is no such file, or it is refused.
+    Raises as `read_rows` does; StoreError if a file does not exist or the store refuses it.
     """
     return tuple(row for url in urls for row in _rows_at(url))
 
@@ -201,7 +201,7 @@ def _row(fields: dict[str, Any]) -> RobotRow:
 
 
 def _text(value: Any) -> Any:
-    """The value with text that UTF-8 can write, also inside of lists."""
+    """The value with its text, also inside lists, made valid UTF-8."""
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode("utf-8")
     if isinstance(value, list | tuple):

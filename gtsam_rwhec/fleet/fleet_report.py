@@ -1,4 +1,4 @@
-"""A fleet's run on the terminal: how many robots may be used, the worst, what failed, where things are, its costs."""
+"""The report of a fleet's run on the terminal: usable robots, the worst, failures, where the files are, costs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from gtsam_rwhec.report.terminal_report import (
     report_console,
 )
 
-#: So many robots and failures are named.
+#: The most robots and failures that are named.
 MOST_NAMED = 10
-#: Characters of a reason in a list.
+#: The most characters of a reason in a list.
 LONGEST_REASON = 600
 HEADINGS = ("verdict", "logs", "n", "mm", "deg")
 LEGEND = (
@@ -70,14 +70,14 @@ def summary(rows: Sequence[RobotRow]) -> str:
 
 
 def worst_first(rows: Sequence[RobotRow]) -> list[RobotRow]:
-    """The calibrations, those that are not to be used first, then by how well positions of sensors are known."""
+    """The calibrations: first those that are not to be used, then by the uncertainty of the sensors' positions."""
     there = [row for row in rows if row.verdict is not None]
     order = list(Verdict)
     return sorted(there, key=lambda row: (-order.index(row.verdict), -row.largest_deviations("sensor")[1], row.unit))  # type: ignore[arg-type]
 
 
 def failures_of(rows: Sequence[RobotRow]) -> list[str]:
-    """Robots without a calibration, and logs that were left out, with their reasons."""
+    """Robots without a calibration and logs that were left out, with the reasons."""
     failures = [f"{_name(row)}: {_short(row.failure)}" for row in rows if row.failure is not None]
     return failures + [
         f"{_name(row)}, {log.url}: {_short(log.reason)}"
@@ -88,7 +88,7 @@ def failures_of(rows: Sequence[RobotRow]) -> list[str]:
 
 
 def remarks_of(rows: Sequence[RobotRow]) -> list[str]:
-    """What logs said of themselves where the poses may be used: a log that ends in the middle, for one."""
+    """Findings about logs whose poses may be used, for example that a log is cut off."""
     return [f"{_name(row)}: {_short(words)}" for row in rows if row.verdict is Verdict.USE for words in row.findings]
 
 
@@ -132,14 +132,14 @@ def _done(run: FleetRun) -> str:
     )
 
 
-#: Variances over the stated ones that are as good as one, and correlations as good as none.
+#: Ratios of a variance to the stated one that count as 1, and correlations that count as 0.
 AS_STATED, NO_CORRELATION = (0.8, 1.25), 0.05
-#: So many names, or reasons, are said; of more, how many.
+#: The most names or reasons that are listed; of others only the number.
 SAID = 5
 
 
 def drift_verdict(watched: Watched, since_ns: int = 0) -> str:
-    """What the watch found, in a sentence or two, with what to do."""
+    """What the watch found and what to do, in a sentence or two."""
     if not watched.robots:
         return "Nothing was watched: no robot has a night that says where its frames are."
     changed = list(dict.fromkeys(alarm.robot for alarm in watched.alarms if alarm.when_ns >= since_ns))
@@ -155,7 +155,7 @@ def drift_verdict(watched: Watched, since_ns: int = 0) -> str:
 
 
 def drift_remarks(watched: Watched) -> tuple[str, ...]:
-    """What to keep in mind."""
+    """The limits of what the watch found."""
     tests = [test for robot in watched.robots.values() for test in robot.tests]
     found = []
     if watched.robots:
@@ -189,13 +189,13 @@ def drift_remarks(watched: Watched) -> tuple[str, ...]:
 
 
 def alarm_lines(watched: Watched, since_ns: int = 0) -> tuple[str, ...]:
-    """One sentence for each alarm, the last one first."""
+    """One sentence for each alarm, the latest first."""
     alarms: list[AlarmEvent] = [alarm for alarm in reversed(watched.alarms) if alarm.when_ns >= since_ns]
     return tuple(map(str, alarms))
 
 
 def day_ns_of(text: str | None) -> int:
-    """The beginning of a day in UTC, nanoseconds; 0 for none; OptionError for what is no day."""
+    """The start of a day in UTC, nanoseconds; 0 without a day; OptionError if the text is not a day."""
     if text is None:
         return 0
     try:

@@ -1,7 +1,7 @@
-"""One row for each calibration of a fleet: what the terminal, the page, Parquet and the watch read.
+"""One row for each calibration of a fleet; the terminal report, the page, Parquet and the watch read the rows.
 
-A row holds what a result file says, short; where there is no calibration it holds the failure. Rows are kept as JSON,
-and as Parquet, which pandas, DuckDB and Arrow read; every number is read back bit for bit.
+A row is the summary of a result file or, without a calibration, the failure. Rows are stored as JSON and as Parquet
+(for pandas, DuckDB and Arrow); every number is read back bit for bit.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.certificate import Status
 
-#: What a file of rows calls itself, and the version of its fields.
+#: The format's name in a file of rows, and the version of its fields.
 FORMAT, FORMAT_VERSION = "gtsam-rwhec fleet rows", 1
-#: The names of the files of rows in an output: JSON, and the same as Parquet.
+#: The file names in an output: JSON, and the same rows as Parquet.
 ROWS_FILE, PARQUET_FILE = "fleet.json", "fleet.parquet"
-#: Infinite covariances, as JSON has them.
+#: Infinite covariances in JSON.
 _INFINITE = {"inf": math.inf, "-inf": -math.inf}
 
 
@@ -38,7 +38,7 @@ class RowFrame:
 
 @dataclass(frozen=True)
 class FailedLog:
-    """A log that gave no partial result: its URL, and why."""
+    """A log without a partial result: its URL and the reason."""
 
     url: str
     reason: str
@@ -46,9 +46,9 @@ class FailedLog:
 
 @dataclass(frozen=True, eq=False)
 class RobotRow:
-    """One calibration of one robot: of all its logs, of a day or of a log; or why there is none.
+    """One calibration of one robot, from all its logs, from one day or from one log; or why there is none.
 
-    The robots of a site are solved together, and each has a row: of its own sensors and of the targets that it saw.
+    The robots of a site are solved together. Each has its own row, with its sensors and the targets that it saw.
     """
 
     unit: str  #: What was solved together: "arm_01", "arm_01@2026-11-22", "hall_a". Its files are in ``robots/UNIT/``
@@ -60,38 +60,38 @@ class RobotRow:
     verdict: Verdict | None = None  #: None where there is no calibration
     reason: str = ""  #: The verdict's reason in words, with what to do
     grounds: tuple[Ground, ...] = ()
-    status: Status | None = None  #: Of the certificate; None also where there is no answer with a positive scale
+    status: Status | None = None  #: Of the certificate; None also if no answer has a positive scale
     frames: tuple[RowFrame, ...] = ()  #: Sensors first, then targets
     #: (6 n, 6 n): joint covariance of the tangents of `frames`, in their order: right perturbations, [omega (rad), v
     #: (m)]. Infinite along free directions. None where the calibration was not refined
     covariance: Array | None = None
-    #: Deviations of a constant error of the target carriers' and the sensor carriers' poses, which `covariance` holds:
-    #: the same in every calibration with the same carriers (`CalibrationFields`)
+    #: Deviations of a constant error of the target carriers' and of the sensor carriers' poses; `covariance` includes
+    #: it. The error is the same in every calibration with the same carriers (`CalibrationFields`)
     constant_errors: tuple[tuple[float, ...], ...] = ()
     degrees_of_freedom: float = math.inf  #: Of the estimated noise; infinite where it was given
-    #: Measured over true length, for all or by target; nan where there is none
+    #: Measured over true length, for all or by target; nan if unknown
     scale: float | Mapping[str, float] = math.nan
-    measurements_sha256: str = ""  #: Checksum of the measurements' files, the same whatever worker or order
-    logs: int = 0  #: How many logs are in the answer; `failed_logs` gave nothing
+    measurements_sha256: str = ""  #: Checksum of the measurements' files; workers and order do not change it
+    logs: int = 0  #: How many logs are in the answer, without `failed_logs`
     failed_logs: tuple[FailedLog, ...] = ()
     measurements: int = 0
     removed: Mapping[str, int] = field(default_factory=dict)  #: Measurements that cleaning left out, by reason
-    findings: tuple[str, ...] = ()  #: What speaks against the poses, and what the logs said of themselves, in words
-    #: cpu_s, bytes_read, peak_bytes: of its logs' tasks and the unit's own, also where an earlier run did them; of the
-    #: logs' stores; the largest
+    findings: tuple[str, ...] = ()  #: What speaks against the poses, and findings about the logs, in words
+    #: cpu_s, bytes_read, peak_bytes: CPU time of its logs' tasks and of the unit's, also if an earlier run did them;
+    #: bytes from the logs' stores; the largest peak memory of a task
     cpu_s: float = 0.0
     bytes_read: int = 0
     peak_bytes: int = 0
-    result: str | None = None  #: The result file's place below the output, with slashes
+    result: str | None = None  #: The result file's path in the output, with slashes
     failure: str | None = None  #: Why there is no calibration; without credentials
 
     @property
     def is_fine(self) -> bool:
-        """Whether the poses may be used, and every log of the unit was read."""
+        """Whether the poses may be used and every log of the unit was read."""
         return self.verdict in (Verdict.USE, Verdict.CARE) and not self.failed_logs
 
     def largest_deviations(self, kind: str | None = None) -> tuple[float, float]:
-        """The largest standard deviations of frames (of a kind): about an axis (rad) and along one (m); or infinite."""
+        """The frames' largest standard deviations (of one kind): about an axis (rad), along one (m); or infinite."""
         at = [i for i, frame in enumerate(self.frames) if kind in (None, frame.kind)]
         if self.covariance is None or not at:
             return math.inf, math.inf
@@ -99,7 +99,7 @@ class RobotRow:
         return float(turned), float(moved)
 
 
-#: What JSON and Parquet keep as it is.
+#: Fields that JSON and Parquet keep unchanged.
 PLAIN = (
     "unit", "robot", "site", "begin_ns", "end_ns", "reason", "measurements_sha256", "logs", "measurements", "cpu_s",
     "bytes_read", "peak_bytes", "result", "failure",
@@ -114,14 +114,14 @@ def rows_json(rows: Iterable[RobotRow]) -> bytes:
 
 
 def read_rows(content: bytes, where: str) -> tuple[RobotRow, ...]:
-    """The rows of a file, which `where` names.
+    """The rows of a file; `where` is its name in messages.
 
     Raises
     ------
     ResultVersionError
         The rows are of another version of this library.
     FileFormatError
-        It is no file of rows, or a damaged one.
+        The file is damaged, or is not a file of rows.
     """
     try:
         tree = json.loads(content.decode("utf-8", "surrogateescape"))
@@ -132,7 +132,7 @@ def read_rows(content: bytes, where: str) -> tuple[RobotRow, ...]:
 
 
 def check_format(name: object, version: object, where: str) -> None:
-    """Raise the errors of `read_rows` for what calls itself something else, or is of another version."""
+    """Raise the errors of `read_rows` if the content is of another format or version."""
     if name != FORMAT:
         raise FileFormatError(f"{where} has no rows of a fleet that gtsam-rwhec wrote: its format is {name!r}")
     if str(version) != str(FORMAT_VERSION):

@@ -1,7 +1,7 @@
-"""A run over a fleet: look for the logs, read each, solve what belongs together, and put the rows together.
+"""A run over a fleet: list the logs, read each log, solve each robot or site, and collect the rows.
 
-What an earlier run did is read from its receipts and not given to the engine; a run that finds everything done starts
-no engine. Nothing in the output is changed but result files and the table of rows, so two runs at once agree.
+Tasks that an earlier run did are read from their receipts. If all tasks are done, no engine starts. A run changes only
+result files and the table of rows in the output, so two runs at the same time do not disturb each other.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from gtsam_rwhec.fleet.stores import exists, listed, local_path, read_bytes, sta
 from gtsam_rwhec.fleet.tasks import Engine, Failed, InProcess, Receipt, Task, below, kept_receipt
 from gtsam_rwhec.fleet.unit_task import Answer, Each, UnitTask, solve_unit, write_results
 
-#: Which version wrote the output; written before the first task.
+#: This file has the version that wrote the output; it is written before the first task.
 ABOUT_FILE = "about.json"
-#: So many requests to stores at the same time.
+#: The most requests to stores at the same time.
 THREADS = 16
 _NOT_OF_NAMES = re.compile(r"[^A-Za-z0-9_.-]+")
 Asked = TypeVar("Asked")
@@ -50,13 +50,13 @@ class FleetRun:
     """What a run found and did."""
 
     output: str  #: Its URL, without credentials
-    #: Robots in the manifest's order, sites after them; of each, calibrations in order of time
+    #: Robots in the manifest's order, then sites; the calibrations of each in order of time
     rows: tuple[RobotRow, ...]
-    logs: int  #: How many logs were asked for
-    #: new_tasks, earlier_tasks: how many tasks this run did, and how many an earlier run, or another one, had done
+    logs: int  #: How many logs the manifest lists
+    #: new_tasks, earlier_tasks: how many tasks this run did, and how many other runs had done
     new_tasks: int
     earlier_tasks: int
-    #: seconds, cpu_s: on the clock; of the tasks that this run did
+    #: seconds, cpu_s: duration of the run; CPU time of the tasks that this run did
     seconds: float
     cpu_s: float
     remarks: tuple[str, ...] = ()  #: What the user should know of the output
@@ -90,21 +90,21 @@ def run(
     ----------
     manifest : Manifest
     output : str
-        A folder, or a URL of fsspec. It is made where it is not there; files of another version, or of another rig
-        file, stay and are not used.
+        A folder, or a URL of fsspec; it is made if needed. Files of another version or of another rig file stay
+        there and are not used.
     each : "robot", "day" or "log"
-        What is solved together: the logs of a robot or of a site, those of a day (UTC), or each log alone.
+        What is solved together: all logs of a robot or of a site, the logs of a day (UTC), or each log alone.
     engine : Engine, optional
         By default this process. The caller closes it.
     progress : callable, optional
-        Is called with each stage, counted.
+        Called with each stage, which has a count.
 
     Raises
     ------
     RigError
         The rig file of all robots cannot be read.
     ManifestError
-        A log is said to be of two robots.
+        Two robots have the same log.
     StoreError
         The output cannot be written.
     """
@@ -116,7 +116,7 @@ def run(
 
 
 def read_fleet(output: str) -> tuple[RobotRow, ...]:
-    """The rows of the last run in an output; a FileFormatError where there is none, or of another version."""
+    """The rows of the last run in an output; a FileFormatError if there are none or their version differs."""
     url = below(output, ROWS_FILE)
     return read_rows(read_bytes(url), shown(url))
 
@@ -135,7 +135,7 @@ def _run(manifest: Manifest, output: str, each: Each, engine: Engine, tell: Prog
         outcomes: dict[str, Outcome] = {receipt.key: receipt for receipt in kept if receipt is not None}
         new = [Task(task.key, function, (task, output)) for task in tasks if task.key not in outcomes]
         if new:
-            # Hours of work are not begun for an output that cannot be written.
+            # Check first that the output can be written: the run may take hours.
             write_once(below(output, ABOUT_FILE), json.dumps({"gtsam-rwhec fleet": version("gtsam-rwhec")}).encode())
             tell(Counted(what, 0, len(new)))
             for done, outcome in enumerate(engine.run(new), 1):
@@ -167,13 +167,13 @@ def _run(manifest: Manifest, output: str, each: Each, engine: Engine, tell: Prog
 
 
 def _many(function: Callable[[Asked], Told], of: Iterable[Asked]) -> list[Told]:
-    """Ask stores many things at the same time; the answers are in the order of the questions."""
+    """Send many requests to stores at the same time; the answers have the order of the requests."""
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(function, of))
 
 
 def _of_earlier_rows(output: str) -> tuple[str, ...]:
-    """What to say where the output has rows that this version does not read."""
+    """The remark for an output with rows that this version does not read."""
     if not exists(below(output, ROWS_FILE)):
         return ()
     try:
@@ -189,7 +189,7 @@ def _of_earlier_rows(output: str) -> tuple[str, ...]:
 
 
 def planned_logs(manifest: Manifest) -> list[PlannedLog]:
-    """All logs of a manifest, each once. Errors as `run`; what is wrong with one robot is a failure of its logs."""
+    """All logs of a manifest, each once. Raises as `run` does; a fault of one robot becomes a failure of its logs."""
     if manifest.shared_rig is not None:
         read_rig_source(manifest.shared_rig)
     entries = [(robot, source) for robot in manifest.robots for source in robot.logs]
@@ -208,7 +208,7 @@ def planned_logs(manifest: Manifest) -> list[PlannedLog]:
 
 
 def _rig(url: str) -> RigSource | str:
-    """A rig file; or why it cannot be used."""
+    """A rig file, or the reason why it cannot be used."""
     try:
         return read_rig_source(url)
     except (RwhecError, OSError) as error:
@@ -233,14 +233,14 @@ def _planned(robot: str, url: str, rig_url: str, failure: str, rigs: Mapping[str
     if failure or isinstance(rig, str):
         return PlannedLog(robot, url, failure=failure or str(rig))
     try:
-        path = local_path(url)  # whole: the same log whatever folder a run or a worker is started in
+        path = local_path(url)  # absolute: runs and workers may start in other folders
         return PlannedLog(robot, url, LogTask(url if path is None else os.path.abspath(path), stamp_of(url), rig))
     except (RwhecError, OSError) as error:
         return PlannedLog(robot, url, failure=without_secrets(str(error)))
 
 
 def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Outcome], each: Each) -> list[UnitTask]:
-    """What is to be solved, from the logs that gave a partial result."""
+    """The units to solve, from the logs with a partial result."""
     of_robot: dict[str, list[PlannedLog]] = {robot.name: [] for robot in manifest.robots}
     for log in logs:
         of_robot[log.robot].append(log)
@@ -268,7 +268,7 @@ def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Ou
 
 
 def _names(robot: str, logs: Sequence[PlannedLog]) -> list[str]:
-    """A name of each log alone: the file's, with a number where several have it."""
+    """A unique name for each log: the file's name, with a number if several files share it."""
     taken: dict[str, int] = {}
     names = []
     for log in logs:
@@ -309,7 +309,7 @@ def _rows(
 
 
 def _answer_rows(unit: UnitTask, outcome: Outcome, output: str) -> list[RobotRow]:
-    """The rows of a unit's answer with its costs, or one of failure for each of its robots that has a log."""
+    """The rows of a unit's answer with its costs; without an answer, a row of failure for each robot with a log."""
     if isinstance(outcome, Failed):
         robots = dict.fromkeys(robot for robot, _ in unit.rigs)
         return [RobotRow(unit.name, robot, unit.site, failure=outcome.reason) for robot in robots]

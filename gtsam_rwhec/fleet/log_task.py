@@ -1,4 +1,4 @@
-"""One log becomes one partial result, by the stages that ``calibrate`` runs, in a folder of the worker."""
+"""Make a partial result of one log with the stages that ``calibrate`` runs, in a folder of the worker."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, read_pair
 from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata
 from gtsam_rwhec.runs.topics_of_rig import wanted_topics
 
-#: The folder of partial results, below the output.
+#: The folder of partial results in the output.
 FOLDER = "partials"
 
 
 @dataclass(frozen=True)
 class LogTask:
-    """One log to be read: its URL, what changes when it does, and its rig file."""
+    """One log to read: its URL, a stamp that changes when the log changes, and its rig file."""
 
     url: str
     stamp: str
@@ -57,19 +57,19 @@ class LogTask:
 
     @property
     def file(self) -> str:
-        """The place of the partial result below the output."""
+        """The path of the partial result in the output."""
         return f"{FOLDER}/{self.key}.partial"
 
 
 def map_log(task: LogTask, output: str) -> Receipt:
-    """Read a log, detect, clean, and keep its measurements in the output, a folder or a URL.
+    """Read a log, detect, clean, and write its measurements to the output (a folder or a URL).
 
     Raises
     ------
     RwhecError
-        As ``detect_log`` and ``clean_log`` do; the log has changed while it was read.
+        As ``detect_log`` and ``clean_log`` do; or the log changed while it was read.
     OSError
-        The store stopped.
+        The store broke off.
     """
     earlier = kept_receipt(output, task.key, task.file)
     if earlier is not None:
@@ -82,7 +82,7 @@ def map_log(task: LogTask, output: str) -> Receipt:
 
 
 def _partial(task: LogTask, folder: Path) -> PartialResult:
-    """The partial result of a log. What is said of files of the worker is said of the log."""
+    """The partial result of a log. Messages about the worker's files name the log instead."""
     rig = task.rig.rig(folder)
     _refuse_odometry(rig)
     detected, cleaned = folder / DETECTED_LOG, folder / CALIBRATION_LOG
@@ -116,7 +116,7 @@ def _partial(task: LogTask, folder: Path) -> PartialResult:
 
 
 def _refuse_odometry(rig: Rig) -> None:
-    """A RigError for sensors that know only their own motion: their motions are not in partial results."""
+    """A RigError for sensors that know only their own motion: partial results have no place for their motions."""
     names = [name for name, sensor in rig.sensors.items() if isinstance(sensor, OdometrySensor)]
     if names:
         raise RigError(
@@ -126,7 +126,7 @@ def _refuse_odometry(rig: Rig) -> None:
 
 
 def _of_stages(task: LogTask, path: Path, rig: Rig, detected: Path, cleaned: Path) -> PartialResult:
-    """By the stages, where the log has not been through them."""
+    """Run the stages that the log has not been through."""
     with open_log(path) as log:
         is_detected = is_from_stage(log)
     if is_detected:
@@ -179,7 +179,7 @@ def _kept(measured: MeasuredPairs, corners: LogCorners, offsets_s: Mapping[str, 
 def _findings(
     log: Log, rig: Rig, metadata: LogMetadata, motion: CarrierMotion, pairs: Mapping[Pair, MeasuredPairs]
 ) -> list[Finding]:
-    """What the log itself says against the poses: its clocks, intrinsics and boards, and blurred images."""
+    """Findings in the log that speak against the poses: clocks, intrinsics, boards, blurred images."""
     stated_s = {
         name: float(sensor.time_offset) for name, sensor in rig.sensors.items() if sensor.time_offset != "estimate"
     }

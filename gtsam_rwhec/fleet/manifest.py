@@ -1,6 +1,6 @@
-"""Manifests of fleets, which docs/fleets.md shows, and the rig files that they name, as any worker can read them.
+"""Manifests of fleets (docs/fleets.md), and the rig files that they name, in a form that every worker can read.
 
-Every path is a URL of fsspec, or a path; relative ones start from the manifest's folder. Names with * ? [ are patterns.
+Each entry is a URL of fsspec or a path. Relative ones start from the manifest's folder. Names with * ? [ are patterns.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gtsam_rwhec.fleet.stores import listed, local_path, read_bytes
 from gtsam_rwhec.rig import Rig, parse_rig
 from gtsam_rwhec.rig.sections import ESTIMATE
 
-#: Robots and sites name folders of the output; "/" and "@" join names of frames and of units.
+#: Names of robots and sites become folders of the output; "/" and "@" join names of frames and of units.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
 _PATTERN = re.compile(r"[*?\[]")
@@ -40,7 +40,7 @@ class LogSource:
 
     url: str  #: A log, or a pattern of logs
     rig: str  #: URL of its rig file
-    place: str  #: Where the manifest has it, for messages
+    place: str  #: Its place in the manifest, for messages
 
     @property
     def is_pattern(self) -> bool:
@@ -50,7 +50,7 @@ class LogSource:
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot: its name, its logs, and the site whose targets it sees, if others see them too."""
+    """One robot: its name, its logs, and its site if other robots see the same targets."""
 
     name: str
     logs: tuple[LogSource, ...]
@@ -76,7 +76,7 @@ class Manifest:
 
 
 def is_pattern(url: str) -> bool:
-    """Whether a URL stands for all files that match it. What follows "?" in a URL of http is its query."""
+    """Whether a URL is a pattern for files. In a URL of http, "?" begins the query."""
     place = url.partition("?")[0] if url.lower().startswith(("http://", "https://")) else url
     return _PATTERN.search(place) is not None
 
@@ -103,12 +103,12 @@ def read_manifest(url: str) -> Manifest:
 
 
 def manifest_of_pattern(pattern: str, rig: str) -> Manifest:
-    """The fleet of all logs that a pattern names; a robot has the name of its logs' folder.
+    """The fleet of all logs that match a pattern; a robot has the name of its logs' folder.
 
     Raises
     ------
     ManifestError
-        No log matches, or a folder has a name that no robot can have.
+        No log matches, or a folder's name cannot be a robot's name.
     """
     logs: dict[str, list[LogSource]] = {}
     for url in listed(pattern):
@@ -127,7 +127,7 @@ def manifest_of_pattern(pattern: str, rig: str) -> Manifest:
 
 
 def parse_manifest(text: str, where: str) -> Manifest:
-    """Read the text of a manifest that is at a URL; relative paths start from the folder of that.
+    """Read the text of a manifest that is at a URL; relative paths start from the URL's folder.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def parse_manifest(text: str, where: str) -> Manifest:
 
 
 def joined(base: str, url: str) -> str:
-    """A URL as a file at `base` means it: relative ones start from that file's folder."""
+    """A URL that a file at `base` has: relative ones start from that file's folder."""
     if _SCHEME.match(url) or url.startswith("/"):
         return url
     folder = base.rpartition("/")[0]
@@ -260,7 +260,7 @@ class _Checks:
         return None if url is None else LogSource(url, rig or "", place)
 
 
-#: A rig file, or a file that it names, has at most this many bytes.
+#: The most bytes of a rig file, and of a file that it names.
 MOST_RIG_BYTES = 4_000_000
 
 
@@ -270,20 +270,20 @@ class RigSource:
 
     url: str  #: Where it is
     text: str
-    #: The files with intrinsics and targets that it names: the path as it has it, and the content. Those of absolute
-    #: paths are read where they are, by every worker
+    #: Files of intrinsics and targets that the rig file names: path as written there, and content. Each worker reads
+    #: files of absolute paths itself
     files: tuple[tuple[str, bytes], ...] = ()
 
     @property
     def sha256(self) -> str:
-        """A checksum of all of it, in hexadecimal digits."""
+        """A checksum of the rig file and its files, in hexadecimal digits."""
         digest = hashlib.sha256(self.text.encode())
         for name, content in self.files:
             digest.update(f"\0{name}\0{len(content)}\0".encode() + content)
         return digest.hexdigest()
 
     def rig(self, folder: Path) -> Rig:
-        """The rig; the files that it names are written below a folder of this process, if it names any.
+        """The rig. Files that it names are first written into a folder of this process.
 
         Raises `RigError` as ``read_rig`` does.
         """
@@ -301,7 +301,7 @@ class RigSource:
 
 @lru_cache(maxsize=8)
 def _parsed(text: str, where: str) -> Rig:
-    """A rig file that names no others: a worker parses it once."""
+    """The rig of a file that names no other files: a worker parses it only once."""
     return _in_words(text, where, Path())
 
 

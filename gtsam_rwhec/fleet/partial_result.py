@@ -1,6 +1,6 @@
-"""The partial result of one log: its cleaned measurements with their corners, and the facts about the log, in one file.
+"""The partial result of one log: its cleaned measurements with their corners, and facts about the log, in one file.
 
-A file has some 260 bytes for each measurement (of single tags).
+A file has about 260 bytes for each measurement (of single tags).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from gtsam_rwhec.results.log_history import (
     TrackCount,
 )
 
-#: The version of these files: it is in their names, through the keys.
+#: The version of these files. The keys depend on it, and the files' names are made of the keys.
 FORMAT_VERSION = 1
 _TRIANGLE = np.triu_indices(6)
 
 
 class LogFacts(BaseModel):
-    """The facts of one log, as its file has them."""
+    """The facts about one log in its file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,8 +50,8 @@ class LogFacts(BaseModel):
     #: detection, cleaning: the reports of the stages
     detection: DetectionReport
     cleaning: CleaningReport
-    poses: dict[str, int]  #: At how many poses of the carriers each frame is used
-    findings: list[tuple[Ground, str]] = []  #: What the log itself says against the poses
+    poses: dict[str, int]  #: by frame: the number of the carriers' poses at which it is used
+    findings: list[tuple[Ground, str]] = []  #: Findings in the log that speak against the poses
     warnings: list[str] = []
 
     def camera(self, sensor: str) -> Camera:
@@ -82,7 +82,7 @@ class PairMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class PartialResult:
-    """What is kept of a log."""
+    """The measurements and facts that are kept of a log."""
 
     facts: LogFacts
     pairs: Mapping[Pair, PairMeasurements]  #: by Pair
@@ -90,9 +90,9 @@ class PartialResult:
     path: tuple[np.ndarray, Array] | None = None
 
     def packed(self) -> bytes:
-        """The bytes of its file; the same for the same content."""
+        """The bytes of its file; equal content gives equal bytes."""
         arrays: dict[str, np.ndarray] = {}
-        # Targets in one image have one A: it is kept once.
+        # Targets in one image share one A, which is stored once.
         stacked = [one.A[:, :3] for one in self.pairs.values()]
         poses, which = np.unique(np.concatenate(stacked).reshape(-1, 12), axis=0, return_inverse=True)
         arrays["poses"] = poses
@@ -116,7 +116,7 @@ class PartialResult:
 
 
 def read_partial(content: bytes, where: str) -> PartialResult:
-    """A partial result from the bytes of its file, which `where` names; a FileFormatError where it is none."""
+    """A partial result from the bytes of its file; `where` names the file in the FileFormatError if it is invalid."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = dict(file)
@@ -152,7 +152,7 @@ def _poses(rows: Array) -> Array:
 
 
 def with_sensor_names(facts: LogFacts, names: Mapping[str, str]) -> LogFacts:
-    """The facts with other names of sensors."""
+    """The facts with new names of sensors."""
 
     def track(one: TrackCount) -> TrackCount:
         return one.model_copy(update={"sensor": names.get(one.sensor, one.sensor)})
@@ -191,7 +191,7 @@ def with_sensor_names(facts: LogFacts, names: Mapping[str, str]) -> LogFacts:
 def history_of_logs(
     logs: Sequence[LogFacts], carriers: tuple[str, str], outliers: Mapping[Pair, tuple[int, int]]
 ) -> LogFields:
-    """The history of all logs of a unit in one, as a result file has it.
+    """The histories of all logs of a unit joined into one, in the form of a result file.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def history_of_logs(
     carriers : (str, str)
         Of the sensors, and of the targets.
     outliers : dict of Pair to (int, int)
-        Of each pair in the answer, how many measurements are used, and how many there were.
+        For each pair in the answer: how many measurements are used, and how many there were.
     """
     detections, cleanings = [log.detection for log in logs], [log.cleaning for log in logs]
     offsets: dict[str, list[float]] = {}
@@ -248,7 +248,7 @@ def history_of_logs(
 
 
 def findings_of_logs(logs: Sequence[LogFacts]) -> list[Finding]:
-    """What the logs say against the poses, with their names where there are several."""
+    """Findings of the logs that speak against the poses, with the logs' names if there are several."""
     found: dict[tuple[Ground, str], list[str]] = {}
     for log in logs:
         for ground, words in log.findings:

@@ -1,4 +1,4 @@
-"""Requests to a store: tried again where that may help, and every failure told in words without credentials."""
+"""Requests to a store. They are repeated if this may help; messages about failures never have credentials."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from urllib.parse import quote, quote_plus, unquote, unquote_plus
 
 from gtsam_rwhec.errors import StoreError, StoreInterruptedError
 
-#: What stands where a secret was.
+#: This text replaces a secret.
 HIDDEN = "***"
 #: Names of options, parameters of a query and variables of the environment whose values are secret.
 _SECRET_NAME = re.compile(r"key|secret|token|passw|pwd|credential|signature|(^|[-_.])sig$|auth|sas|account|user", re.I)
-#: Shorter values are not looked for: "1" is in every message.
+#: Shorter values are not hidden: "1" is in every message.
 _SHORTEST = 4
 _USER_INFO = re.compile(r"(?<=://)[^/\s?#]*@")
 _QUERY = re.compile(r"(\w[\w+.-]*://[^\s?#'\"]*)[?#][^\s'\">)\]]*")
@@ -28,27 +28,27 @@ _NAMED = re.compile(
 )
 _ACCESS_KEY = re.compile(r"\b(?:AKIA|ASIA)[0-9A-Z]{12,}\b")
 _SCHEME = re.compile(r"^[a-zA-Z][\w+.-]*://")
-#: The parameters of a query that are not secret have these names.
+#: Names of a query's parameters that are not secret.
 _PLAIN_PARAMETER = re.compile(r"(?i)(response-|x-amz-(algorithm|date|expires|signedheaders)|version)")
 
 
 def shown(url: str) -> str:
-    """A URL as messages show it: without user, password, query and fragment."""
+    """A URL for messages: without user, password, query and fragment."""
     if not _SCHEME.match(url):
         return url
     plain = _USER_INFO.sub("", url, count=1)
     place, mark, _ = plain.partition("?")
-    # A query is left out for http alone: other stores have question marks in patterns and names.
+    # Only http has queries: other stores have question marks in patterns and names.
     return place + "?..." if mark and url.lower().startswith("http") else plain
 
 
 def without_secrets(text: str, url: str = "") -> str:
-    """`text` with `HIDDEN` in place of what is secret, or looks like it.
+    """`text` with `HIDDEN` in place of secrets and of words that look like secrets.
 
     Parameters
     ----------
     text
-        What a library says, or anything that may repeat it.
+        A library's message, or any text that may quote it.
     url
         Its user, password and query are secret.
     """
@@ -83,11 +83,11 @@ def _of_environment() -> Iterator[str]:
             yield value
 
 
-#: A request is made so often before the store counts as gone.
+#: The most attempts of one request; then the store counts as lost.
 ATTEMPTS = 4
-#: Seconds before the second request; twice as many before each further one, and up to half as many more by chance.
+#: Seconds before the second attempt; each further wait is twice as long. A random part of up to half is added.
 PAUSE_S = 0.25
-#: What the codes and classes of stores' libraries mean, by words in them. Only what may pass is asked for again.
+#: Kinds of errors, by words in the codes and class names of stores' libraries. Only passing ones are tried again.
 _REFUSED = (
     "accessdenied", "invalidaccesskeyid", "signaturedoesnotmatch", "expiredtoken", "invalidtoken", "forbidden",
     "unauthorized", "nocredentials", "partialcredentials", "credentialretrieval", "unable to locate credentials",
@@ -107,7 +107,7 @@ _PASSING = (
     "disconnected", "payload", "incompleteread", "requesttimeout", "reset by peer", "service unavailable",
     "bad gateway", "too many requests", "ssl", "temporarily", "broken pipe", "endpoint url", "httpclient",
 )  # fmt: skip
-#: Errors of disks that no second attempt mends.
+#: Errors of disks for which a second attempt does not help.
 _OF_DISKS = {errno.ENOSPC, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EDQUOT}
 
 Answer = TypeVar("Answer")
@@ -120,11 +120,11 @@ def requested(
     how_far: Callable[[], str] | None = None,
     attempts: int | None = None,
 ) -> Answer:
-    """What `ask` gives: it may be called several times, and goes on from where it broke off, if it can.
+    """The value that `ask` returns. `ask` is called again after a failure, and continues if it can.
 
-    `what` is asked for, in words without credentials, at `url`, whose secrets are taken out of what libraries say;
-    `how_far` says how much has come. A StoreError where the store refuses, or the file is not there; a
-    StoreInterruptedError where each of the attempts (`ATTEMPTS` if not said) broke off.
+    For messages: `what` is asked for, in words without credentials; secrets of `url` are hidden in libraries'
+    messages; `how_far` gives how much has arrived. Raises StoreError if the store refuses or the file is missing,
+    StoreInterruptedError if all attempts (by default `ATTEMPTS`) broke off.
     """
     most = ATTEMPTS if attempts is None else attempts
     for attempt in range(1, most + 1):
@@ -149,10 +149,10 @@ def requested(
 
 
 def _fault(error: Exception, what: str, url: str) -> StoreError | None:
-    """The error of what stays wrong; None if the same request may work later."""
+    """The error if it is permanent; None if the same request may work later."""
     words = _words(error)
     said = without_secrets(words, url)
-    # The names in the URL say nothing of the error.
+    # Names in the URL could look like words of the error.
     names = [name for name in url.lower().replace("?", "/").split("/") if name]
     text = f"{type(error).__name__} {_code(error)} {words}".lower()
     for name in sorted(names, key=len, reverse=True):
@@ -165,7 +165,7 @@ def _fault(error: Exception, what: str, url: str) -> StoreError | None:
             f"{what}: refused ({said}). Check the rights and the credentials: they come from the environment, or "
             "from the store's own configuration files."
         )
-    if status is None and "://" in url and _is_of_connection(error):  # fsspec tells it as a file that is not there
+    if status is None and "://" in url and _is_of_connection(error):  # fsspec reports it as a missing file
         return None
     if isinstance(error, FileNotFoundError) or status in (404, 410) or any(word in text for word in _ABSENT):
         return StoreError(f"{what}: it is not there ({said}).")
@@ -179,23 +179,23 @@ def _fault(error: Exception, what: str, url: str) -> StoreError | None:
 
 
 def _is_of_connection(error: BaseException) -> bool:
-    """Whether nobody answered: the error, or one that it came from, is of the way to the store."""
+    """Whether the store was not reached: the error, or one of its causes, is one of the connection."""
     cause = error.__cause__ or error.__context__
     of_way = "ClientConnect" in type(error).__name__ or isinstance(error, ConnectionError | asyncio.TimeoutError)
     return of_way or (cause is not None and _is_of_connection(cause))
 
 
 def _words(error: BaseException) -> str:
-    """What an error says, with those that it came from."""
+    """The message of an error and of its causes."""
     said = str(error).strip() or type(error).__name__
     if isinstance(error, OSError) and error.strerror and error.filename:
-        return error.strerror  # the file is named before it
+        return error.strerror  # the message names the file already
     cause = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return said if cause is None or str(cause) in said else f"{said} (from {type(cause).__name__})"
 
 
 def _code(error: BaseException | None) -> str:
-    """The store's own code of an error, such as ``InvalidAccessKeyId``; empty where it has none."""
+    """The store's own code of an error, such as ``InvalidAccessKeyId``; empty without one."""
     while error is not None:
         answer = getattr(error, "response", None)
         if isinstance(answer, dict):
@@ -205,7 +205,7 @@ def _code(error: BaseException | None) -> str:
 
 
 def _status(error: Exception) -> int | None:
-    """The number of an answer in HTTP, if the error has one."""
+    """The HTTP status, if the error has one."""
     status = getattr(error, "status", None)
     if not isinstance(status, int):
         answer = getattr(error, "response", None)

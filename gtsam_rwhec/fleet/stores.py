@@ -1,9 +1,9 @@
-"""Files in object stores and on disks by one way: a URL of fsspec (s3, gs, http, ...) or a path.
+"""Files in object stores and on disks with the same functions: a URL of fsspec (s3, gs, http, ...) or a path.
 
-Paths and ``file://`` need no library. Every error says what was asked of which store, without credentials: a
-`StoreError` for what stays wrong, a `StoreInterruptedError` (an OSError) for what was tried several times and may work
-later. Every byte that comes from a store is counted; an object is written by one request. File systems find credentials
-where their users keep them: environment, configuration files, roles.
+Paths and ``file://`` need no library. Every error names the store and the request, without credentials: a `StoreError`
+if the fault is permanent, a `StoreInterruptedError` (an OSError) after several attempts if it may work later. Bytes
+from stores are counted. One request writes an object. File systems find credentials in the usual places:
+environment, configuration files, roles.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.whole_files import checked_path, write_atomically
 from gtsam_rwhec.fleet.store_requests import requested, shown
 
-#: A file that is asked for whole, a manifest or a rig file, has at most this many bytes unless the caller says more.
+#: Default limit of the bytes of a file that is read whole, such as a manifest or a rig file.
 MOST_BYTES = 1 << 32
 
 
@@ -39,7 +39,7 @@ _counting: ContextVar[tuple[ByteCount, ...]] = ContextVar("counting", default=()
 
 @contextmanager
 def counted_bytes() -> Iterator[ByteCount]:
-    """Count in the block; blocks within blocks count each for themselves."""
+    """Count bytes inside the block; nested blocks count separately."""
     count = ByteCount()
     token = _counting.set((*_counting.get(), count))
     try:
@@ -49,7 +49,7 @@ def counted_bytes() -> Iterator[ByteCount]:
 
 
 def count_bytes(count: int) -> None:
-    """Tell all that count of bytes that came."""
+    """Add bytes to all active counts."""
     for one in _counting.get():
         one.count += count
 
@@ -62,13 +62,13 @@ def local_path(url: str) -> Path | None:
 
 
 def exists(url: str) -> bool:
-    """Whether a file is there."""
+    """Whether a file exists."""
     path = local_path(url)
     if path is not None:
         return path.is_file()
     fs, place = _opened(url)
 
-    def ask() -> bool:  # not fs.isfile, to which a store that refuses is one that has nothing
+    def ask() -> bool:  # not fs.isfile: it returns False if the store refuses
         try:
             return bool(fs.info(place)["type"] == "file")
         except FileNotFoundError:
@@ -89,7 +89,7 @@ def size_of(url: str) -> int:
 
 
 def stamp_of(url: str) -> str:
-    """What changes when the file does: its ETag or checksum in the store, or else its size and time of change."""
+    """A text that changes when the file changes: its ETag or checksum, else its size and time of change."""
     path = local_path(url)
     if path is not None:
         status = requested(lambda: os.stat(path), str(path), url)
@@ -106,7 +106,7 @@ def stamp_of(url: str) -> str:
 
 
 def read_bytes(url: str, most_bytes: int = MOST_BYTES) -> bytes:
-    """A whole file; a StoreError where it has more than `most_bytes`."""
+    """The bytes of a file; a StoreError if there are more than `most_bytes`."""
     size = size_of(url)
     if size > most_bytes:
         raise StoreError(f"{shown(url)} has {size} bytes, and {most_bytes} at most are expected; is it the right file?")
@@ -114,9 +114,9 @@ def read_bytes(url: str, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Parts of a file, each from a byte to before another; all that is asked for, or an error.
+    """Parts of a file, each from a first byte to before an end byte; complete, or an error.
 
-    Ranges of one call travel at the same time. A range that breaks off is asked for again from where it broke off.
+    All ranges of one call are requested at the same time. A range that breaks off is continued from there.
     """
     path = local_path(url)
     if path is not None:
@@ -125,7 +125,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     parts: list[list[bytes]] = [[] for _ in ranges]
 
     def missing() -> list[tuple[int, int, int]]:
-        """Number, first byte and end of what has not come."""
+        """Number, first byte and end of each missing part."""
         came = ((i, a + sum(map(len, part)), b) for i, ((a, b), part) in enumerate(zip(ranges, parts, strict=True)))
         return [each for each in came if each[1] < each[2]]
 
@@ -134,7 +134,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         if not wanted:
             return
         _, starts, ends = zip(*wanted, strict=True)
-        # One connection for each range at most: `batch_size` of fsspec bounds them.
+        # At most one connection for each range: `batch_size` of fsspec limits them.
         answers = fs.cat_ranges([place] * len(wanted), list(starts), list(ends), on_error="return")
         fault: Exception | None = None
         for (number, start, end), answer in zip(wanted, answers, strict=True):
@@ -142,7 +142,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
                 fault = answer
                 continue
             count_bytes(len(answer))
-            if len(answer) > end - start:  # the server knows no ranges, and sent all of the file
+            if len(answer) > end - start:  # the server does not support ranges and sent the whole file
                 answer = answer[start:end]
             parts[number].append(bytes(answer))
         if fault is not None:
@@ -161,10 +161,10 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 
 
 def write_once(url: str, data: bytes) -> bool:
-    """Write a file whole, unless it is there with the same bytes. Two who write at once leave one of the two, whole.
+    """Write a whole file, unless it exists with the same bytes. Of two writers at once, one file stays, complete.
 
-    On disks it is a temporary file that is renamed, with its folder made; in stores one request. It returns whether
-    the file was there, and nothing was written.
+    On disks it makes the folder and renames a temporary file; in stores it is one request. Returns whether the file
+    existed already, so that nothing was written.
     """
     path = local_path(url)
     if path is not None:
@@ -176,7 +176,7 @@ def write_once(url: str, data: bytes) -> bool:
             if fs.size(place) == len(data) and fs.cat_file(place) == data:
                 return True
         except FileNotFoundError:
-            pass  # it is to be made
+            pass  # it does not exist yet
         fs.pipe_file(place, data)
         return False
 
@@ -184,7 +184,7 @@ def write_once(url: str, data: bytes) -> bool:
 
 
 def listed(pattern: str) -> list[str]:
-    """The URLs of files that a pattern with ``*``, ``?``, ``[]`` or ``**`` names, sorted; those of folders are not."""
+    """The sorted URLs of the files, without folders, that match a pattern with ``*``, ``?``, ``[]`` or ``**``."""
     path = local_path(pattern)
     if path is not None:
         found = requested(lambda: glob.glob(str(path), recursive=True), f"the files {path}", pattern)
@@ -202,22 +202,22 @@ def listed(pattern: str) -> list[str]:
 
 
 class StoppedEarlyError(OSError):
-    """A store sent less than was asked for, and no error."""
+    """A store sent less than requested, without an error."""
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and the place in it."""
+    """The file system of a URL, and the path in it."""
     scheme = url.partition("://")[0].lower()
     with extra_named():
         from fsspec import core
 
         if scheme == "s3":
-            import s3fs  # noqa: F401  # for its own error, if it is missing
+            import s3fs  # noqa: F401  # if it is missing, this import raises the clear error
 
     def ask() -> tuple[Any, str]:
         fs, place = core.url_to_fs(url, **_OPTIONS.get(scheme, {}))
         if scheme == "s3":
-            fs.retries = 1  # `requested` tries again, and says so
+            fs.retries = 1  # `requested` repeats requests and reports it
         return fs, place
 
     try:
@@ -226,7 +226,7 @@ def _opened(url: str) -> tuple[Any, str]:
         raise StoreError(f"{shown(url)}: {error}") from error
 
 
-#: Storage options of file systems. No block is read ahead and no listing kept, and nobody is waited for for ever.
+#: Storage options of file systems: no reading ahead, no cached listings, and time limits on every request.
 _OPTIONS: dict[str, dict[str, Any]] = {
     "s3": {
         "default_cache_type": "none",
@@ -268,5 +268,5 @@ def _written_locally(path: Path, data: bytes) -> bool:
     try:
         write_atomically(path, data)
     except FileFormatError as error:
-        raise (error.__cause__ or error) from None  # whoever asked says it in words
+        raise (error.__cause__ or error) from None  # the caller writes the message
     return False

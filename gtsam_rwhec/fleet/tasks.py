@@ -1,8 +1,8 @@
-"""What a fleet's run is made of: tasks that write one file each, what each cost, and how one is carried out.
+"""The tasks of a fleet's run: each writes one file. How a task is run, and what it costs.
 
-A task's function writes its file to the output under the task's key, and returns a receipt. The key is a checksum of
-all that the file depends on (the log, the rig file, the options, the version), so a file that is there already is what
-the task would write: nothing is done twice, and two runs at once write the same bytes.
+A task's function writes its file to the output under the task's key and returns a receipt. The key is a checksum of
+everything that the file depends on (log, rig file, options, version). So an existing file is the one that the task
+would write: no work is done twice, and two runs at the same time write the same bytes.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-#: A task is tried so often, for errors of the system and for workers that die.
+#: The most attempts of a task after errors of the system or the death of its worker.
 ATTEMPTS = 3
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 @dataclass(frozen=True)
 class Receipt:
-    """What a task did. Small: it travels between processes, the file does not."""
+    """What a task did. It is small and is sent between processes; the file is not sent."""
 
     key: str  #: The task's key
-    file: str  #: The file's place below the output, with slashes
+    file: str  #: The file's path in the output, with slashes
     sha256: str  #: Checksum of the file's bytes, in hexadecimal digits
-    was_there: bool = False  #: Whether an earlier run, or another one, had written the file
-    #: cpu_s, seconds: of the processor, and on the clock
+    was_there: bool = False  #: Whether another run had written the file
+    #: cpu_s, seconds: CPU time, and elapsed time
     cpu_s: float = 0.0
     seconds: float = 0.0
     bytes_read: int = 0  #: Bytes that came from the store of the logs
@@ -50,7 +50,7 @@ class Receipt:
 
 @dataclass(frozen=True)
 class Failed:
-    """A task that gave no file: what was wrong, where, and what to do; without credentials."""
+    """A task without a file: what was wrong, where, and what to do; without credentials."""
 
     key: str
     reason: str
@@ -61,22 +61,22 @@ class Task:
     """One call of ``function(*arguments)``."""
 
     key: str  #: Unique in a run
-    #: A function of a module, which other processes can import. It returns a Receipt, raises an OSError for what a
-    #: second attempt may mend, and an error of the library for what none does
+    #: A function of a module, which other processes can import. It returns a Receipt. It raises an OSError if a second
+    #: attempt may help, else an error of the library
     function: Callable[..., Receipt]
     arguments: tuple[Any, ...] = ()  #: Small, and picklable
 
 
 class Engine(Protocol):
-    """What carries out tasks: Dask, or this process."""
+    """The protocol of an engine, which runs tasks: on Dask, or in this process."""
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Receipt | Failed]:
-        """Yield one receipt or failure for each task, as they end; a dead worker's tasks are tried again."""
+        """Yield one receipt or failure for each task in the order in which they end; repeat a dead worker's tasks."""
         ...
 
 
 class InProcess:
-    """The engine without other processes: one task after another in this one."""
+    """The engine that runs one task after another in this process."""
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Receipt | Failed]:
         """Yield one receipt or failure for each task, in their order."""
@@ -92,15 +92,15 @@ class InProcess:
 
 
 def carried_out(task: Task) -> Receipt | Failed:
-    """The task's receipt, or why there is none; an OSError (a disk, a network, a store) is for whoever tries again.
+    """The task's receipt or failure. An OSError (disk, network, store) is raised, so that the caller tries again.
 
-    All other errors would come again: they are a row of the report, not the end of the run. BLAS has one thread.
+    Other errors would occur again: each becomes a row of the report and the run continues. BLAS has one thread.
     """
     try:
         with one_blas_thread():
             return task.function(*task.arguments)
     except OSError as error:
-        raise OSError(_words(error)) from None  # the store's own error may not travel, and may repeat credentials
+        raise OSError(_words(error)) from None  # the store's own error may not be picklable, and may have credentials
     except RwhecError as error:
         return failed(task, error)
     except MemoryError:
@@ -113,7 +113,7 @@ def carried_out(task: Task) -> Receipt | Failed:
 
 
 def failed(task: Task, error: BaseException) -> Failed:
-    """The row of a task that ended with an error."""
+    """The failure of a task that ended with an error."""
     return Failed(task.key, _words(error))
 
 
@@ -127,7 +127,7 @@ def below(output: str, file: str) -> str:
 
 
 def kept_receipt(output: str, key: str, file: str) -> Receipt | None:
-    """The receipt of a file that is there and whole, for the task `key`; None where it is still to be made."""
+    """The receipt of the complete file of the task `key`; None if the file must still be made."""
     url = below(output, _place(file))
     if not (exists(url) and exists(below(output, file))):
         return None
@@ -138,7 +138,7 @@ def kept_receipt(output: str, key: str, file: str) -> Receipt | None:
 
 
 def keep_receipt(output: str, receipt: Receipt) -> Receipt:
-    """Keep the receipt of a file that is written; it comes last, so that a file with a receipt is whole."""
+    """Write the receipt after its file, so that a file with a receipt is complete."""
     write_once(below(output, _place(receipt.file)), json.dumps(asdict(receipt), sort_keys=True).encode())
     return receipt
 
@@ -180,7 +180,7 @@ def costs_of(key: str) -> Iterator[Costs]:
 def peak_bytes() -> int:
     """Peak memory (resident) of this process, bytes.
 
-    On Linux it is the peak since the task began, elsewhere since the process began; 0 on Windows, which does not tell.
+    On Linux it is the peak since the task began, elsewhere since the process began; on Windows it is 0 (unknown).
     """
     if _STATUS.exists():
         with open(_STATUS, encoding="ascii", errors="replace") as lines:
@@ -191,13 +191,13 @@ def peak_bytes() -> int:
 
 
 def _cpu_s() -> float:
-    """Seconds of the processor of this process and of those that it started and that have ended."""
+    """CPU seconds of this process and of its child processes that have ended."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
 
 
 def _forget_peak() -> None:
-    """Let Linux measure the peak from now on; where it may not be told so, the peak is that of the process."""
+    """Make Linux measure the peak from now on; without the right to do so, the peak is that of the process."""
     try:
         told = os.open(_CLEAR, os.O_WRONLY)
     except OSError:

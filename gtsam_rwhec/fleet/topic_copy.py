@@ -1,7 +1,7 @@
-"""The part of a log that a rig needs, as a log on this machine's disk: only the chunks of its topics travel.
+"""Copy the part of a log that a rig needs to this machine's disk: only chunks with its topics are read.
 
-The index at the end of an MCAP file says which channels each chunk has. Logs without an index, unfinished or damaged
-ones, are read whole, and a `LogWarning` says why.
+The index at the end of an MCAP file lists the channels of each chunk. A log without an index (unfinished or damaged)
+is read whole, and a `LogWarning` gives the reason.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from gtsam_rwhec.fleet.stores import count_bytes, counted_bytes, local_path, rea
 from gtsam_rwhec.logs.mcap_file import FAULTS, MAGIC, RECORD, read_index
 from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
-#: Bytes. A file on disk that is smaller is read where it is, whatever is in it.
+#: Bytes. A smaller file on disk is never copied.
 SMALL = 64 << 20
-#: A file on disk is read where it is unless its needed chunks have less than this share of it: the stages go through
-#: a log several times, and open every chunk each time.
+#: A file on disk is copied only if its needed chunks are less than this share of it. A copy saves time since the
+#: stages read a log several times and open every chunk each time.
 SHARE = 0.5
-#: Bytes between two chunks are read with them, in one request, if they are less than this share of what is before.
+#: A gap between two chunks is read with them in one request if it is less than this share of the bytes before it.
 GAP_SHARE = 0.05
-#: Bytes of one request, and of the requests that are under way together.
+#: The most bytes of one request, and of all requests at the same time.
 REQUEST, TOGETHER = 8 << 20, 32 << 20
-#: This library's own metadata begin with this word; others are not read.
+#: The names of this library's metadata begin with this word; other metadata are not read.
 _OWN = "gtsam_rwhec."
-#: These files are written beside the log by the stages.
+#: The stages write these files beside the log.
 _OF_STAGES = ("detected.mcap", "calibration.mcap")
 
 
 class LocalCopy(NamedTuple):
-    """A log on this machine's disk: the file where it was there, or a copy; and the bytes that were read for it."""
+    """A log on this machine's disk (the file itself or a copy), and the bytes that were read for it."""
 
     path: Path
     bytes_read: int
@@ -53,7 +53,7 @@ _Request: TypeAlias = tuple[int, int, list[tuple[int, int]]]
 
 @dataclass(frozen=True)
 class Needed:
-    """What is needed of a log, by its index: schemas and channels, statistics, chunks and metadata."""
+    """The needed parts of a log, from its index: schemas and channels, statistics, chunks and metadata."""
 
     descriptions: tuple[McapRecord, ...]
     statistics: Statistics
@@ -62,14 +62,14 @@ class Needed:
 
     @property
     def chunk_bytes(self) -> int:
-        """Bytes of the chunks, as they are stored."""
+        """Bytes of the chunks as stored (compressed)."""
         return sum(chunk.chunk_length for chunk in self.chunks)
 
 
 def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> LocalCopy:
-    """A log on disk that has all messages of some topics, and may have others.
+    """A log on disk that has all messages of some topics, and possibly others.
 
-    With ``/tf`` or ``/tf_static`` among the topics all topics of transforms are meant. A copy is made in `folder`.
+    ``/tf`` or ``/tf_static`` stand for all topics of transforms. A copy is made in `folder`.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> Loc
 
 
 def needed_of(url: str, size: int, topics: Collection[str]) -> Needed | str:
-    """What a log of `size` bytes has of some topics, by its index; or why the index does not tell."""
+    """The parts of a log of `size` bytes with some topics, from its index; or why the index cannot be used."""
 
     def read(offset: int, length: int) -> bytes:
         return read_ranges(url, [(offset, min(size, offset + length))])[0]
@@ -121,7 +121,7 @@ def needed_of(url: str, size: int, topics: Collection[str]) -> Needed | str:
         for number, channel in summary.channels.items()
         if channel.topic in topics or (with_tf and _is_tf(channel, summary.schemas.get(channel.schema_id)))
     }
-    # A recorder that writes no index of messages does not say what is in a chunk.
+    # Without an index of messages nothing says which channels a chunk has.
     chunks = [
         chunk
         for chunk in summary.chunk_indexes
@@ -143,7 +143,7 @@ def _is_tf(channel: Channel, schema: Schema | None) -> bool:
 
 
 def _copied(url: str, needed: Needed, copy: Path) -> str:
-    """Write the needed part; why it could not be, where the index does not tell the truth."""
+    """Write the needed part; if the index is wrong, return the reason."""
     places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in needed.chunks]
     extras = [(extra.offset, extra.length) for extra in needed.metadata]
     with _written(copy) as stream:
@@ -178,7 +178,7 @@ def _copied_whole(url: str, size: int, copy: Path) -> None:
 
 
 def _parts(url: str, places: list[tuple[int, int]]) -> Iterator[bytes]:
-    """The bytes of places (offset, length), in their order, by few requests."""
+    """The bytes of places (offset, length), in their order, with few requests."""
     for group in _together(_joined(places)):
         for (start, _, members), data in zip(group, read_ranges(url, [each[:2] for each in group]), strict=True):
             for offset, length in members:
@@ -186,7 +186,7 @@ def _parts(url: str, places: list[tuple[int, int]]) -> Iterator[bytes]:
 
 
 def _joined(places: list[tuple[int, int]]) -> list[_Request]:
-    """Requests for places, of which those that lie close together are one."""
+    """Requests for places; places close together share one request."""
     found: list[_Request] = []
     for offset, length in places:
         if found:
@@ -200,7 +200,7 @@ def _joined(places: list[tuple[int, int]]) -> list[_Request]:
 
 
 def _together(requests: list[_Request]) -> Iterator[list[_Request]]:
-    """Requests that travel together, of few bytes, so that memory is bounded."""
+    """Groups of requests to send together; their size is limited, so that memory is limited."""
     group: list[_Request] = []
     size = 0
     for request in requests:
@@ -214,7 +214,7 @@ def _together(requests: list[_Request]) -> Iterator[list[_Request]]:
 
 
 class McapCopy:
-    """Writes an MCAP file of chunks and metadata of another one, byte for byte, with an index of its own."""
+    """Writes an MCAP file of chunks and metadata copied byte for byte from another file, with a new index."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self._at = stream, 0
@@ -224,8 +224,8 @@ class McapCopy:
         self._write_record(Header(profile="", library="gtsam-rwhec"))
 
     def chunk(self, index: ChunkIndex, record: bytes) -> None:
-        """Write a chunk. Its index of messages is not copied: readers that need it find that there is none."""
-        # The numbers of its channels stay, as they say what is in it.
+        """Write a chunk without its index of messages."""
+        # Keep the channels' numbers: they say which channels the chunk has.
         offsets = dict.fromkeys(index.message_index_offsets, 0)
         self._chunks.append(
             replace(index, chunk_start_offset=self._at, message_index_offsets=offsets, message_index_length=0)
