@@ -24,6 +24,8 @@ from gtsam_rwhec.problem.measurements import Pair
 
 #: Corners whose median error is above this, pixels, do not belong to the poses.
 FARTHEST_PX = 30.0
+#: Corners of an image that lie closer together, pixels, have no shape.
+ONE_PLACE_PX = 1.0
 #: A frame with a larger deviation is not determined: rad, and times the largest distance of a corner from its camera.
 ROTATION_RAD, TRANSLATION_OF_DISTANCE = 0.5, 10.0
 
@@ -266,6 +268,20 @@ LENS_CURE = (
     "check D, its order and its model, state another one (k3 or the rational model, equidistant, unified), or leave "
     "such corners out (nan)"
 )
+
+
+def check_spread(stacks: tuple[Stack, ...]) -> None:
+    """UnderdeterminedError where in every image of a sensor all corners of a target are on one pixel."""
+    faults = []
+    for stack in stacks:
+        seen = np.where(stack.known[..., None], stack.pixels, np.nan)
+        if (np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1)).max() < ONE_PLACE_PX:
+            faults.append(f"{stack.sensor} to {stack.target}")
+    if faults:
+        raise UnderdeterminedError(
+            f"the images do not determine the pose of {', '.join(faults)}: in each image all corners are within "
+            f"{ONE_PLACE_PX:g} pixel; give the corners that were measured, in the target's order"
+        )
 
 
 def check_rays(stacks: tuple[Stack, ...], options: CornerOptions) -> None:

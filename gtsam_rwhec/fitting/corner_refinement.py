@@ -21,6 +21,7 @@ from gtsam_rwhec.fitting.corner_checks import (
     check_names,
     check_options,
     check_rays,
+    check_spread,
     farthest,
     few_corners,
     findings_of_images_left_out,
@@ -114,6 +115,7 @@ def refine_corners(
     check_clocks(options, observations)
     model, point, noise, cameras = _stated(observations, X, Y, options)
     priors, first = model.camera_priors, model.camera_of
+    check_spread(model.stacks)
     check_rays(model.stacks, options)
     _check_start(model, point)
     settled = _settled(model, point, noise, options, tell)
