@@ -11,7 +11,7 @@ from gtsam_rwhec.files.optional_packages import extra_named
 
 
 def main() -> None:
-    """Run the command; without the extra ``cli`` it ends in the words that name it."""
+    """Run the command; without the extra ``cli`` it ends with a message that names this extra."""
     try:
         with extra_named():
             from gtsam_rwhec.cli.app import main

@@ -1,4 +1,4 @@
-"""The command ``gtsam-rwhec``: its subcommands put together."""
+"""The command ``gtsam-rwhec`` with all its subcommands."""
 
 from __future__ import annotations
 

@@ -42,9 +42,9 @@ class Remark(str):
 
 @dataclass
 class Pace:
-    """How fast a counted stage goes, from when it was first told."""
+    """The speed of a counted stage since its first report."""
 
-    #: begun_s, begun_done: time, and count, when the stage was first told: what an earlier run had done takes no time
+    #: begun_s, begun_done: time and count at the first report: the work of an earlier run takes no time
     begun_s: float
     begun_done: int
 

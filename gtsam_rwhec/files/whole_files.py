@@ -114,7 +114,7 @@ def why_not_writable(path: str | Path) -> str:
 
 
 def appending_stream(path: str | Path) -> BinaryIO:
-    """A stream that adds to the end of a file. What it is told must itself show whether it is whole.
+    """A stream that appends to a file. The written data must themselves show whether they are complete.
 
     Raises
     ------

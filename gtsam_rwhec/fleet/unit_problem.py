@@ -25,7 +25,7 @@ from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
 
-#: Pixels: the standard deviation of a corner where the rig file states none, as for one log.
+#: Pixels: the default standard deviation of a corner, the same as for one log.
 CORNER_PX = 0.1
 #: A message names at most this many contradictions.
 MOST_NAMED = 10
@@ -41,19 +41,19 @@ class UnitLog:
 
     @property
     def facts(self) -> LogFacts:
-        """Of the log."""
+        """The facts about the log."""
         return self.partial.facts
 
 
 @dataclass(frozen=True, eq=False)
 class UnitProblem:
-    """The problem of a unit, and what its rig files state beside it."""
+    """The problem of a unit, with the clocks and the noise that its rig files state."""
 
     problem: Problem
     carrier_noise: CarrierNoise | None
     estimated: tuple[str, ...]  #: Sensors whose clocks are to be estimated along `path`
     path: Trajectory | None
-    log_of: dict[Pair, np.ndarray]  #: by (target, sensor): The place of each measurement's log among the unit's
+    log_of: dict[Pair, np.ndarray]  #: by (target, sensor): The index of each measurement's log in the unit
 
 
 def sensor_name(robot: str, sensor: str) -> str:
@@ -62,7 +62,7 @@ def sensor_name(robot: str, sensor: str) -> str:
 
 
 def unit_problem(logs: Sequence[UnitLog], rigs: Mapping[str, Rig], *, at_site: bool) -> UnitProblem:
-    """The problem of logs in order of time.
+    """The problem of a unit, from its logs in order of time.
 
     At a site several robots are solved together, each with carriers of its own: their clocks are not estimated.
 
@@ -109,14 +109,14 @@ def unit_problem(logs: Sequence[UnitLog], rigs: Mapping[str, Rig], *, at_site: b
 
 
 def _common_offsets(logs: Sequence[UnitLog], clocks: Sequence[str]) -> dict[str, float]:
-    """One time offset, seconds, for each sensor whose clock is estimated: the mean of what the logs' rotations tell."""
+    """One time offset, seconds, for each sensor whose clock is estimated: the mean of the logs' offsets."""
     told = {name: [log.facts.cleaning.time_offsets_s.get(name) for log in logs] for name in clocks}
     known = {name: [offset_s for offset_s in each if offset_s is not None] for name, each in told.items()}
     return {name: float(np.mean(each)) for name, each in known.items() if each}
 
 
 def _at_offsets(log: PartialResult, common_s: Mapping[str, float]) -> Mapping[Pair, PairMeasurements]:
-    """The measurements of a log with A at common time offsets in place of those at which it was taken."""
+    """The measurements of a log, with A interpolated at the common time offsets instead of the log's own."""
     if log.path is None or not common_s:
         return log.pairs
     path = Trajectory.of(*log.path, "the carriers' path of a log")
@@ -140,7 +140,7 @@ def _add(problem: Problem, pair: Pair, one: PairMeasurements, rig: Rig, noise_is
 
 
 def _joined(paths: list[tuple[np.ndarray, Array]]) -> Trajectory:
-    """One path of several logs, in order of time; of two poses at a stamp the first is taken."""
+    """The paths of several logs as one, in order of time; the first of two poses with the same stamp counts."""
     stamps, first = np.unique(np.concatenate([stamps for stamps, _ in paths]), return_index=True)
     return Trajectory.of(stamps, np.concatenate([T for _, T in paths])[first], "the carriers' paths of the logs")
 
@@ -150,7 +150,7 @@ STATED, OF_CORNERS, UNKNOWN = "stated", "from corners", "detections without corn
 
 
 def check_logs(logs: Sequence[UnitLog], rig: Rig) -> str:
-    """How the noise of logs is known; a RigError where they know it in different ways, or cameras differ."""
+    """How the logs know their noise; a RigError if the logs differ in this or in their cameras."""
     found: list[str] = []
     cameras: dict[str, UnitLog] = {}
     for log in logs:
@@ -179,13 +179,13 @@ def _noise_of(log: PartialResult, rig: Rig) -> str:
 
 
 def check_rigs(rigs: Mapping[str, Sequence[tuple[str, Rig]]]) -> None:
-    """Refuse rig files that say different things of one thing; each with its URL, by robot.
+    """Refuse rig files (by robot, each with its URL) that contradict each other.
 
     Raises
     ------
     RigError
-        A target has another type or size in one than in the other, a sensor of a robot other intrinsics, the carriers
-        other frames, or sizes and noise are treated otherwise; all are named.
+        Two rig files differ in the type or size of a target, the intrinsics of a robot's sensor, the carriers' frames,
+        or the treatment of sizes and noise. The message names all differences.
     """
     found: list[str] = []
     everyone = [(robot, url, rig) for robot, several in rigs.items() for url, rig in several]
@@ -226,12 +226,12 @@ def _difference(one: object, other: object) -> str:
     return ", ".join(f"{key}: {before.get(key)} and {now.get(key)}" for key in sorted(keys)[:3])
 
 
-#: Logs disagree where a frame's changes are this many times what noise explains, by chance in one case of a million.
+#: Logs disagree on a frame if its changes are this many times the noise, and less likely than this by chance.
 TIMES, CHANCE = 2.0, 1e-6
 
 
 def disagreeing_logs(found: Calibration, measured: UnitProblem, logs: Sequence[str]) -> tuple[Finding, ...]:
-    """A finding where a frame is elsewhere in one of the logs (URLs) than in the others, by more than the noise.
+    """A finding if frames are elsewhere in one of the logs (URLs) than in the others, by more than the noise.
 
     With the information M = sum J' C^-1 J of a log, its measurements alone would move a frame by
     d = M^-1 sum J' C^-1 r. About the logs' mean of d, sum (d - mean)' M (d - mean) is a chi-square where they agree.

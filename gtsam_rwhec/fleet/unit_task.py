@@ -1,4 +1,4 @@
-"""One robot, or the robots of a site, calibrated from the measurements of their logs; result files and rows."""
+"""Calibrate one robot, or the robots of a site, from the measurements of their logs; write result files and rows."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Each = Literal["robot", "day", "log"]
 
 @dataclass(frozen=True)
 class UnitTask:
-    """What one task solves."""
+    """The robot, site or log that one task solves."""
 
     name: str  #: The robot, the site, or the log's name
     site: str | None  #: The site whose robots are solved together
@@ -56,7 +56,7 @@ class UnitTask:
 
     @property
     def key(self) -> str:
-        """A checksum of all that the answer depends on."""
+        """A checksum of everything that the answer depends on."""
         rigs = [(robot, source.sha256) for robot, source in self.rigs]
         logs = [(robot, receipt.file) for robot, receipt in self.logs]
         parts = [FORMAT_VERSION, version("gtsam-rwhec"), self.name, self.site, self.each, rigs, logs]
@@ -64,13 +64,13 @@ class UnitTask:
 
     @property
     def file(self) -> str:
-        """The place of the answer below the output."""
+        """The path of the answer in the output."""
         return f"{FOLDER}/{self.key}.answer"
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a task's file holds: rows, and the content of a result file for each unit."""
+    """The content of a task's file: rows, and a result file's content for each unit."""
 
     rows: tuple[RobotRow, ...]
     results: dict[str, str]
@@ -91,7 +91,7 @@ class Answer:
 
 
 def result_file(unit: str) -> str:
-    """The place of a unit's result file below the output."""
+    """The path of a unit's result file in the output."""
     return f"robots/{unit}/result.json"
 
 
@@ -118,7 +118,7 @@ def solve_unit(task: UnitTask, output: str) -> Receipt:
 
 
 def write_results(output: str, answer: Answer) -> None:
-    """Write the result files of an answer where they are not there, or are those of another run."""
+    """Write the result files of an answer that are missing or are those of another run."""
     for unit, text in answer.results.items():
         write_once(below(output, result_file(unit)), text.encode("utf-8", "surrogateescape"))
 
@@ -148,7 +148,7 @@ def _answer(task: UnitTask, output: str, folder: Path) -> Answer:
 
 
 def joined_rig(rigs: Sequence[Rig]) -> Rig:
-    """One rig with the sensors and targets of all of a robot's rig files, which agree (`check_rigs`)."""
+    """One rig with the sensors and targets of all rig files of a robot, which agree (`check_rigs`)."""
     sensors = {name: sensor for rig in reversed(rigs) for name, sensor in rig.sensors.items()}
     targets = {name: target for rig in reversed(rigs) for name, target in rig.targets.items()}
     return rigs[0].model_copy(update={"sensors": sensors, "targets": targets})
@@ -171,7 +171,7 @@ def _read(output: str, robot: str, receipt: Receipt, rig: Rig, *, at_site: bool)
 def calibrated_unit(
     measured: UnitProblem, logs: Sequence[UnitLog], rigs: Mapping[str, Rig], *, at_site: bool
 ) -> tuple[Calibration, LogFields]:
-    """The calibration of a unit with what its logs say against it, and their history.
+    """The calibration of a unit with its logs' findings and history.
 
     `rigs` are by robot. `at_site` says that several robots are solved together.
     """
@@ -209,7 +209,7 @@ def calibrated_unit(
 
 
 def _with_offsets(history: LogFields, found: Calibration) -> LogFields:
-    """The history with the whole offsets of clocks: that of cleaning, and what the refinement added."""
+    """The history with the total clock offsets: those of cleaning plus those of the refinement."""
     refined = found.refined
     if not isinstance(refined, Refined) or not refined.time_offsets_s:
         return history
@@ -225,7 +225,7 @@ def _with_offsets(history: LogFields, found: Calibration) -> LogFields:
 
 
 def _of_clocks(history: LogFields) -> tuple[Finding, ...]:
-    """That clocks were estimated by rotations alone, which standard deviations of poses do not hold."""
+    """A finding if clocks were estimated from rotations alone: the poses' covariance does not include their errors."""
     sigmas = history.cleaning.coarse_sigma_s
     if not sigmas:
         return ()
@@ -246,7 +246,7 @@ def _row(
     found: Calibration,
     history: LogFields,
 ) -> RobotRow:
-    """The row of one robot, with the costs of its logs; failed logs and the cost of the answer are added later."""
+    """The row of one robot with the costs of its logs. Failed logs and the answer's cost are added later."""
     logs = [log for log in of if log.robot == robot]
     own = sensor_name(robot, "") if site is not None else ""
     pairs = [pair for pair in measured.problem.pairs if pair.sensor.startswith(own)]

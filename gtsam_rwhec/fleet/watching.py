@@ -1,4 +1,4 @@
-"""Drift of each robot of a fleet over time: a control chart for each, on the rows of the fleet's runs."""
+"""Find drift in a fleet: one control chart for each robot, from the rows of the fleet's runs."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from gtsam_rwhec.results.common_quantities import Movement
 from gtsam_rwhec.results.control_chart import RATE, Alarm, Chart, NightTest
 from gtsam_rwhec.results.nights import FoundSpread, Nights, SpreadPool
 
-#: Verdicts "do not use" for these grounds alone still say what is determined.
+#: Rows that are "do not use" only for these grounds still count in what they determine.
 DETERMINES_SOMETHING = {Ground.NOT_UNIQUE, Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS}
-#: An eigenvalue of a covariance's correlations is at least this: below is rounding.
+#: Smaller eigenvalues of a correlation matrix are rounding error and are set to this.
 ROUNDING = 1e-12
-#: A correlation matrix that is negative by more is not one.
+#: A matrix with an eigenvalue below minus this is not a correlation matrix.
 NEGATIVE = 1e-9
 #: Names of a tangent's numbers.
 AXES = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
@@ -43,16 +43,16 @@ AXES = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z
 
 @dataclass(frozen=True, eq=False)
 class RobotFrames:
-    """The frames of a robot over all its nights, and where each is in the chart's numbers."""
+    """The frames of a robot over all its nights, and the place of each frame in the chart's numbers."""
 
-    #: By name; a name that is a sensor in some nights and a target in others has "(target)" after it for these
+    #: By name. If a name is a sensor in some nights and a target in others, the target has "(target)" after it
     groups: dict[str, slice]
     reference: dict[str, Array]  #: The pose of its first night
     unit: Array  #: (m,): the deviation of each number at its first night, rad and m: the numbers are multiples of it
 
     @staticmethod
     def of(rows: Sequence[RobotRow]) -> RobotFrames:
-        """Of rows that can be used, in order of time."""
+        """Make it from usable rows in order of time."""
         reference: dict[str, Array] = {}
         units: dict[str, Array] = {}
         names = _names(rows)
@@ -80,7 +80,7 @@ class RobotFrames:
         xi = se3.logmap(se3.inverse(before) @ np.stack([frame.T for frame in row.frames]))
         inward = se3.right_jacobian_inverse(xi)
         variances = np.diagonal(row.covariance).reshape(-1, 6)
-        # A rotation that is free leaves nothing linear; a number without variance was given, not found.
+        # With a free rotation nothing is linear. A number without variance was given, not estimated.
         known = (variances > 0.0) & np.isfinite(variances) & np.isfinite(variances[:, :3]).all(axis=1, keepdims=True)
         for i, name in enumerate(called):
             at = self.groups[name]
@@ -93,13 +93,13 @@ class RobotFrames:
         return Night(row.begin_ns, x / self.unit, _information(C, rows), np.where(np.outer(rows, rows), C, 0.0), rows)
 
     def movement(self, name: str, before: Array, change: Array) -> Movement:
-        """How a frame moved by a change (6,) of the numbers that it had before."""
+        """The movement of a frame for a change (6,) of its numbers."""
         unit = self.unit[self.groups[name]]
         T = gtsam.Pose3(self.reference[name])
         return Movement.of(T.expmap(unit * before), T.expmap(unit * (before + change)))
 
     def free_of(self, night: Night) -> dict[str, tuple[str, ...]]:
-        """What a night leaves free of frames that it has some of, by name."""
+        """By frame, the numbers that a night leaves free, for frames that it determines in part."""
         found = {}
         for name, rows in self.groups.items():
             seen = night.seen[rows]
@@ -126,7 +126,7 @@ def names_of(rows: Iterable[RobotRow]) -> dict[tuple[str, str], str]:
 
 
 def why_not(row: RobotRow) -> str:
-    """Why a row says nothing of where the frames are; empty where it does."""
+    """Why a row does not determine where the frames are; empty if it does."""
     if row.verdict is None or not row.frames:
         return row.failure or row.reason or "there is no calibration"
     if row.verdict is Verdict.DO_NOT_USE and not set(row.grounds) <= DETERMINES_SOMETHING:
@@ -157,7 +157,7 @@ def _names(rows: Iterable[RobotRow]) -> dict[tuple[str, str], str]:
 
 
 def _without_constant_errors(row: RobotRow) -> Array:
-    """The finite covariances without what all nights share; as they are where they do not hold that much of it."""
+    """The finite covariances minus the errors that all nights share; unchanged if they do not include them."""
     assert row.covariance is not None
     finite: Array = np.where(np.isfinite(row.covariance), row.covariance, 0.0)
     if not row.constant_errors:
@@ -193,12 +193,12 @@ DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """What the charts of a fleet say."""
+    """The control charts of a fleet with their events."""
 
     rate: float  #: False alarms a night of one robot
     events: tuple[Event, ...]  #: In order of time
     robots: dict[str, RobotChart]  #: Robots with at least one night that can be used
-    spread: FoundSpread  #: How the nights scatter beside what their covariances say, from all of them
+    spread: FoundSpread  #: The scatter of all nights compared with their covariances
 
     @property
     def alarms(self) -> tuple[AlarmEvent, ...]:
@@ -207,20 +207,20 @@ class Watched:
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """The robots with an alarm, those with the last one first."""
+        """The robots with an alarm, the latest alarm first."""
         return tuple(dict.fromkeys(alarm.robot for alarm in reversed(self.alarms)))
 
 
 @dataclass(eq=False)
 class RobotChart:
-    """The chart of one robot as it stands, with what it said."""
+    """The chart of one robot: its present state and its past tests."""
 
     number: int
     frames: RobotFrames
     names: dict[tuple[str, str], str]
     chart: Chart
     when_ns: list[int] = field(default_factory=list)  #: Of each night
-    #: Its numbers, in the frames' units; nan in what it does not determine
+    #: Each night's numbers, in the frames' units; nan if the night does not determine a number
     x: list[Array] = field(default_factory=list)
     tests: list[NightTest] = field(default_factory=list)
     alarms: list[AlarmEvent] = field(default_factory=list)
@@ -232,7 +232,7 @@ class RobotChart:
 def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
     """The control charts of all robots, night by night.
 
-    What a night says rests on that night and on earlier ones, so more nights later change no event.
+    The events of a night depend on this night and earlier ones only: later nights do not change them.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
         night = robot.frames.night(row, robot.names)
         said = _night_events(robot, row, night, spread, rate)
         events += said
-        if said and isinstance(said[-1], AlarmEvent):  # what lies across a change says nothing of quiet nights
+        if said and isinstance(said[-1], AlarmEvent):  # differences across a change do not show the noise
             robot.last = [each for each in robot.last if each.when_ns >= said[-1].first_changed_ns]
         fresh += _differences(robot, night)
         robot.last = [*robot.last[-1:], night]
@@ -280,7 +280,7 @@ def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
 
 
 def _one_for_each_time(rows: list[RobotRow]) -> list[RobotRow]:
-    """The rows in order of time, without those whose time a row of the same robot covers that was given later."""
+    """The rows in order of time, without rows that overlap in time with a row of the same robot given later."""
     kept: list[RobotRow] = []
     taken: dict[str, list[tuple[int, int]]] = {}
     for row in reversed(rows):
@@ -296,7 +296,7 @@ def _one_for_each_time(rows: list[RobotRow]) -> list[RobotRow]:
 
 
 def _night_events(robot: RobotChart, row: RobotRow, night: Night, spread: FoundSpread, rate: float) -> list[Event]:
-    """Put a night into a robot's chart, and say what it says."""
+    """Add a night to a robot's chart; return its events."""
     when = row.begin_ns
     assert when is not None
     events: list[Event] = []
@@ -361,7 +361,7 @@ def _alarm_event(robot: RobotChart, row: RobotRow, test: NightTest, alarm: Alarm
 
 
 def _differences(robot: RobotChart, night: Night) -> Sequence[tuple[int, int, Array, Array]]:
-    """The differences of a night from the one before and from the one before that, where both determine the same."""
+    """The differences of a night from the previous one and the one before, if they determine the same numbers."""
     found = []
     for lag, other in enumerate(reversed(robot.last), start=1):
         at = np.flatnonzero(night.seen & other.seen)
@@ -371,12 +371,12 @@ def _differences(robot: RobotChart, night: Night) -> Sequence[tuple[int, int, Ar
     return found
 
 
-#: What the stream calls itself, and the version of its fields.
+#: The stream's format name, and the version of its fields.
 FORMAT, FORMAT_VERSION = "gtsam-rwhec watch", 1
 
 
 def stream(watched: Watched, *, every_night: bool = False) -> Iterator[str]:
-    """The lines of the stream, without line ends; lines of nights only where they are asked for."""
+    """The lines of the stream, without line ends; lines of nights only on request."""
     times = [when for robot in watched.robots.values() for when in (robot.when_ns[0], robot.when_ns[-1])]
     spread = watched.spread
     yield json_line(

@@ -1,8 +1,8 @@
 """What the drive leaves free, and the covariance of the rest (design facts 8, 14 and 24).
 
-H is the information with the windows' motions eliminated, N the part that the noise of the estimated motions alone
-makes of it. A direction is free when its H is no more than its N would be by chance: the ratio follows an F
-distribution. What is given is asked afterwards: it holds a direction or does not.
+H is the information with the windows' motions eliminated. N is the part of H that the noise of the estimated motions
+alone produces. A direction is free if its H is no larger than N can be by chance: the ratio follows an F distribution.
+Afterwards each free direction is compared with the prior knowledge, which may determine it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from gtsam_rwhec.odometry.window_likelihood import SCALE, Layout
 
 #: The probability that a free direction counts as determined: a fleet has many drives.
 SIGNIFICANCE = 1e-6
-#: Information of what is given, per square metre or radian, above which it holds a direction: a deviation of one.
+#: Prior knowledge with more information than this, per square metre or radian, determines a direction.
 HOLDS = 1.0
-#: A component of a free direction that is larger than this part of its largest makes a number infinite.
+#: A variance is infinite if its component of a free direction exceeds this part of the largest component.
 REACHES = 0.02
 #: Ridge, as a part of each diagonal entry, that keeps factorisations of singular information from failing.
 RIDGE = 1e-13
@@ -28,12 +28,12 @@ RIDGE = 1e-13
 
 @dataclass(frozen=True)
 class Freedom:
-    """What is free, and the information of the rest."""
+    """The free directions, and the information about the others."""
 
     by_data: Array  #: (p, f): directions that the drive leaves free, in units of 1 rad, metres, a scale times e
-    left: Array  #: (p, l): those of them that what is given leaves free too
-    information: Array  #: (p, p): h - N where the drive tells, plus that of what is given
-    score: Array  #: (p, p): h plus that of what is given: the covariance of the gradient
+    left: Array  #: (p, l): directions that prior knowledge leaves free too
+    information: Array  #: (p, p): H - N along determined directions, plus that of prior knowledge
+    score: Array  #: (p, p): H plus that of prior knowledge: the covariance of the gradient
     weakest: float  #: The smallest ratio of information over its threshold
 
     def complement(self) -> Array:
@@ -41,7 +41,7 @@ class Freedom:
         return _complement(self.left)
 
     def covariance(self) -> Array:
-        """(p, p), with no part along what is left free."""
+        """(p, p), zero along the directions that are left free."""
         Z = self.complement()
         inner = Z.T @ self.information @ Z
         inverse = np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner)))
@@ -52,12 +52,13 @@ class Freedom:
 def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, squares: float, spare: float) -> Freedom:
     """Test every direction.
 
-    ``possible`` is N if the noise is as large as it may be: a direction that this explains is free. ``squares``: how
-    many squares of noise a direction's information would sum; ``spare``: equations that tell the noise.
+    ``possible`` is N for the largest plausible noise: a direction that it explains is free. ``squares`` and
+    ``spare`` are the F distribution's degrees of freedom: squares of noise in a direction's information, and
+    spare equations, which determine the noise.
     """
     data = np.setdiff1d(np.arange(layout.size), layout.ground)
     Hd, Nd, Pd = (each[np.ix_(data, data)] for each in (H, N, possible))
-    # Clocks have a weak prior, so that a clock that the drive does not tell is not what a pose is free by.
+    # A weak prior on clocks: a clock that the drive does not determine must not make a pose free.
     clocks = layout.at[layout.open[:, 7], 7]
     of_clocks = np.zeros(layout.size)
     of_clocks[clocks] = np.diagonal(given)[clocks]
@@ -85,7 +86,7 @@ def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, s
 
 
 def _left(by_data: Array, given: Array, layout: Layout) -> Array:
-    """The free directions that what is given does not hold; the ground's own unknowns are eliminated."""
+    """The free directions that prior knowledge does not determine; the ground's unknowns are eliminated."""
     if not by_data.shape[1]:
         return by_data
     g = layout.ground
@@ -110,7 +111,7 @@ def _complement(directions: Array) -> Array:
 
 
 def seven_each(directions: Array, layout: Layout) -> Array:
-    """Directions (p, l) as identifiability has them, (7 (m - 1) + 1, l): each sensor's pose and own scale; a zero."""
+    """Directions (p, l) in identifiability's order, (7 (m - 1) + 1, l): each sensor's pose and scale; a zero."""
     padded = np.vstack([directions, np.zeros((1, directions.shape[1]))])
     rows = padded[layout.at[1:, : SCALE + 1].ravel()]
     result: Array = np.vstack([rows, np.zeros((1, directions.shape[1]))])

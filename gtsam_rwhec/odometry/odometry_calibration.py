@@ -34,7 +34,7 @@ from gtsam_rwhec.odometry.window_solution import FEWEST, Answer, Task, solve_win
 from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
 from gtsam_rwhec.runs.odometry_cleaning import gated
 
-#: A time offset that the drive does not tell stays within about so many seconds of the first guess.
+#: If the drive does not determine a time offset, it stays within about this many seconds of the first guess.
 CLOCK_SIGMA_S = 0.05
 #: The windows are made again with new offsets until these change by less than this, s, and so often at most. What is
 #: left is in the residuals to first order.
@@ -63,7 +63,7 @@ def calibrate_odometries(
     """Find where sensors are on a vehicle, each of which knows only its own motion.
 
     All sensors are solved at once (design fact 24): the joint cost is certified, then the exact likelihood of all
-    windows is refined, with the vehicle's motion as unknowns. What the drive leaves free is said.
+    windows is refined, with the vehicle's motion as unknowns. The result names what the drive leaves free.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def _check_turning(samples: list[SampledTrack], options: OdometryOptions, varian
 
 
 def _check_agreement(answer: Answer, names: tuple[str, ...]) -> None:
-    """A track of another drive fits nothing but a noise as large as its turns."""
+    """Refuse a track of another drive: its estimated noise is as large as its turns."""
     windows = answer.windows
     square = (windows.rotation_vectors() ** 2).sum(axis=2) / 3.0
     for k, name in enumerate(names):

@@ -33,7 +33,7 @@ def calibration_of(
     removed: dict[str, tuple[Removed, ...]],
     origin_ns: int,
 ) -> OdometryCalibration:
-    """All that a person is told."""
+    """The record of the calibration, from the answer."""
     names, layout, state = task.names, task.layout, answer.fit.state
     sensors = (reference, *(name for name in names if name != reference))
     change, T, order = _in_frame_of(reference, task, state.T)
@@ -213,7 +213,7 @@ def _residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[f
 def _doubts(
     answer: Answer, task: Task, tracks: Sequence[OdometryTrack], clocks: Sequence[Clock], sigmas: dict[str, float]
 ) -> tuple[str, ...]:
-    """The sentences; none where all is well. ``sigmas``: standard deviations of the clocks, s."""
+    """Sentences about doubtful results; none if there are no doubts. ``sigmas``: deviations of the clocks, s."""
     said: list[str] = []
     sizes = _residual_sizes(answer, task.names)
     for k, name in enumerate(task.names):
@@ -254,7 +254,7 @@ def _doubts(
 
 
 def _contradictions(answer: Answer, task: Task) -> tuple[str, ...]:
-    """Tracks that do not fit at all, and what distances move: the certified answer is without them."""
+    """Sentences about tracks that do not fit, and about given distances that moved poses from the certified answer."""
     said = [
         f"the motions of {name} do not fit the other sensors': what differs is the same from window to window, and "
         f"{100 * part:.0f} % of the motion itself"
@@ -295,7 +295,7 @@ def _apart(answer: Answer, task: Task, k: int, sigma: Array) -> str:
 
 
 def _remarks(task: Task) -> tuple[str, ...]:
-    """What was assumed."""
+    """Sentences about what was assumed."""
     said: list[str] = []
     if len(task.names) == 2 and not task.stated.any():
         said.append(
@@ -318,7 +318,7 @@ def _remarks(task: Task) -> tuple[str, ...]:
 
 
 def _misfit(answer: Answer, k: int) -> float:
-    """The part of a sensor's motion that its residuals are, where they are large and alike, or zero."""
+    """Residuals as a share of the sensor's motion, if they are large and correlated; else zero."""
     windows, r = answer.windows, answer.fit.linear.r[k]
     motion = se3.logmap(windows.M[k])
     used, found = windows.used[k], 0.0
@@ -344,14 +344,14 @@ def _correlations(answer: Answer, k: int) -> tuple[float, float]:
     return next(shares), next(shares)
 
 
-#: An answer that costs at most so much more than the best fits alike: two standard deviations.
+#: An answer fits equally well if it costs at most this much more than the best: two standard deviations.
 ALIKE = 2.0
 #: Two answers are one if no sensor is further apart than this, metres.
 SAME_M = 1e-3
 
 
 def other_answers(answer: Answer, task: Task, named: Callable[[Array], dict[str, Array]]) -> tuple[OtherAnswer, ...]:
-    """Start from the mirror image of each distance's free shift; keep what fits alike.
+    """Refine again from the mirror image of each distance's free shift; keep answers that fit equally well.
 
     A distance is even in the shift that the drive leaves free: the sensor may be above or below.
     """

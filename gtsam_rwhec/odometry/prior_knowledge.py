@@ -172,7 +172,7 @@ class GivenRows:
     #: (3,): the ground's normal there, as given or as the axis that the vehicle turned about; it points up
     normal: Array
     sigma_normal: float  #: rad
-    #: What time offsets may be off at most, one standard deviation: keeps those that the data do not tell
+    #: Standard deviation of a weak prior on time offsets, which keeps offsets that the data do not determine
     clock_sigma_s: float
 
     @property

@@ -65,7 +65,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class RoleEvidence:
-    """What solving for both roles says."""
+    """The residuals of both roles."""
 
     #: child, parent: the robust fit if the sensors are on the child of the poses, or on their parent; None without an
     #: answer
@@ -108,7 +108,7 @@ class RoleEvidence:
         return {name: 1.0 / scale for name, scale in fit.scale.items() if scale > 0.0}
 
     def in_words(self, parent: str, child: str) -> str:
-        """The figures of both, in one phrase."""
+        """The residuals of both roles, in one phrase."""
         return (
             f"solved both ways over {self.images} measurements, the median residual is {_figures(self.child)} with the "
             f"cameras on {child}, and {_figures(self.parent)} with them on {parent}"
@@ -132,7 +132,7 @@ def evidence_of_roles(seen: Iterable[Seen]) -> RoleEvidence:
 
 
 def _product(fit: TrialFit) -> float:
-    """Of both residuals, the translations in true lengths."""
+    """The product of both residuals, the translations in true lengths."""
     return max(fit.residual.rotation_rad, 1e-6) * max(_translation_m(fit), 1e-9)
 
 
