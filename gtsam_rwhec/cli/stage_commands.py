@@ -137,7 +137,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
     anyway: AnywayOption = False,
 ) -> ExitStatus:
-    """Last stage: write a launch file, tf, URDF, cameras (Kalibr, ROS, OpenCV, COLMAP) and plots from a solved log."""
+    """Last stage: write a launch file, tf, URDF, cameras (Kalibr, ROS, OpenCV, COLMAP) from a solved log."""
     if rw.odometry.is_of_odometries(None, solved):
         with StageDisplay() as stage:
             for path in rw.odometry.export_odometries(solved, output, anyway=anyway, progress=stage):

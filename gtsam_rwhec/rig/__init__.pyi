@@ -1,5 +1,4 @@
-# Rig files, read and written.
-# A calibrated rig, for export and for plots.
+# A calibrated rig, for export and for figures.
 from .rig_frames import CalibratedFrame as CalibratedFrame
 from .rig_frames import CameraLink as CameraLink
 from .rig_frames import RigFrames as RigFrames

@@ -1,4 +1,4 @@
-"""The calibrated frames that are exported and plotted: poses on the carriers, intrinsics, time offsets, topics."""
+"""The calibrated frames that are exported and drawn: poses on the carriers, intrinsics, time offsets, topics."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The sections of a rig file, field by field; `target_sections` and `intrinsics_section` have the others.
+"""The sections of a rig file, field by field; `target_sections` and `odometry_sections` have the others.
 
 No value is converted, and an unknown key is an error. What a key is, its example, and its unit where its name does not
-end with it stand beside the field: the reference (`reference`) and the JSON Schema (`json_schema`) are made of them.
+end with it stand beside the field: the reference and the JSON Schema (`rig_reference`) are made of them.
 """
 
 from __future__ import annotations

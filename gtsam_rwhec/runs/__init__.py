@@ -1,4 +1,4 @@
-"""From a log and a rig file to a calibration: detect, clean, solve; each stage reads the log of the one before it."""
+"""From a log and a rig file to a calibration: detect, clean, solve, export."""
 
 from gtsam_rwhec.files.optional_packages import lazy_names
 

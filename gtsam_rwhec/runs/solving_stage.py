@@ -241,7 +241,7 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
 
 
 def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progress | None) -> Refined:
-    """A refinement of measurements that were misread, or of which the noise is not known: for the plots alone."""
+    """A refinement of measurements that were misread, or of which the noise is not known: for figures alone."""
     how = RefineOptions(
         noise="given" if options.noise == "given" else "estimate",
         carrier_noise=options.carrier_noise,
