@@ -24,7 +24,7 @@ from gtsam_rwhec.geometry.poses import Array
 LEAST_VIEWS, LEAST_CORNERS = 8, 8
 #: Of more views, this number is taken, evenly over the track.
 MOST_VIEWS = 40
-#: Nominal intrinsics: the focal length's share, and pixels of the principal point.
+#: Prior of nominal intrinsics: focal length (relative), principal point (pixels).
 NOMINAL_SHARE, NOMINAL_PX = 0.03, 30.0
 #: Far from what is stated, the prior is this many times as wide, and coefficients of distortion have this deviation.
 WIDER, DISTORTION = 20.0, 0.5

@@ -170,7 +170,7 @@ class Bundle:
         return np.concatenate([tag.corners() for tag in self.tags])
 
 
-#: Where a larger dot can be, as printed.
+#: Corners of a printed circle grid that can have the larger dot.
 CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 
 

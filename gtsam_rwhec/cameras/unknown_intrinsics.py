@@ -287,7 +287,7 @@ def _best(views: Sequence[tuple[Array, Array]], size: tuple[int, int], lens: Len
 
 
 def _is_usual(fit: _Fit, corners: int) -> bool:
-    """Whether nothing speaks for a fisheye."""
+    """Whether the lens is not wide and the fit is good."""
     camera = fit.camera
     reach = np.degrees(np.arctan2(0.5 * np.hypot(camera.width, camera.height), camera.K[0, 0]))
     return bool(reach < WIDE_DEG and fit.squares.sum() < corners * BADLY_PX**2)

@@ -74,7 +74,7 @@ def _in_order(gray: Gray, board: Checkerboard, level: int) -> Iterator[tuple[Arr
     for members in groups_of(seen.places, corners):
         for lattice in lattices(seen, members, corners):
             for grid, goes_on in boards_in(lattice, seen.places, board.rows, board.columns):
-                # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
+                # Pixel centres are integers: halved once, the first pixel's centre is at 1/2.
                 yield grid * 2**level + 0.5 * (2**level - 1), goes_on
 
 

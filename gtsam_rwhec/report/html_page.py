@@ -95,11 +95,11 @@ def _base64(content: bytes) -> str:
 
 
 def _script_json(value: Any) -> str:
-    """JSON that may stand inside a script element: no sign ends it."""
+    """JSON for a script element: `<`, `>` and `&` are escaped."""
     text = json.dumps(value, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _signs(words: Words) -> int:
-    """How many signs words have as they are read."""
+    """The number of characters that a reader sees."""
     return sum(len(piece if isinstance(piece, str) else piece.text) for piece in pieces_of(words))

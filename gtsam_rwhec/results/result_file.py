@@ -343,7 +343,7 @@ def result_json(
 
 
 def _encoded(tree: dict[str, Any]) -> bytes:
-    """A tree as text; a name may have half a character, which is a `ValueError`."""
+    """JSON in UTF-8. Raises `ValueError` if a name has a lone surrogate."""
     return (json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
 

@@ -217,7 +217,7 @@ def _content(line: bytes) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """An object in JSON's types."""
+    """Convert an object to types that JSON has."""
     if isinstance(value, np.ndarray):
         data = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
         return {"array": base64.b64encode(data.tobytes()).decode(), "dtype": data.dtype.str, "shape": value.shape}

@@ -291,7 +291,7 @@ def _views(
 ) -> list[tuple[Array, Array]]:
     """Corners in their plane (n, 3) and pixels (n, 2) of every flat target that was read, in the images' order.
 
-    `also` are the rejections that do not matter.
+    Rejected detections are skipped, except for the rejections `also`.
     """
     views = []
     images = [found[i].found for i in sorted(found)]
