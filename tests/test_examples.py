@@ -12,12 +12,12 @@ from places import EXAMPLES
 
 #: Arguments that make it quick, and what must be in its output.
 RUNS = {
-    "certify_a_rig": ([], "Certified globally optimal"),
+    "certify_a_rig": ([], r"Proven: [^$]*certified: cost 368\.6"),
     "noise_sweep": (["--runs", "2", "--degrees", "2", "60"], r"shared\s+20\s+2\s+100"),
     "tightness_neighbourhood": (["--problems", "2", "--step", "45"], "all constraints: the first loss at"),
-    "sparsity": (["--leaves", "2", "4"], r"8 X: ([\d.]+)% of Q' filled before, \1% after"),
+    "sparsity": (["--leaves", "2", "4"], r"8 Y: .* 8 to 36\n8 X: .* 8 to 8\n"),
     "certify_other_solver": (["--runs", "4"], "After local descent: certified"),
-    "covariance_report": ([], r"Not determined: translation of cam_0 along its own y axis[^$]*cam_1 .* free "),
+    "covariance_report": ([], r"Not determined: translation of .*cam_0 along its own y axis[^$]*cam_1 .* free "),
     "log_in_a_viewer": ([], "certified: cost 1"),
     "slam_graph": ([], r"Batch and iSAM2 agree to [\d.]+e-0[4-9] mm"),
 }
@@ -30,6 +30,8 @@ PAPERS = {
     "dq_figure_6": (["--runs", "2"], r"DQConvRlx \| rotation +\| +11.50"),
     "rwhec_tables": (["--runs", "2", "--tables", "5", "--model", "released"], r"Ours .*\| paper .*1\.46 \+- 0\.61"),
 }
+#: They hold the paper's numbers and judge the same runs at 1,000 of each; rwhec_tables prints the tables.
+JUDGES = {"lom_tables", "method_tables", "tables_2_to_5"}
 
 
 def run(name: str, arguments: list[str], folder: Path) -> str:
@@ -64,7 +66,7 @@ def test_all_of_the_papers_are_run_by_one_command() -> None:
     assert listed is not None
     assert set(re.findall(r'"(\w+)"', listed[1])) == set(PAPERS)
     scripts = [p.stem for p in (EXAMPLES / "papers").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")]
-    assert set(scripts) == {*PAPERS, "all"}
+    assert set(scripts) == {*PAPERS, *JUDGES, "all"}
 
 
 def test_the_grid_of_figure_8(utias_folder: Path, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def print_calibration(
     """
     console = report_console() if console is None else console
     if verbose:
-        _print_everything(console, ShownResult.of_answer(calibration, log))
+        _print_everything(console, ShownResult.of_answer(calibration, log), _carrier_noise(calibration.refined))
         return
     refined, solution = calibration.refined, calibration.solution
     free: Sequence[FreeDirection] = () if refined is None else refined.free_directions
@@ -106,8 +106,7 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
         What became of the measurements, if they come from a log.
     """
     console = report_console() if console is None else console
-    noise = Section("noise-of-A", "Noise of the carriers' poses", (Paragraph(_carrier_noise_sentence(refined)),))
-    _print_everything(console, ShownResult.of_answer(refined, log), [noise] if refined.reprojection is None else [])
+    _print_everything(console, ShownResult.of_answer(refined, log), _carrier_noise(refined))
 
 
 def print_solution(
@@ -151,9 +150,10 @@ def print_solution(
 def _print_everything(console: Console, shown: ShownResult, more: Sequence[Section] = ()) -> None:
     """The verdict first, then the sections that have something to say without figures and measurements."""
     sections = [
-        replace(section, blocks=tuple(block for block in section.blocks if not is_absent(block)))
+        replace(section, blocks=blocks, missing="")
         for section in sections_of(shown)
-        if section.blocks and section.name not in ON_THE_PAGE_ONLY
+        if section.name not in ON_THE_PAGE_ONLY
+        if (blocks := tuple(block for block in section.blocks if not is_absent(block)))
     ]
     print_blocks(console, sections[0].blocks)
     print_sections(console, [*sections[1:], *more])
@@ -252,6 +252,13 @@ def scales_and_clocks(refined: Refined) -> list[str]:
             offset = 1e3 * refined.time_offsets_s[owner]
             sentences.append(f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms.")
     return sentences
+
+
+def _carrier_noise(refined: Refined | None) -> list[Section]:
+    """The noise of A that a fit to poses took as true."""
+    if refined is None or refined.reprojection is not None:
+        return []
+    return [Section("noise-of-A", "Noise of the carriers' poses", (Paragraph(_carrier_noise_sentence(refined)),))]
 
 
 def _carrier_noise_sentence(refined: Refined) -> str:

@@ -62,7 +62,7 @@ def determines_section(shown: ShownResult) -> Section:
     if shown.result is None:
         return Section("determines", title, missing=NO_ANSWER)
     known = shown.result.solution.identifiability
-    blocks: list[Block] = [Paragraph(str(known)), *_grid(shown), *_motions(shown)]
+    blocks: list[Block] = [Paragraph(_what_was_measured(shown)), Paragraph(str(known)), *_grid(shown), *_motions(shown)]
     refined = shown.result.refined
     free = (refined.free_directions if refined is not None else ()) or known.free_directions
     if free:
@@ -73,6 +73,17 @@ def determines_section(shown: ShownResult) -> Section:
         blocks += _distance_to_free(shown)
     blocks += weak_blocks(shown)
     return Section("determines", title, tuple(blocks))
+
+
+def _what_was_measured(shown: ShownResult) -> str:
+    """How many frames, pairs and measurements the certified answer is from."""
+    assert shown.result is not None
+    solution = shown.result.solution
+    measurements = sum(residual.number_of_measurements for residual in solution.residuals.values())
+    return (
+        f"{len(solution.X)} targets, {len(solution.Y)} sensors, {len(solution.residuals)} pairs, {measurements} "
+        "measurements."
+    )
 
 
 def _distance_to_free(shown: ShownResult) -> Iterator[Block]:

@@ -24,9 +24,8 @@ HEADLINES: Mapping[Status, tuple[str, Tone]] = {
     Status.FAILED: ("Not proven: there is no bound on what a better answer could cost.", "bad"),
 }
 ABOUT = (
-    "This is about the certified answer, at which the refinement began. It says nothing of the measurements: of wrong "
-    "ones it proves the best answer to wrong measurements. Section Verdict judges those, and Uncertainty says how far "
-    "off a pose may be."
+    "It says nothing of the measurements: of wrong ones it proves the best answer to wrong measurements. The verdict "
+    "judges those, and the standard deviations say how far off a pose may be."
 )
 ABSENT = "Not shown: the spectrum of Z"
 
@@ -42,8 +41,20 @@ def proof_section(shown: ShownResult) -> Section:
     sentence = shown.tree["certified"]["certificate"].get("sentence")
     if sentence:
         blocks.append(Paragraph(f"In the result's words: {sentence}."))
-    blocks += [Listing(tuple(_facts(shown, certificate))), *_spectra(shown), *_parts(shown), Paragraph(ABOUT, "note")]
+    blocks += [
+        Listing(tuple(_facts(shown, certificate))),
+        *_spectra(shown),
+        *_parts(shown),
+        Paragraph(_which_answer(shown) + ABOUT, "note"),
+    ]
     return Section("proof", title, tuple(blocks))
+
+
+def _which_answer(shown: ShownResult) -> str:
+    """Of what the proof is, where the poses are of another fit."""
+    assert shown.result is not None
+    refined = shown.result.refined
+    return "" if refined is None else "This is about the certified answer, at which the refinement began. "
 
 
 def _facts(shown: ShownResult, certificate: Certificate) -> Iterator[Words]:

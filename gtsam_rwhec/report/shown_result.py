@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,6 +13,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Judgement
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.report.report_blocks import Number
 from gtsam_rwhec.results import Evidence
+from gtsam_rwhec.results.derived import derived_of
 from gtsam_rwhec.results.evidence import evidence_json
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_file import Result, has_no_answer, parse_result, parse_tree, result_json
@@ -32,6 +33,7 @@ class ShownResult:
     warnings: tuple[str, ...] = ()  #: What could not be shown although it is there
     #: What is known against a solution that was not calibrated, beside what the file holds
     findings: tuple[Finding, ...] = ()
+    in_memory: bool = False  #: Whether it was just computed: then it has no files, and no page that shows it
 
     @staticmethod
     def of(content: bytes, evidence: Evidence | None, name: str = "result.json", *, images: bool = True) -> ShownResult:
@@ -44,12 +46,13 @@ class ShownResult:
         answer: Calibration | Refined | Solution, log: LogFields | None = None, findings: Sequence[Finding] = ()
     ) -> ShownResult:
         """Of what was just computed."""
-        shown = ShownResult.of(result_json(answer, log), None)
+        evidence = Evidence(derived=derived_of(answer)) if isinstance(answer, Calibration) else None
+        shown = replace(ShownResult.of(result_json(answer, log), evidence), in_memory=True)
         if not findings or not isinstance(answer, Solution):
             return shown
         judgement = judge(answer, findings=findings)
         more = {"verdict": judgement.verdict.value, "verdict_reason": judgement.reason}
-        return ShownResult({**shown.tree, **more}, shown.result, None, shown.name, findings=tuple(findings))
+        return replace(shown, tree={**shown.tree, **more}, findings=tuple(findings))
 
     @property
     def judgement(self) -> Judgement:

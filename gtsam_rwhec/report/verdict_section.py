@@ -34,9 +34,12 @@ BETWEEN = ". What to do: "
 FEW_SENSORS = 4
 POINTS = (
     "This is the error of the calibration alone, where each sensor typically saw its targets; the noise of one new "
-    "measurement comes on top, and averages out over several. Section Uncertainty has other distances."
+    "measurement comes on top, and averages out over several."
 )
-NOTHING_TO_DO = "Nothing has to be done first: copy the poses from the last section, Inputs and versions."
+OTHER_POINTS = "Section Uncertainty has other distances."
+OTHER_POINTS_IN_PYTHON = "In Python, calibration.uncertainty_at(point, frame) tells of any other point."
+NOTHING_TO_DO = "Nothing has to be done first."
+WHERE_TO_COPY = "Copy the poses from the last section, Inputs and versions."
 NO_NOISE_STATED = "Look at the residuals, in mm and degrees, before you trust the poses: no noise was stated."
 
 
@@ -51,7 +54,7 @@ def verdict_section(shown: ShownResult) -> Section:
     if todo:
         blocks += [Paragraph("What to do next", "lead"), Listing(tuple(todo))]
     else:
-        blocks.append(Paragraph(NOTHING_TO_DO))
+        blocks.append(Paragraph(NOTHING_TO_DO if shown.in_memory else f"{NOTHING_TO_DO} {WHERE_TO_COPY}"))
     findings = _findings(shown)
     if len(findings) > 1:
         grounds = Listing(tuple(f"{_sentence(one.words)} {_sentence(one.ground.advice)}" for one in findings))
@@ -118,6 +121,7 @@ def _points(shown: ShownResult) -> Iterator[Block]:
         (
             point["frame"],
             point["seen_from"],
+            f"{np.linalg.norm(point['point_m']):.2f}",
             shown.number("calibration", "points", i, "level", times=100.0, spec="g"),
             significant(shown.number("calibration", "points", i, "radius_mm"), 3),
             "-"
@@ -126,8 +130,13 @@ def _points(shown: ShownResult) -> Iterator[Block]:
         )
         for i, point in enumerate(points)
     )
-    headings = ("sensor", "expressed in", "probability %", "within mm", "one new measurement adds mm")
-    yield Table("How far off a point is", headings, rows, POINTS)
+    headings = ("sensor", "expressed in", "targets at m", "probability %", "within mm", "one new measurement adds mm")
+    yield Table(
+        "How far off a point is",
+        headings,
+        rows,
+        f"{POINTS} {OTHER_POINTS_IN_PYTHON if shown.in_memory else OTHER_POINTS}",
+    )
 
 
 LEGEND = (

@@ -105,7 +105,7 @@ def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path
     done = run("calibrate", utias_folder, "--certified-only", "--sigma", 1, "--kappa", 1, "-v", "-o", result)
     assert done.returncode == 0, done.stderr
     assert "16 targets, 8 sensors, 73 pairs, 3230 measurements" in done.stdout
-    assert "this answer costs 8.281245" in done.stdout
+    assert "no answer below 8.281245" in done.stdout
     assert f"Written to {result}; report: {tmp_path / 'report.html'}." in done.stderr
     solution = rw.read_solution(result)
     assert solution.certificate.is_certified
@@ -209,7 +209,7 @@ def test_not_unique_is_status_3(tmp_path: Path) -> None:
     folder = write_csv(general(2, 2, seed=5, motion="planar", noise=NOISE).problem, tmp_path)
     done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "-v", "-o", tmp_path / "result.json")
     assert done.returncode == 3
-    assert "Certified, but not unique" in done.stdout
+    assert "not unique" in done.stdout
     assert done.stdout.startswith("Do not use these poses: ")
     assert rw.read_solution(tmp_path / "result.json").certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE
 
@@ -221,12 +221,15 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("Use these poses: ")
     assert done.stdout.index("How far off a point is") < done.stdout.index("What was chosen, and why")
-    assert "A point 2.60 m from cam_0, expressed in the frame that carries cam_0, is within " in done.stdout
-    assert done.stdout.index("±x mm") < done.stdout.index("Details") < done.stdout.index("Certified globally optimal")
+    assert re.search(r"cam_0 +the frame that carries cam_0 +2\.60 +95 +3\.91 ", done.stdout)
+    assert done.stdout.index("±x mm") < done.stdout.index("Proven: ") < done.stdout.index("certified: cost 368.6")
+    assert "Other sensors in the frame of cam_0" in done.stdout
+    assert not re.search("Not shown|evidence.json|Inputs and versions|free_directions", done.stdout)
     assert "Noise of B: 0.5° and 5 mm for each axis of a typical measurement, as given." in done.stdout
     refined = rw.read_refined(result)
+    poses = done.stdout[done.stdout.index("Sensors in the frame") :].splitlines()
     for name in refined.Y:
-        (row, *_) = [line for line in done.stdout.splitlines() if line.startswith(f" {name} ")]
+        (row, *_) = [line for line in poses if line.startswith(f" {name} ")]
         np.testing.assert_allclose(
             [float(cell) for cell in row.split()[7:10]], refined.standard_deviations(name)[1], atol=0.0051
         )
@@ -253,12 +256,11 @@ def test_outliers_are_left_out(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     kept, number = rw.read_refined(tmp_path / "result.json").inlier_counts["tag_0", "cam_1"]
     assert kept == number - 3
-    assert done.stdout.count(f"3 of {number} of tag_0-cam_1") == 1
-    assert f"tag_0-cam_1 3 of {number}" not in done.stdout
+    assert f"3 of {number} of tag_0-cam_1" in done.stdout
     all_count = run("calibrate", folder, "--robust", "none", "--verbose")
     assert "every measurement counts, because an option says so" in all_count.stdout
     assert all_count.stdout.startswith("Use these poses with care: 3 of ")
-    assert "--robust auto" in all_count.stdout.splitlines()[0]
+    assert "--robust auto" in all_count.stdout.partition("Sensors in the frame")[0]
 
 
 def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
@@ -348,4 +350,4 @@ def test_a_terminal_without_our_signs_gets_others() -> None:
         [*COMMAND, "calibrate", str(DEMO), "--verbose"], capture_output=True, env=environment, check=False, timeout=60
     )
     assert done.returncode == 0
-    assert b"Certified globally optimal" in done.stdout
+    assert b"Proven: " in done.stdout
