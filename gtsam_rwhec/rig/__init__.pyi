@@ -3,6 +3,8 @@ from .rig_frames import CalibratedFrame as CalibratedFrame
 from .rig_frames import CameraLink as CameraLink
 from .rig_frames import RigFrames as RigFrames
 from .rig_frames import frames_of_refined as frames_of_refined
+
+# Rig files, read and written.
 from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
 from .rig_file import read_rig as read_rig
