@@ -1,4 +1,5 @@
-"""What a cost is evaluated at, and what comes out: enclosed costs, gradients, and the form's action on directions.
+"""Points at which a cost is evaluated, and the results: enclosed costs, gradients, and the form's products with
+directions.
 
 A direction and a gradient are vectors over the form's variables without h, about the part's gauge: 13 numbers for each
 leaf, 13 for each center, [t (3), own scale, vec R (9)], then alpha; (13 n + 1,) in all.
@@ -31,7 +32,7 @@ class Point:
 
     @property
     def rotations(self) -> Array:
-        """(n, 3, 3), as the form has them."""
+        """(n, 3, 3), as variables of the form."""
         return unvec(self.numbers[:, 4:])
 
 
@@ -58,7 +59,7 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Action:
-    """What the form does to directions V (13 n + 1, D): Q V, V'Q V and V'Q x, each with a bound on its error."""
+    """The form's products with directions V (13 n + 1, D): Q V, V'Q V and V'Q x, each with a bound on its error."""
 
     QV: Array
     QV_error: Array
@@ -66,7 +67,7 @@ class Action:
     VQV_error: Array
     VQx: Array
     VQx_error: Array
-    #: Sizes of the terms that cancel in each, where only moments tell them.
+    #: Magnitudes of the terms that cancel in each product; given only where the products come from moments.
     sizes: tuple[Array, Array, Array] | None = None
 
 
@@ -77,7 +78,7 @@ class Form(Protocol):
         """The cost at values of the variables."""
 
     def action(self, evaluation: Evaluation, V: Array) -> Action:
-        """What the form does to directions, and to them with the evaluated point."""
+        """The form's products with directions, and of directions with the evaluated point."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def as_point(part: Part, answer: Answer) -> Point:
 
 
 def rotations_as_variables(part: Part, R: Array) -> Array:
-    """Rotations of frames as the form has them: transposed in the inverse form."""
+    """Rotations of frames as variables of the form: transposed in the inverse form."""
     return R if part.kind == "direct" else np.ascontiguousarray(R.transpose(0, 2, 1))
 
 

@@ -1,8 +1,8 @@
-"""Symmetric matrices that follow a graph: a block for each frame and each coupling, and a dense tail.
+"""Symmetric block-sparse matrices of a graph: a block for each frame and each coupling, and a dense tail.
 
-Cholesky factorisation in the order of `elimination`. Frames that are eliminated at once are stacks of small matrices,
-so numpy's and BLAS's loops do the work. Each entry of the factor is that of the textbook, in some order of summation:
-the bounds on its rounding hold (`verified`).
+Cholesky factorisation in the order of `elimination`. Frames that are eliminated together are stacks of small matrices,
+so the loops run inside numpy and BLAS. Each entry of the factor is the textbook's sum, in some order of summation, so
+the textbook's rounding bounds hold (`verified`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import UNIT
 from gtsam_rwhec.solver.elimination import Elimination, Group
 
-#: So many numbers are worked on at once: 8 MB.
+#: At most this many numbers are processed at once: 8 MB.
 AT_ONCE = 1_000_000
-#: So few numbers are summed one by one.
+#: Up to this many numbers are summed one by one.
 FEW_NUMBERS = 4096
-#: The same where frames have the same neighbours: what stays in the processor's cache.
+#: `AT_ONCE` for frames with the same neighbours: these numbers fit in the processor's cache.
 ALIKE_AT_ONCE = 100_000
 
 
@@ -83,7 +83,7 @@ class BlockMatrix:
         return replace(self, frames=Tt @ self.frames @ T, couplings=couplings, tails=Tt @ self.tails)
 
     def _portions(self) -> Iterator[slice]:
-        """The couplings, so many at a time that what is made of them fits."""
+        """Slices of the couplings, short enough that the arrays computed from one slice fit in memory."""
         step = max(1, AT_ONCE // max(self.frames.shape[1] ** 2, 1))
         return (slice(begin, begin + step) for begin in range(0, len(self.couplings), step))
 
@@ -135,7 +135,7 @@ class BlockMatrix:
         return BlockFactor(self.order, factorisation.shape, factorisation.lower, factorisation.rows, rest)
 
     def has_factor(self) -> bool:
-        """Whether `factor` gives one, which is not kept."""
+        """Whether the Cholesky factor exists; the factor itself is not kept."""
         return _Factorisation(self).run(keep=False) is not None
 
 
@@ -193,7 +193,7 @@ class BlockFactor:
 
 
 class _Factorisation:
-    """What is left of a matrix while it is factored."""
+    """The part of a matrix that is not eliminated yet, during the factorisation."""
 
     def __init__(self, matrix: BlockMatrix) -> None:
         self.matrix, self.order = matrix, matrix.order
@@ -201,12 +201,12 @@ class _Factorisation:
         self.shape = n, m, q
         self.lower: list[Array] = []
         self.rows: list[Array] = []
-        # One row more than there are: what is summed for no frame goes there.
+        # One extra row: sums for the index "no frame" go there.
         self.frames = np.concatenate([matrix.frames, np.zeros((1, m, m))])
         self.tails = np.concatenate([matrix.tails, np.zeros((1, m, q))])
         self.tail = matrix.tail.copy()
         self.changes = np.zeros((self.order.number_changed + 1, m, m))
-        #: The place of each coupling among the changes; and for no coupling.
+        #: The place of each coupling among the changed ones; the last entry is for "no coupling".
         last = self.order.number_changed
         self.place = np.append(np.where(self.order.changed < len(self.order.changed), self.order.changed, last), last)
 
@@ -249,7 +249,7 @@ class _Factorisation:
         return result
 
     def _couplings(self, group: Group, at: slice) -> Array:
-        """The rows (k, m, d m + q) of a group's frames beside their diagonal blocks."""
+        """The off-diagonal rows (k, m, d m + q) of a group's frames."""
         _, m, q = self.shape
         edges, flipped = group.edges[at], group.flipped[at]
         k, d = edges.shape
@@ -262,7 +262,7 @@ class _Factorisation:
         return result
 
     def _take_off(self, group: Group, at: slice, rows: Array) -> None:
-        """Subtract what the elimination of frames takes from their neighbours."""
+        """Subtract the update that the elimination of frames makes to the blocks of their neighbours."""
         _, m, q = self.shape
         neighbours = group.neighbours[at]
         d = neighbours.shape[1]
@@ -302,7 +302,7 @@ class _Factorisation:
 
 
 def _portions(group: Group, width: int) -> Iterator[slice]:
-    """The frames of a group, so many at a time that what is made of them fits."""
+    """Slices of a group's frames, short enough that the arrays computed from one slice fit in memory."""
     count, m = len(group.frames), 13
     step = ALIKE_AT_ONCE // (m * max(width, 1)) if group.are_alike else AT_ONCE // max(width * width, 1)
     step = max(1, step)
@@ -326,7 +326,7 @@ def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.
     result[rows] += sums.reshape(len(rows), *values.shape[1:])
 
 
-#: This number is added to a bound; underflow can lose less.
+#: Added to a bound, to cover underflow: underflow loses less than this.
 _TINY = 1e-290
 
 
@@ -346,7 +346,7 @@ def proof_that_it_exceeds(matrix: BlockMatrix, margin: Array | float = 0.0) -> B
 
 
 def is_proven_to_exceed(matrix: BlockMatrix, margin: Array | float = 0.0) -> bool:
-    """Whether there is such a proof, which is not kept."""
+    """Whether this proof succeeds; its factor is not kept."""
     return _smaller(matrix, margin).has_factor()
 
 

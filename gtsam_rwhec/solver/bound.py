@@ -5,18 +5,18 @@ variables, translations included. About any point x, with g half its gradient an
 
     J(y) = L(y) = L(x) + 2 g'd + d'Z d,      d = y - x
 
-L(x) and g come from the raw measurements, where nothing cancels (`measured_form`). The moments enter Z alone, whose
-rounding only has to be small against its eigenvalues. If Z >= diag(m) with m > 0, then for any vector v, with
-rho = g - Z v: 2 g'd + d'Z d >= -(2 g - Z v)'v - sum rho^2 / m. With v near Z^-1 g this loses next to nothing.
+L(x) and g come from the raw measurements, where nothing cancels (`measured_form`). Only Z comes from the moments; its
+rounding only has to be small against its eigenvalues. If Z >= diag(m) with m > 0, then for any vector v, with rho = g -
+Z v: 2 g'd + d'Z d >= -(2 g - Z v)'v - sum rho^2 / m. With v near Z^-1 g the bound is almost tight.
 
 **Null vectors.** Where the measurements leave directions V free, Z is singular. For each, one variable is held: d =
 V a + z, where z is zero at the held variables and a is d there. Then Z has to be definite for z only, and ::
 
     L(y) >= L(x) + 2 (V'g)'a + a'(V'Z V) a - |g + Z V a|^2 in the norm of the inverse of Z
 
-V'ZV, V'g and Z V come from what V does to the raw measurements, which is next to nothing. Held entries of rotations
-have |a| <= 2; held translations and scales are limited by a `Region`. With an unknown scale nothing couples to h, and x
-itself is a null vector.
+V'ZV, V'g and Z V are computed from the raw measurements' residuals along V, which are almost zero. Held entries of
+rotations have |a| <= 2; held translations and scales are limited by a `Region`. With an unknown scale nothing couples
+to h, and x itself is a null vector.
 
 **Rotations in floating point** satisfy their constraints up to rounding only. The bound covers those too.
 """
@@ -39,9 +39,10 @@ from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.region import AT_LEAST, LARGER, Region, half_widths, smallest_region
 from gtsam_rwhec.solver.rotations import constraint_values, multiplier_blocks
 
-#: Margins of definiteness as parts of the form's diagonal: the largest that is proven costs least.
+#: Margins of definiteness as fractions of the form's diagonal. The largest proven margin gives the smallest loss.
 ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-#: A solution by the factor of a proof is improved at most so many times, until it loses this part of the loss.
+#: A solution with a proof's factor is refined at most ``IMPROVEMENTS`` times, until its error is ``ENOUGH`` of the
+#: loss.
 IMPROVEMENTS = 6
 ENOUGH = 1e-6
 #: A loss below this part of the value needs no solution at all.
@@ -67,7 +68,7 @@ class Room:
 
     @staticmethod
     def largest(Z: Curvature, scale: Array, value: float) -> Room | None:
-        """The largest room that is proven, of parts of a diagonal ``scale`` (13 n + 1,)."""
+        """The largest room that is proven; the margins tried are fractions of a diagonal ``scale`` (13 n + 1,)."""
         for margin in (*(np.maximum(part * scale, 1e-290) for part in ROOMS), 0.25 * Z.allowance(scale)):
             proven = Room.of(Z, margin, value)
             if proven is not None:
@@ -79,9 +80,9 @@ class Room:
         return self.proof or self.Z.proof_that_it_exceeds(self.margin)
 
     def solved(self, h: Array, held: np.ndarray) -> Array:
-        """Nearly Z^-1 h: the factor's solution, improved where the margin makes it poor. It is zero where held.
+        """An approximation of Z^-1 h: the factor's solution, refined where the margin makes it poor; zero at ``held``.
 
-        Where zero loses next to nothing, and no factor was kept, it is zero.
+        If no factor was kept and the zero vector loses almost nothing, the zero vector is returned.
         """
         v, rest, size = np.zeros_like(h), h, np.inf
         if self.proof is None and float((h**2 / self.margin).sum()) <= NEXT_TO_NOTHING * abs(self.value):
@@ -131,7 +132,7 @@ def loss_along(nulls: NullVectors, root: float, of_nulls: Array, width: Array) -
 def root_of_loss(room: Room, h: Array, h_error: Array, held: np.ndarray) -> tuple[float, float]:
     """The root of an upper bound on -min 2 h'z + z'Z z, over z whose ``held`` entries are zero.
 
-    With the error of h, and without.
+    Returns two values: with the error of h, and without it.
     """
     h, h_error = h.copy(), h_error.copy()
     h[held], h_error[held] = 0.0, 0.0
@@ -147,13 +148,13 @@ def root_of_loss(room: Room, h: Array, h_error: Array, held: np.ndarray) -> tupl
     return float(root + of_error) * (1.0 + 1e-9), float(root) * (1.0 + 1e-9)
 
 
-#: Each entry of R'R - I of an answer in floating point, and of what the other constraints ask, is at most this.
+#: For rotations in floating point, each entry of R'R - I and each residual of the other constraints is at most this.
 ROTATION_IN_DOUBLES = 1e-15
-#: A factor of the slack between tries.
+#: The factor from one slack to the next one tried.
 MORE_SLACK = 3.0
-#: A loss below this part of the value does not ask for another try.
+#: With a loss below this fraction of the value, nothing else is tried.
 NEGLIGIBLE = 1e-9
-#: A loss above this part of the value asks for other null vectors.
+#: With a loss above this fraction of the value, other null vectors are tried.
 OPEN = 1e-6
 
 
@@ -172,7 +173,7 @@ class Bound:
     step: Array | None = None
 
     def at_most(self, cost: float) -> Bound:
-        """The bound, no higher than a cost that an answer has; and zero for less, as J is a sum of squares."""
+        """The bound, limited to the range from 0 (J is a sum of squares) to the cost of a known answer."""
         lower = min(self.lower_bound, cost)
         if np.isfinite(lower) and lower <= 0.0:
             return replace(self, lower_bound=0.0, region=None)
@@ -244,7 +245,7 @@ class _Lagrangian:
     # -- three cases --------------------------------------------------------------------------------------------
 
     def definite(self) -> Bound | None:
-        """Z is positive definite, but for x where nothing couples to h."""
+        """Z is positive definite; if nothing couples to h, then except along x."""
         if self.is_homogeneous:
             return self._definite_but_for_the_point()
         room = self._room(self.Z)
@@ -349,7 +350,7 @@ class _Lagrangian:
         return Room.largest(Z, np.abs(self.form.curvature.diagonal), self.value)
 
     def _over_region(self, nulls: NullVectors, room: Room, enough: float) -> tuple[float, float, Region | None]:
-        """`_lower` over the largest region that costs little, or over all of space where no region is needed."""
+        """`_lower` over the largest region with a small loss, or without a region where none is needed."""
         if self.Z.is_rotation[nulls.held].all():
             return *self._lower(nulls, room, None), None
         smallest = smallest_region(self.form.part, self.evaluation.point, self.contains)
@@ -396,7 +397,7 @@ class _Lagrangian:
         return step
 
     def _slack_by_multipliers(self) -> float:
-        """What L and J differ by at most at rotations in floating point."""
+        """An upper bound on |L - J| at rotations in floating point."""
         return ROTATION_IN_DOUBLES * float(np.abs(self.multipliers).sum()) * (1.0 + 1e-9)
 
     def _less_rounding_of_rotations(self, lower: float) -> float:

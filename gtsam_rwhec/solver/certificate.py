@@ -154,7 +154,7 @@ class Cause(StrEnum):
         "the answer may be a local minimum, or the multipliers of redundant constraints are needed; method='auto' "
         "finds out",
     )
-    #: More frames at once need the multipliers of all constraints than the dense methods take.
+    #: Too many frames at once need the multipliers of all constraints: the dense methods cannot take them.
     TOO_LARGE = (
         "too_large",
         Status.GAP,

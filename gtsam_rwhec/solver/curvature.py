@@ -1,7 +1,7 @@
-"""The second derivative Z of a Lagrangian in blocks that follow the graph, and proofs that it is positive definite.
+"""The second derivative Z of a Lagrangian, as blocks of the graph, and proofs that it is positive definite.
 
 Z = Q - Lambda over the form's variables without h: 13 numbers a frame, and alpha. The translations stay in it: then the
-proof needs no elimination, which would lose digits. What rounding did to Z is dominated by a diagonal (``rounding``).
+proof needs no elimination, which would lose digits. A diagonal (``rounding``) dominates the rounding error of Z.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ HELD = 2.0**50
 DENSE = 1000
 #: A factor with more numbers beside its dense rest than this, 40 MB, is large.
 LARGE_FACTOR = 5_000_000
-#: So many null vectors are looked for in a large matrix.
+#: At most this many null vectors are searched for in a large matrix.
 SPARSE_NULLS = 24
 
 
 @dataclass(frozen=True)
 class Curvature:
-    """Z over the frames (13 each) and alpha, and what dominates its rounding."""
+    """Z over the frames (13 each) and alpha, and a diagonal that dominates its rounding error."""
 
     matrix: BlockMatrix
     rounding: Array
@@ -90,7 +90,7 @@ class Curvature:
         return self.matrix.times(v)
 
     def rounding_of_product(self, v: Array) -> Array:
-        """A bound on what rounding takes from Z v: that of the product, and that of Z's entries."""
+        """A bound on the rounding error of Z v, from the product and from Z's entries."""
         root = np.sqrt(self.rounding)
         of_entries = root * float(root @ np.abs(v)) + self.rounding * np.abs(v).max(initial=0.0)
         terms = np.append(np.repeat(13 * (self.matrix.order.neighbours + 1), 13), self.size) + 8
@@ -98,7 +98,7 @@ class Curvature:
         return result
 
     def allowance(self, diagonal: Array) -> Array:
-        """What rounding may take in a factorisation of a matrix with this diagonal, as a diagonal matrix."""
+        """A bound on the rounding in a factorisation of a matrix with this diagonal, as a diagonal matrix."""
         return cholesky_allowance(self.matrix, diagonal)
 
     def with_held(self, held: np.ndarray) -> Curvature:
@@ -111,14 +111,14 @@ class Curvature:
         return self.plus(large)
 
     def proof_that_it_exceeds(self, margin: Array) -> BlockFactor | None:
-        """Whether the true Z is proven to exceed diag(margin): what rounding did to it is taken off too.
+        """The proof that the true Z exceeds diag(margin): the rounding error of Z is subtracted too.
 
-        The factor of the proof is that of a matrix that is a little smaller; None where nothing is proven.
+        Returns the factor of a slightly smaller matrix; None where nothing is proven.
         """
         return proof_that_it_exceeds(self.matrix, margin + self.rounding)
 
     def is_proven_to_exceed(self, margin: Array) -> bool:
-        """Whether there is such a proof, which is not kept."""
+        """Whether this proof succeeds; its factor is not kept."""
         return is_proven_to_exceed(self.matrix, margin + self.rounding)
 
     @property

@@ -18,7 +18,7 @@ from gtsam_rwhec.solver.parts import Part, connected_components
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import project, retract, tangent_basis, unvec, vec
 
-#: What a search looks for answers in: Q' as a matrix, or as a product that follows the graph.
+#: The reduced form in which answers are searched: Q' as a matrix, or as products over the graph.
 SearchForm = ReducedForm | GraphForm
 
 
@@ -80,11 +80,11 @@ def descend(form: SearchForm, R: Array, max_iterations: int) -> Descent:
     return Descent(R, cost, max_iterations, converged=False)
 
 
-#: This part of the diagonal is added to it: exact data make the form singular.
+#: This fraction of the diagonal is added to the form, because exact data make it singular.
 SHIFT = 1e-9
-#: Inverse iterations at most, and the change of a unit vector at which they end: the start need not be exact.
+#: The most inverse iterations, and the change of the unit vector below which they end: a rough start is enough.
 ITERATIONS, SMALL = 40, 1e-3
-#: Inverse iterations with Q' as a whole.
+#: Number of inverse iterations with the whole Q'.
 FEW_ITERATIONS = 8
 
 
@@ -164,7 +164,7 @@ def mirrored(part: Part, R: Array) -> Array:
 
 
 def _smallest(factor: BlockFactor, weight: Array, v: Array) -> Array:
-    """The smallest eigenvector, beside the diagonal ``weight``, that ``v`` has a part of: by inverse iteration."""
+    """The smallest eigenvector with a part in ``v``, in the metric diag(``weight``), by inverse iteration."""
     v = v / np.sqrt(float(weight @ v**2))
     for _ in range(ITERATIONS):
         after = factor.solve_vector(weight * v)
