@@ -7,8 +7,8 @@ With w_k the rotation vector and s_k the translation of sensor k over a window, 
     R_k s_k + (I - V) t'_k - alpha_k v = 0      for a sensor of unknown scale alpha_k, t' = alpha t.
 
 The vehicle's rotation vector and translation are eliminated: residuals are the differences from the weighted mean, so
-every pair of sensors counts and loops are consistent. V and v are the fused motion at the estimate before, and given
-here. What is left is a quadratic form of y = [vec R_k, t_k, alpha_k, 1], with R_k the only constrained numbers.
+every pair of sensors counts and loops are consistent. V and v are the fused motion at the previous estimate, and are
+fixed here. What is left is a quadratic form of y = [vec R_k, t_k, alpha_k, 1], with R_k the only constrained numbers.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class JointForm:
         return ReducedForm.of_rotations(self._eliminated[1])
 
     def with_scales_near(self, scale: Array, share: float) -> JointForm:
-        """The form with a row for each unknown scale (K,): off by ``share`` of it costs a half, as one deviation does.
+        """The form with a prior row for each unknown scale in ``scale`` (K,), of relative standard deviation ``share``.
 
         A mirror image has a negative scale (design fact 5) and may cost less where the vehicle turned about one axis.
         """
@@ -97,15 +97,15 @@ class JointForm:
 def joint_form(
     windows: WindowMotions, state: State, variances: Array, scaled: np.ndarray, prior_rows: Array | None = None
 ) -> JointForm:
-    """The form at given turns and ways of the windows, those of ``state.motion``.
+    """The form with the windows' rotations and translations fixed to those of ``state.motion``.
 
     Parameters
     ----------
     variances : (m, 2) array
-        Noise of rotation and translation a second.
+        Variances of rotation (rad^2/s) and translation (m^2/s).
     scaled : (m,) booleans
     prior_rows : (q, d) array, optional
-        Rows over y, whitened: what a person gives.
+        Whitened rows over y, from the user's prior knowledge.
     """
     m, n = windows.used.shape
     K = m - 1
@@ -114,7 +114,7 @@ def joint_form(
     w, s, used = windows.rotation_vectors(), windows.M[..., :3, 3], windows.used
     V, v = state.motion[:, :3, :3], state.motion[:, :3, 3]
     of_rotation = used / (windows.length * variances[:, :1] + ~used)
-    # The rotation's noise moves the way that is still to go: its mean square distance counts.
+    # Rotation noise also moves the window's end, by the distance from there: its mean square counts.
     turned = 2.0 / 3.0 * variances[:, :1] * np.einsum("mnii->mn", windows.second)
     of_translation = used / (windows.length * variances[:, 1:] + turned + ~used)
 
@@ -135,7 +135,7 @@ def joint_form(
             E[k, :, :, -1] = s[k]
     metric = ~scaled
     rows.append(_contrasts(E[metric], of_translation[metric]))
-    # v is known from the sensors of known scale; its noise is that of their mean.
+    # v comes from the sensors of known scale; it has the noise of their weighted mean.
     of_v = 1.0 / np.maximum(of_translation[metric].sum(axis=0), 1e-300)
     has_v = used[metric].any(axis=0)
     for i, k in enumerate((which + 1).tolist()):
@@ -151,7 +151,7 @@ def joint_form(
 
 
 def _times(w: Array) -> Array:
-    """(n, 3, 9): R w is this times vec R, which stacks columns."""
+    """The matrix (n, 3, 9) that gives R w when multiplied by vec R (columns stacked)."""
     matrix: Array = np.einsum("nj,ik->nijk", w, I3).reshape(len(w), 3, 9)
     return matrix
 
@@ -164,36 +164,36 @@ def _contrasts(E: Array, weight: Array) -> Array:
     return rows
 
 
-#: Descents from so many random rotations, beside the given starts.
+#: The number of descents from random rotations, in addition to the given starts.
 RANDOM_STARTS = 4
-#: Newton's steps of a descent.
+#: The most Newton steps of a descent.
 MAX_DESCENT = 100
 #: The relaxation is solved for at most so many sensors (beside the reference).
 MAX_RELAXED = 60
-#: Where the best answer is a mirror image, scales are held to this part of themselves, so often that they settle.
+#: For a mirror image: the relative standard deviation that holds the scales, and the rounds of it.
 SCALE_SHARE, SCALE_ROUNDS = 0.1, 3
-#: Positive scales may cost so many times what the mirror image does.
+#: Positive scales may cost this many times as much as the mirror image.
 MIRRORED_COST = 1.5
-#: Where a proof needs a region, translations are limited to so many metres along each axis.
+#: Where a proof needs a bounded region, translations are limited to this along each axis (m).
 REGION_M = 1000.0
-#: The gap that counts as none, of a cost that is half a chi-square (design fact 10).
+#: A smaller gap counts as zero; the cost is half a chi-square (design fact 10).
 TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
 class JointSolution:
-    """The answer y (d,) of a joint form and its certificate; whether it is unique is not asked here."""
+    """The answer y (d,) of a joint form and its certificate; uniqueness is tested elsewhere."""
 
     y: Array
     certificate: JointCertificate
 
 
 def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -> JointSolution:
-    """The best answer of descents from rotations (K, 3, 3), with the best bound that was found for it.
+    """The best result of descents from rotations (K, 3, 3), and the best bound found for it.
 
     An answer with a negative scale is the mirror image of one with a positive scale (design fact 5), which costs about
-    as much if the vehicle turned about one ``axis`` (3,). It is turned about that axis by half a turn, and found and
-    proven again with the scales held near (``SCALE_SHARE``).
+    as much if the vehicle turned about one ``axis`` (3,). The sensor is then turned by half a turn
+    about that axis; the answer is found and proven again with the scales held (``SCALE_SHARE``).
 
     Raises
     ------
@@ -225,7 +225,7 @@ def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -
 
 
 def _best(form: JointForm, starts: list[Array]) -> tuple[Descent, Array, JointCertificate]:
-    """The lowest end of the descents, its y (d,), and the highest bound."""
+    """The best end of the descents, its y (d,), and the certificate with the highest bound."""
     reduced = form.reduced
     best = min((descend(reduced, R, MAX_DESCENT) for R in starts), key=lambda end: end.cost)
     y, certificate = _proven(form, best)
@@ -241,13 +241,13 @@ def _best(form: JointForm, starts: list[Array]) -> tuple[Descent, Array, JointCe
 
 
 def _gradient(q: Array) -> Array:
-    """(K, 9) of Q'x without its last entry."""
+    """The entries of Q'x without the last one, (K, 9)."""
     rows: Array = q[:-1].reshape(-1, 9)
     return rows
 
 
 def _proven(form: JointForm, end: Descent) -> tuple[Array, JointCertificate]:
-    """By the multipliers at the answer, or by those of all constraints if they prove more."""
+    """Certified by the KKT multipliers of the answer, or by improved multipliers if their bound is higher."""
     reduced = form.reduced
     gradient = _gradient(reduced.apply(homogeneous(end.R)))
     multipliers = kkt_multipliers(end.R, gradient)
@@ -282,23 +282,23 @@ def _certified(form: JointForm, end: Descent, multipliers: Array) -> tuple[Array
 
 
 def _loss(Z: Array, gradient: Array, K: int, y: Array) -> tuple[float, float, float]:
-    """What is to be taken from the cost, the region of the bound, and the least eigenvalue of the scaled Z."""
-    # A translation along which no window has any effect is in no term of the cost.
+    """How far the bound is below the cost, the bound's region (m), and the least eigenvalue of the scaled Z."""
+    # The cost does not contain a translation that affects no window.
     matters = np.abs(Z).max(axis=1) > 0.0
     Z, gradient = Z[np.ix_(matters, matters)], gradient[matters]
     limit = np.r_[np.full(9 * K, 2.0), np.full(len(y) - 1 - 9 * K, REGION_M) + np.abs(y[9 * K : -1])][matters]
     n = len(Z)
     unit = 1.0 / np.sqrt(np.maximum(np.abs(np.diagonal(Z)), 1e-300))
     scaled = Z * unit[:, None] * unit
-    # A Cholesky factorisation that succeeds proves the matrix positive semidefinite up to this (Rump 2006).
+    # If the Cholesky factorisation succeeds, no eigenvalue is below minus this (Rump 2006).
     hidden = 4.0 * n * (n + 1) * 2.0**-53
     g = gradient * unit
     values = np.linalg.eigvalsh(scaled)
-    # First: positive definite, without any region.
+    # First try: Z is positive definite; then no region is needed.
     margin = 0.5 * float(values[0])
     if margin > hidden and _is_definite(scaled, margin + hidden):
         return float(g @ g) / margin, np.inf, margin
-    # Else: not below -shift, and d limited.
+    # Else: no eigenvalue is below -shift, and the answer's distance is limited.
     for shift in (hidden, 1e-11, 1e-9, 1e-7):
         if shift >= hidden and _is_definite(scaled, -shift):
             total = shift + hidden
@@ -317,10 +317,11 @@ def _is_definite(matrix: Array, less: float) -> bool:
 
 
 def star_starts(w: Array, s: Array, used: np.ndarray) -> list[Array]:
-    """Starts (K, 3, 3) of the descents: each sensor aligned to sensor 0 by its turns and ways.
+    """Starts (K, 3, 3) of the descents: each sensor aligned to sensor 0 by its rotations and translations.
 
-    ``w`` and ``s`` (m, n, 3) are the windows' rotation vectors and translations. Turns alone leave a rotation about one
-    axis free where the vehicle turned about one only; the ways decide then, unless lever arms are long against them.
+    ``w`` and ``s`` (m, n, 3) are the windows' rotation vectors and translations. If the
+    vehicle turned about one axis only, rotations leave the angle about that axis free. Then translations determine it,
+    unless the lever arms are long against them.
     """
     starts = []
     for of_ways in (0.0, 0.1, 1.0):

@@ -15,10 +15,10 @@ from gtsam_rwhec.odometry.window_likelihood import Layout, State
 from gtsam_rwhec.odometry.window_motions import WindowMotions
 
 Vector = tuple[float, float, float]
-#: What has a known direction: an axis of the sensor, or the line from the reference sensor to it.
+#: What the known direction belongs to: an axis of the sensor, or the line from the reference sensor to it.
 DirectionOf = Literal["x", "y", "z", "lever_arm"]
 
-#: No two sensors of a vehicle are further apart, metres; nor further above the ground.
+#: The largest distance between two sensors, and of a sensor above the ground, metres.
 MOST_M = 150.0
 
 
@@ -46,22 +46,22 @@ class KnownDirection:
 class Given:
     """What a person knows; nothing by default."""
 
-    #: by sensor: heights of the sensors' origins above the ground, metres. The reference sensor needs one too, or the
-    #: ground
+    #: by sensor: heights of the sensors' origins above the ground, metres. Give the reference sensor's height
+    #: too, or ``ground``
     heights_m: dict[str, tuple[float, float]] = field(default_factory=dict, hash=False)
-    #: The plane that the vehicle drives on. Without it heights are along the axis that the vehicle turned about
+    #: The plane that the vehicle drives on. Without it, heights are along the vehicle's turning axis
     ground: Ground | None = None
     directions: tuple[KnownDirection, ...] = ()
-    #: by (sensor, sensor): Measured distances of two sensors' origins, metres. They are used in the refinement only
+    #: by (sensor, sensor): measured distances between two sensors' origins, metres; only the refinement uses them
     distances_m: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict, hash=False)
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is given that says where a sensor is."""
+        """Whether no height, direction or distance is given."""
         return not (self.heights_m or self.directions or self.distances_m)
 
     def checked(self, sensors: Collection[str], reference: str) -> None:
-        """Raise an error in words for what is not about these sensors, or is no number.
+        """Raise an error for what does not fit these sensors or is not a valid number.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class Given:
 
 
 _AXES = {"x": 0, "y": 1, "z": 2}
-#: The least length of a lever arm whose direction is given, metres: shorter ones have none.
+#: The least length of a lever arm, metres: a shorter one has no direction.
 LEAST_ARM_M = 1e-3
 
 
@@ -150,7 +150,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened residuals (q,) and derivatives (q, p) at a state, with the number of each."""
+    """Whitened residuals (q,) and derivatives (q, p) at a state, and the given number behind each row."""
 
     r: Array
     J: Array
@@ -165,14 +165,14 @@ class Rows:
 
 @dataclass(frozen=True)
 class GivenRows:
-    """What is given, by the places of the sensors."""
+    """The prior knowledge, with sensors by their indices."""
 
     given: Given
     place: dict[str, int]  #: by sensor: 0 is the one in whose frame the poses are
-    #: (3,): the ground's normal there, as given or as the axis that the vehicle turned about; it points up
+    #: (3,): the ground's normal in the frame of sensor 0, pointing up: as given, or the vehicle's turning axis
     normal: Array
     sigma_normal: float  #: rad
-    #: Standard deviation of a weak prior on time offsets, which keeps offsets that the data do not determine
+    #: Standard deviation of a weak prior, which holds time offsets that the data do not determine
     clock_sigma_s: float
 
     @property
@@ -182,7 +182,7 @@ class GivenRows:
 
     @property
     def first_height(self) -> float:
-        """A start for the height of sensor 0."""
+        """The initial height of sensor 0, metres."""
         ground = self.given.ground
         named = [name for name, k in self.place.items() if k == 0]
         if named[0] in self.given.heights_m:
@@ -260,8 +260,8 @@ class GivenRows:
     def form_rows(self, state: State, scaled: np.ndarray) -> Array:
         """Whitened rows (q, d) over the certified form's y; distances are not linear and have none.
 
-        The height of sensor 0 is taken as given there, with its deviation in each height's; the exact likelihood has
-        what heights share.
+        The height of sensor 0 is fixed in them, and its variance is added to that of each height. Only the exact
+        likelihood has the correlations between heights.
         """
         K = len(state.T) - 1
         which = np.flatnonzero(scaled[1:])
@@ -275,7 +275,7 @@ class GivenRows:
             t = state.T[k, :3, 3]
             lateral = float(np.linalg.norm(t - self.normal * (self.normal @ t)))
             whole = np.sqrt(sigma**2 + self._reference_sigma**2 + (self.sigma_normal * lateral) ** 2)
-            # Of a scaled sensor the form has t' = alpha t: the row is about it times the scale of the estimate.
+            # For a scaled sensor the form has t' = alpha t: the row is multiplied by the estimated scale.
             row = np.zeros(d)
             row[9 * K + 3 * k - 3 : 9 * K + 3 * k] = self.normal
             row[-1] = -state.scale[k] * (value - reference)
@@ -292,7 +292,7 @@ class GivenRows:
                     row[axis : axis + 3] = across[:, i]
                 rows.append(row / known.sigma_rad)
                 if known.of != "lever_arm":
-                    # Both ways of the axis are across it; the length along it tells them apart.
+                    # The rows across also fit the opposite direction; the component along the axis excludes it.
                     along = np.zeros(d)
                     along[axis : axis + 3] = _unit(known.direction)
                     along[-1] = -1.0
@@ -314,26 +314,26 @@ def _unit(direction: tuple[float, float, float] | Array) -> Array:
 
 
 def _across(axis: Array) -> Array:
-    """Two unit vectors (3, 2) across an axis and each other."""
+    """Two unit vectors (3, 2), perpendicular to an axis and to each other."""
     _, _, Vt = np.linalg.svd(axis[None])
     basis: Array = Vt[1:].T
     return basis
 
 
-#: An axis is taken as up where it is within this angle of the reference's z axis, or of the opposite of its y axis.
+#: An axis is taken as up if it is within this angle of the reference's +z axis or -y axis.
 NEAR_RAD = np.radians(40.0)
 
 
 def up_direction(given: Given, windows: WindowMotions, variances: Array, reference: str) -> tuple[Array, float]:
-    """The ground's normal (3,) in the frame of sensor 0, up, and its standard deviation in rad.
+    """The ground's normal (3,), pointing up, in the frame of sensor 0, and its standard deviation in rad.
 
-    Without a given ground it is the axis about which sensor 0 turned most. Its sign is that of z, or, in an optical
-    frame (z forward, y down), that against y.
+    Without a given ground it is the axis about which sensor 0 turned most. It is made to
+    point along +z, or, in an optical frame (z forward, y down), along -y.
 
     Raises
     ------
     OptionError
-        Heights are given without the ground, and the turning axis is near neither.
+        Heights are given without the ground, and the turning axis is near neither z nor y.
     """
     if given.ground is not None:
         normal = np.asarray(given.ground.normal, dtype=float)
@@ -355,8 +355,8 @@ def up_direction(given: Given, windows: WindowMotions, variances: Array, referen
 def turning_axis(windows: WindowMotions, variances: Array) -> tuple[Array, float]:
     """The axis (3,) about which sensor 0 turned most, and its standard deviation in rad.
 
-    A plane's normal is that axis up to noise. What the vehicle turns about other axes beyond its noise says that the
-    ground is no plane: then the axis is off by chance, as the mean of ten drives' parts would be.
+    On a plane, this axis is the normal up to noise. Turns about other axes above the noise show that the ground is not
+    a plane. Their mean square, divided by ten (as for ten independent parts of a drive), is then added to the variance.
     """
     used = windows.used[0]
     w = windows.rotation_vectors()[0, used]
@@ -368,9 +368,9 @@ def turning_axis(windows: WindowMotions, variances: Array) -> tuple[Array, float
 
 
 def upside_down(normal: Array, T: Array) -> np.ndarray:
-    """(m,) for sensors at T (m, 4, 4): 1 where its own axes say that ``normal`` is down, -1 where up, 0 where neither.
+    """For sensors at T (m, 4, 4): 1 where ``normal`` points down by the sensor's axes, -1 where up, 0 where neither.
 
-    As `up_direction` reads them: z is up; or, where it is level, y is down.
+    As in `up_direction`, z points up; if z is near neither, y points down. Returns (m,).
     """
     along = np.einsum("mij,i->mj", T[:, :3, :3], normal)
     limit = np.cos(NEAR_RAD)

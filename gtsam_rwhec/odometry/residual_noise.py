@@ -1,10 +1,11 @@
 """The noise of odometries, found by restricted likelihood of their residuals against one another.
 
-The windows' motions are unknown, so what is left of the residuals are contrasts between sensors. Three sensors tell the
-noise of each; two tell the sum only, and then both count as equally noisy. With V the covariance of all sensors'
-residuals of a window, B the derivative by its motion and S = V^-1 - V^-1 B (B' V^-1 B)^-1 B' V^-1, the score of a
-variance v_c with V_c = dV / dv_c is (r' S V_c S r - tr S V_c) / 2, and the information tr(S V_c S V_d) / 2
-(Patterson and Thompson 1971). The few unknowns of poses take p equations, for which the residuals are scaled up.
+The windows' motions are unknown, so only differences between sensors (contrasts) carry information. With three sensors
+the noise of each can be found; with two only the sum, and both are taken as equally noisy. V is the covariance of all
+sensors' residuals of a window, B their derivative with respect to its motion, and
+S = V^-1 - V^-1 B (B' V^-1 B)^-1 B' V^-1. With V_c = dV / dv_c, the score of a variance v_c is
+(r' S V_c S r - tr S V_c) / 2, and the information is tr(S V_c S V_d) / 2 (Patterson and Thompson 1971). The p unknowns
+of the poses use up p equations; the residuals are scaled up for this.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ LARGEST_CHANGE = 3.0
 CONVERGED = 1e-3
 #: Rounds of scoring at one linearisation.
 ROUNDS = 30
-#: A prior on the logarithm of each variance keeps what the data do not tell near where it was: its deviation.
+#: Standard deviation of a prior on each log variance, which holds variances that the data do not determine.
 PRIOR = 4.0
 
 
 def groups_of(stated: np.ndarray) -> np.ndarray:
-    """(m,) which sensors share a noise: each its own, or two sensors one together, where neither is stated."""
+    """The noise group (m,) of each sensor: each has its own; two sensors without stated noise share one."""
     groups = np.arange(len(stated))
     if len(stated) == 2 and not stated.any():
         groups[:] = 0
@@ -37,10 +38,10 @@ def groups_of(stated: np.ndarray) -> np.ndarray:
 def found_variances(
     windows: WindowMotions, linear: Linear, variances: Array, stated: np.ndarray, scale: Array, unknowns: int
 ) -> Array:
-    """Variances a second (m, 2), of rotation (rad^2/s) and translation (m^2/s), from residuals at an answer.
+    """Variances (m, 2) of rotation (rad^2/s) and translation (m^2/s), from the residuals at a solution.
 
-    ``variances`` (m, 2) is the start, and stays for sensors whose noise is ``stated`` (m,). Of a sensor of unknown
-    scale the translation's is in its own lengths; ``scale`` (m,) brings two sensors to one unit.
+    ``variances`` (m, 2) are the initial values; those of sensors with ``stated`` noise (m,) do not change. The
+    translation variance of a sensor of unknown scale is in its own unit of length; ``scale`` (m,) converts it.
     """
     m, n = windows.used.shape
     parts = np.array(windows.covariance_parts())  # (2, m, n, 6, 6)
@@ -48,7 +49,7 @@ def found_variances(
     names = [group for group in np.unique(groups) if not stated[groups == group].all()]
     if not names or n == 0:
         return variances
-    # Units: the translation's variance of a sensor is that of true lengths times its scale squared.
+    # A sensor's translation variance is the metric variance times its scale squared.
     unit = np.ones((m, 2))
     unit[:, 1] = scale**2
     current = variances / unit
@@ -81,9 +82,9 @@ def found_variances(
 
 
 def uncertain_by(windows: WindowMotions, linear: Linear, variances: Array, stated: np.ndarray, scale: Array) -> Array:
-    """Standard deviations (m, 2) of the logarithms of the variances that were found; zero where they were stated.
+    """Standard deviations (m, 2) of the logarithms of the estimated variances; zero where they were stated.
 
-    Of several sensors the best one's noise is what the others' leave, and hardly known.
+    Among several sensors, the noise of the best one is small against the others' and is poorly known.
     """
     m = windows.sensors
     unit = np.ones((m, 2))
@@ -136,14 +137,14 @@ def _score(
     return 0.5 * (squares - traces), information.reshape(2 * m, 2 * m)
 
 
-#: The probability that a window without fault is left out.
+#: The probability that a correct window is left out.
 SIGNIFICANCE = 1e-5
 #: The median of chi-square with six degrees of freedom.
 MEDIAN = 5.348
 
 
 def deletion_squares(linear: Linear, W: Array) -> Array:
-    """(m, n) by how much twice the cost falls if a sensor's window is left out: chi-square with six degrees.
+    """Twice the fall of the cost (m, n) if a sensor's window is left out: chi-square with six degrees of freedom.
 
     With S the contrasts' information and u = S r, a sensor's part u_k has the covariance S_kk.
     """
@@ -156,7 +157,7 @@ def deletion_squares(linear: Linear, W: Array) -> Array:
     alone = np.abs(np.einsum("mnii->mn", S)) <= 1e-9 * np.einsum("mnii->mn", W)
     S[alone] = np.eye(6)
     u[alone] = 0.0
-    # Of two sensors S_kk has full rank; rounding is relative to its entries of rad and m.
+    # With two sensors S_kk still has full rank. It is scaled to a unit diagonal, as its units (rad, m) differ.
     unit = 1.0 / np.sqrt(np.maximum(np.einsum("mnii->mni", S), 1e-300))
     scaled = S * unit[..., :, None] * unit[..., None, :] + 1e-9 * np.eye(6)
     squares: Array = np.einsum("mni,mni->mn", u * unit, np.linalg.solve(scaled, (u * unit)[..., None])[..., 0])
@@ -164,9 +165,9 @@ def deletion_squares(linear: Linear, W: Array) -> Array:
 
 
 def outlying(windows: WindowMotions, linear: Linear, W: Array, noise_is_known: np.ndarray) -> np.ndarray:
-    """(m, n) the windows of sensors that are to be left out: the worst sensor of each window that has one.
+    """Where to leave a sensor's window out, (m, n) booleans: at most the worst sensor of each window.
 
-    Where a sensor's noise is not known (m,), its median square stands for it.
+    The squares are compared with each sensor's median. Where ``noise_is_known`` (m,), the median only raises the limit.
     """
     squares = deletion_squares(linear, W)
     squares[~windows.used] = 0.0

@@ -1,7 +1,7 @@
-"""Tracks compared before anything is solved: whether they can be of one drive, and a first guess of their clocks.
+"""Checks of tracks before solving: whether they can be of one drive, and a first guess of their time offsets.
 
-All sensors of a vehicle turn by the same angles, whatever their mounts, and a vehicle goes much the same way in its own
-axes all the time: ahead.
+All sensors of a vehicle turn by the same angles, wherever they are mounted, and a vehicle mostly moves in one
+direction of its own axes: ahead.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class OdometryOptions:
 
     #: Length of the windows over which motions are compared, seconds. None: the length with the most information
     window_s: float | None = None
-    #: Whether each sensor's clock is compared with the reference's. Leave out only for one clock
+    #: Whether each sensor's clock is compared with the reference's. False only where all share one clock
     estimate_time_offsets: bool = True
     search_s: float = 1.0  #: Time offsets are searched from -search_s to search_s
-    #: A step faster than this is an error of tracking (DQ paper, Appendix D.1, whose limit of 0.1 m a frame has the
-    #: frame rate in it). The default is above what roads see
+    #: A step faster than this is an error of tracking (DQ paper, Appendix D.1, whose limit of 0.1 m a frame
+    #: depends on the frame rate). The default is above road speeds
     max_speed_m_per_s: float = 70.0
     #: A step that turns faster than this is an error of tracking. The paper's 11.5 degrees a frame at 30 frames a
     #: second
@@ -41,7 +41,7 @@ class OdometryOptions:
 
     @property
     def gates(self) -> Gates:
-        """What of a track is not used."""
+        """The limits beyond which parts of a track are not used."""
         return Gates(self.max_speed_m_per_s, self.max_turn_rad_per_s, self.reject_outliers)
 
     def __post_init__(self) -> None:
@@ -51,20 +51,20 @@ class OdometryOptions:
                 raise OptionError(f"OdometryOptions: {name} is {value!r}; give a positive number")
 
 
-#: Motions over about so many seconds are compared.
+#: Motions over about this time are compared (s).
 STEP_S = 1.0
-#: A track whose root mean square turn is less than this part of that of all others stands still beside them.
+#: A track stands still if its root mean square turn rate is below this share of the others'.
 TURNS_LESS = 0.2
-#: Below this, rad/s, all turns may be noise: whether the vehicle turned is another question.
+#: If the others turn more slowly than this (rad/s), their turns may be noise and are not compared.
 LEAST_TURN = float(np.radians(1.0))
-#: A track has at least so many poses in the time of the others.
+#: The fewest poses that a track must have during another track.
 FEWEST_SHARED = 3
-#: Poses are taken as inverted where, read the other way, the vehicle would go so much more in one direction.
+#: Poses are reported as inverted if their inverses raise the share of motion in one direction by more than this.
 MORE_AHEAD = 0.5
 
 
 def check_common_time(tracks: Sequence[OdometryTrack], search_s: float) -> None:
-    """Raise `StampError` where a track shares too little time with the first, clocks being off by ``search_s``."""
+    """Raise `StampError` where a track shares too little time with the first, even if clocks differ by ``search_s``."""
     first = tracks[0]
     margin = round(1e9 * search_s)
     for other in tracks[1:]:
@@ -93,7 +93,7 @@ def check_turns(tracks: Sequence[OdometryTrack]) -> None:
 
 
 def check_not_the_same(tracks: Sequence[OdometryTrack]) -> None:
-    """Raise `OutlierError` where two tracks are one: their poses say nothing of two sensors."""
+    """Raise `OutlierError` where two tracks are equal: then they are not from two sensors."""
     for i, one in enumerate(tracks):
         for two in tracks[i + 1 :]:
             if np.array_equal(one.stamps_ns, two.stamps_ns) and np.allclose(
@@ -125,7 +125,7 @@ def _lasts(track: OdometryTrack) -> str:
 
 
 def _velocities(track: OdometryTrack, *, inverted: bool = False) -> Array:
-    """(n, 6) turns (rad/s) and ways (own lengths a second) over about ``STEP_S``, in the sensor's own axes."""
+    """Velocities (n, 6) over about ``STEP_S`` in the sensor's axes: rad/s, and the track's length unit per second."""
     stamps, T = np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor)
     every = max(1, min(round(STEP_S / (1e-9 * float(np.median(np.diff(stamps))))), (len(stamps) - 1) // 2))
     stamps, T = stamps[::every], T[::every]
@@ -136,33 +136,33 @@ def _velocities(track: OdometryTrack, *, inverted: bool = False) -> Array:
 
 
 def _ahead(velocity: Array) -> float:
-    """How much all motion goes one way: the length (0 to 1) of the mean of its unit vectors."""
+    """The share of motion in one direction: the length (0 to 1) of the mean of the motions' unit vectors."""
     way = velocity[:, 3:]
     size = np.linalg.norm(way, axis=1)
     mean = (way / np.maximum(size, 1e-12)[:, None]).mean(axis=0)
     return float(np.linalg.norm(mean))
 
 
-#: The search takes so many seconds of two tracks, from the middle of what they share, at most.
+#: The search uses at most this time (s), from the middle of the time that both tracks share.
 MOST_S = 180.0
-#: About so many of its poses are enough for a first guess; all are taken where these do not tell.
+#: About this many poses are enough for a first guess; if they fail, all are used.
 ENOUGH = 400
-#: A track is compared in pieces of so many seconds: in one piece, what it drifts would look like a turn.
+#: A track is compared in pieces of this length (s): over a longer time, its drift would look like a rotation.
 PIECE_S = 10.0
-#: A piece has at least so many poses.
+#: The fewest poses of a piece.
 FEWEST_POSES = 5
 
 
 @dataclass(frozen=True)
 class Clock:
-    """A sensor's stamp t is the reference's t + offset_s; ``unknown`` says in words why it was not found."""
+    """A sensor's stamp t is the reference's t + offset_s; ``unknown`` explains why no offset was found."""
 
     offset_s: float
     unknown: str = ""
 
 
 def first_offset(reference: OdometryTrack, track: OdometryTrack, options: OdometryOptions) -> Clock:
-    """By the turns of both: the sensor's start is a target that stands still, the reference's is the world."""
+    """Find the offset by both tracks' rotations: the sensor's start is a static target, the reference's the world."""
     first = max(reference.stamps_ns[0], track.stamps_ns[0])
     last = min(reference.stamps_ns[-1], track.stamps_ns[-1])
     middle, half = (int(first) + int(last)) // 2, round(0.5e9 * MOST_S)
@@ -194,7 +194,7 @@ def first_offset(reference: OdometryTrack, track: OdometryTrack, options: Odomet
 
 
 def _pieces(stamps_ns: np.ndarray, T: Array, max_gap_s: float) -> list[tuple[np.ndarray, Array]]:
-    """The track in pieces without gaps: each is a target of its own, so that what it drifts is small."""
+    """The track in pieces without gaps; each piece has its own target, so that drift within a piece is small."""
     step = float(np.median(np.diff(stamps_ns)))
     gap = np.r_[False, np.diff(stamps_ns) > max(1e9 * max_gap_s, 1.5 * step)]
     piece = np.cumsum(gap | np.r_[False, np.diff((stamps_ns - stamps_ns[0]) // round(1e9 * PIECE_S)) > 0])

@@ -12,15 +12,15 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 
-#: Velocities are differences over so many seconds to each side, or a step if that is longer.
+#: Velocities are central differences over this time to each side (s), or over one step where a step is longer.
 HALF_S = 0.1
-#: A cubic has so many poses: one before, two around and one after.
+#: Poses of one cubic: the two around the time, one before and one after them.
 POINTS = 4
 
 
 @dataclass(frozen=True)
 class SampledTrack:
-    """A track with its clock's offset, times in seconds from ``origin_ns`` on the reference's clock."""
+    """A track and the offset of its clock; times are in seconds from ``origin_ns`` on the reference's clock."""
 
     track: OdometryTrack
     origin_ns: int
@@ -35,13 +35,13 @@ class SampledTrack:
 
     @cached_property
     def _bad_before(self) -> np.ndarray:
-        """How many steps that may not be used end at or before each pose, (N,)."""
+        """The number (N,) of unusable steps that end at or before each pose."""
         counts: np.ndarray = np.r_[0, np.cumsum(~self.good)]
         return counts
 
     @cached_property
     def _sums(self) -> tuple[Array, Array, Array]:
-        """Integrals to each pose of dt, p dt and p p' dt over the ends p of the steps, about the track's mean."""
+        """Integrals of dt, p dt and p p' dt up to each pose. p is a step's end, relative to the track's mean."""
         p = self.track.T_start_sensor[:, :3, 3] - self.centre
         dt = np.r_[0.0, np.diff(self.times)]
         return self.times, np.cumsum(p * dt[:, None], axis=0), np.cumsum(_outer(p) * dt[:, None, None], axis=0)
@@ -73,7 +73,7 @@ class SampledTrack:
         return poses
 
     def covers(self, start: Array, end: Array, max_gap_s: float) -> np.ndarray:
-        """Which windows (M,) are inside the track and have no bad step and no gap."""
+        """Which windows (M,) are inside the track and contain no bad step and no gap."""
         times = self.times
         inside = (start >= times[0] - 1e-9) & (end <= times[-1] + 1e-9)
         a = np.clip(np.searchsorted(times, start + 1e-9, side="right") - 1, 0, len(times) - 1)
@@ -92,13 +92,13 @@ class SampledTrack:
         return velocity
 
     def path_sums(self, start: Array, end: Array, T_end: Array) -> tuple[Array, Array, Array]:
-        """Over each window: its length (M,), and the integrals (M, 3), (M, 3, 3) of p and p p' in the end's frame.
+        """For each window: its length (M,) and the integrals (M, 3), (M, 3, 3) of p and p p' in the end's frame.
 
-        p is where the sensor was, so that a twist of its pose there moves its pose at the end by the adjoint.
+        p is a past position of the sensor. By the adjoint, a twist of the pose at p moves the pose at the end.
         """
         length, first, second = (_between(self.times, sums, start, end) for sums in self._sums)
         R, at_end = T_end[:, :3, :3], T_end[:, :3, 3] - self.centre
-        # of p - p_end, then turned into the end's frame
+        # relative to p_end, then rotated into the end's frame
         second = second - _outer_sum(first, at_end) + length[:, None, None] * _outer(at_end)
         first = first - length[:, None] * at_end
         turned = np.swapaxes(R, 1, 2)
@@ -106,7 +106,7 @@ class SampledTrack:
 
 
 def _between(times: Array, sums: Array, start: Array, end: Array) -> Array:
-    """The difference of cumulative sums (N, ...) at two times, linear between poses."""
+    """The difference of cumulative sums (N, ...) between two times; interpolated linearly between poses."""
     flat = sums.reshape(len(times), -1)
 
     def at(when: Array) -> Array:
@@ -131,7 +131,7 @@ def _outer_sum(p: Array, q: Array) -> Array:
 
 @dataclass(frozen=True)
 class WindowMotions:
-    """Motions of m sensors over n windows that follow one another: their errors are independent."""
+    """Motions of m sensors over n consecutive windows; the windows' errors are independent."""
 
     #: start, end: (n,) s
     start: Array
@@ -147,9 +147,9 @@ class WindowMotions:
 
     @staticmethod
     def of(tracks: Sequence[SampledTrack], edges: Array, max_gap_s: float, *, clocks: bool = True) -> WindowMotions:
-        """Between neighbouring times ``edges`` (n + 1,); windows that fewer than two sensors have are left out.
+        """Between neighbouring times ``edges`` (n + 1,); windows with fewer than two sensors are left out.
 
-        Without ``clocks`` the derivatives by offsets are zero.
+        Without ``clocks`` the derivatives with respect to the time offsets are zero.
         """
         start, end = edges[:-1], edges[1:]
         used = np.array([track.covers(start, end, max_gap_s) for track in tracks])
@@ -162,7 +162,7 @@ class WindowMotions:
 
     @property
     def sensors(self) -> int:
-        """How many sensors there are."""
+        """The number of sensors."""
         return len(self.M)
 
     def __len__(self) -> int:
@@ -194,7 +194,7 @@ class WindowMotions:
         return of_rotation, of_translation
 
     def selected(self, windows: np.ndarray) -> WindowMotions:
-        """Some of the windows, by mask or numbers."""
+        """The windows that a mask or indices select."""
         return WindowMotions(
             self.start[windows],
             self.end[windows],
@@ -202,7 +202,7 @@ class WindowMotions:
         )
 
     def without(self, left_out: np.ndarray) -> WindowMotions:
-        """The same, with a sensor's windows (m, n) not used where ``left_out`` is true."""
+        """The same motions, without those of sensor and window (m, n) where ``left_out`` is true."""
         used = self.used & ~left_out
         return WindowMotions(
             self.start, self.end, self.M, used, self.length, self.first, self.second, self.by_offset
@@ -221,9 +221,10 @@ def _of_track(track: SampledTrack, start: Array, end: Array, *, clocks: bool) ->
 
 
 def first_rotation_variances(windows: WindowMotions) -> Array:
-    """A start (m,), rad^2/s: the turn's angle is the same in all sensors, whatever their poses.
+    """First estimates (m,) of the rotation variances, rad^2/s.
 
-    The difference of two sensors' angles has the sum of their variances; medians, so that outliers do not count.
+    All sensors turn by the same angle, whatever their poses. So the variance of the difference of two sensors' angles
+    is the sum of both variances. It is estimated by medians, which outliers hardly change.
     """
     angles = np.linalg.norm(windows.rotation_vectors(), axis=2)
     m = windows.sensors
@@ -241,7 +242,7 @@ def first_rotation_variances(windows: WindowMotions) -> Array:
     if not rows:
         return np.full(m, 1e-6)
     mean = float(np.mean(right)) / 2.0
-    # A little towards the mean: two sensors tell only the sum.
+    # A weak pull towards the mean: two sensors determine only the sum.
     ridge = 1e-3 * np.eye(m)
     found = np.linalg.lstsq(np.vstack([rows, ridge]), np.r_[right, np.full(m, 1e-3 * mean)], rcond=None)[0]
     floor = max(0.05 * mean, 1e-16)
@@ -249,24 +250,24 @@ def first_rotation_variances(windows: WindowMotions) -> Array:
     return result
 
 
-#: Lengths that are tried, in steps of the slowest sensor.
+#: The window lengths to try, in steps of the slowest sensor.
 LADDER = (1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40)
 #: The longest window, seconds: a second of driving is one motion, a minute is not.
 LONGEST_S = 5.0
 #: Turns of more than this in 95 % of windows make rotation vectors a poor measure, rad.
 LARGEST_TURN_RAD = 1.2
-#: This part of the information along each axis may be lost to longer windows.
+#: Longer windows may lose this share of the information along each axis.
 LOSS = 0.01
-#: An axis has information if what it shows is so many times what noise would.
+#: An axis has information if its sum of squares is this many times that of noise alone.
 CLEARLY = 4.0
-#: A vehicle turned about an axis if the square of its turns is so many times that of their noise, as it was found.
+#: The vehicle turned about an axis if its mean square turn is this many times the estimated noise variance.
 PLAINLY = 10.0
-#: Fewer windows than this say little about their own noise.
+#: Fewer windows than this are not enough to estimate their noise.
 FEWEST = 20
 
 
 def edges_of(tracks: Sequence[SampledTrack], every: int) -> Array:
-    """Times (n + 1,) at each so-many-th pose of the slowest track, where at least two tracks are."""
+    """Times (n + 1,) of every ``every``-th pose of the slowest track, while at least two tracks run."""
     slowest = max(tracks, key=lambda track: float(np.median(np.diff(track.times))))
     begin = sorted(track.times[0] for track in tracks)[1]
     end = sorted(track.times[-1] for track in tracks)[-2]
@@ -276,13 +277,13 @@ def edges_of(tracks: Sequence[SampledTrack], every: int) -> Array:
 
 
 def edges_near(tracks: Sequence[SampledTrack], seconds: float) -> Array:
-    """Times (n + 1,) about so many seconds apart."""
+    """Times (n + 1,) about ``seconds`` apart."""
     step = max(float(np.median(np.diff(track.times))) for track in tracks)
     return edges_of(tracks, max(1, round(seconds / step)))
 
 
 def best_length(tracks: Sequence[SampledTrack], max_gap_s: float) -> float:
-    """The length, seconds, of the windows that have the most information of the turns."""
+    """The window length, seconds, with the most information from the rotations."""
     step = max(float(np.median(np.diff(track.times))) for track in tracks)
     pilot = WindowMotions.of(tracks, edges_near(tracks, 5.0 * step), max_gap_s, clocks=False)
     variances = first_rotation_variances(pilot)
@@ -300,13 +301,13 @@ def best_length(tracks: Sequence[SampledTrack], max_gap_s: float) -> float:
         found.append((value, every * step))
     if not found:
         return step
-    # Of lengths that tell as much, the longest: fewer windows, with turns that stand out of the noise.
+    # The longest of the lengths with nearly the most information: fewer windows, and turns well above the noise.
     enough = max(value for value, _ in found) - LOSS * 3.0 * len(tracks)
     return [seconds for value, seconds in found if value >= enough][-1]
 
 
 def _information(windows: WindowMotions, variances: Array) -> tuple[float, float]:
-    """The logarithm of the information along the axes in which there is any, and the turn of long windows."""
+    """The log information, summed over the axes that have any, and the windows' turn (rad, 95 % quantile)."""
     w = windows.rotation_vectors()
     value = 0.0
     for k in range(windows.sensors):
@@ -315,16 +316,16 @@ def _information(windows: WindowMotions, variances: Array) -> tuple[float, float
         rows = w[k, used] / np.sqrt(noise)[:, None]
         N = 2.0 * float(used.sum())
         S = np.linalg.eigvalsh(float((rows**2).sum()) * np.eye(3) - rows.T @ rows)
-        # What is above N by chance, or as the noise is known roughly, tells nothing.
+        # A small excess over N is no information: it is chance, or an error of the roughly known noise.
         told = np.where(S > CLEARLY * N, S - N, 0.0)
         value += float(np.log1p(told**2 / (told + N + 1e-300)).sum())
     return value, float(np.quantile(np.linalg.norm(w[windows.used], axis=1), 0.95))
 
 
 def axes_turned(windows: WindowMotions, motion: Array, variance: float) -> tuple[int, Array, Array]:
-    """About how many axes the fused motions turned beyond their noise (0 to 3), mean squares (3,), and the axes (3, 3).
+    """The number of axes (0 to 3) of fused turns above the noise, the mean squares (3,), and all axes (3, 3).
 
-    ``variance`` is that of the fused rotation about each axis, rad^2 a second.
+    ``variance`` is the fused rotation's variance about each axis, rad^2/s.
     """
     w = se3.so3_logmap(motion[:, :3, :3])
     square, axes = np.linalg.eigh(w.T @ w)

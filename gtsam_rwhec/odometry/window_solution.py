@@ -1,4 +1,4 @@
-"""The maximum of the exact likelihood: Gauss-Newton over all unknowns, the windows' motions eliminated."""
+"""Maximises the exact likelihood: Gauss-Newton over all unknowns, with the windows' motions eliminated."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gtsam_rwhec.odometry.window_likelihood import (
 )
 from gtsam_rwhec.odometry.window_motions import WindowMotions
 
-#: Steps at most. Well-excited drives take four.
+#: The most Gauss-Newton steps. Well-excited drives take four.
 MAX_STEPS = 40
 #: Converged when a step would lower the cost by less than this.
 CONVERGED = 1e-9
@@ -39,7 +39,7 @@ LARGEST_STEP = 0.3
 
 @dataclass(frozen=True)
 class Fit:
-    """The end of a refinement."""
+    """The result of a refinement."""
 
     state: State
     linear: Linear
@@ -50,7 +50,7 @@ class Fit:
 
 
 def motions_fitted(windows: WindowMotions, W: Array, state: State, layout: Layout, steps: int = 3) -> State:
-    """The same poses with each window's motion at its best."""
+    """The state with the same poses and the best motion of each window."""
     still = np.zeros(layout.size)
     for _ in range(steps):
         normal = eliminated(linearised(windows, state), W, layout)
@@ -59,7 +59,7 @@ def motions_fitted(windows: WindowMotions, W: Array, state: State, layout: Layou
 
 
 def refined(windows: WindowMotions, W: Array, state: State, layout: Layout, given: GivenRows, determined: Array) -> Fit:
-    """Go down from a state along the directions ``determined`` (p, q), orthonormal columns."""
+    """Minimise the cost from a state, along the orthonormal columns of ``determined`` (p, q) only."""
     state = motions_fitted(windows, W, state, layout, steps=2)
     converged = False
     for _ in range(MAX_STEPS):
@@ -92,7 +92,7 @@ def _at(
 
 
 def settled(state: State, free: Array, layout: Layout) -> State:
-    """Free shifts taken out: along free directions of translations alone the sensors go where they are nearest."""
+    """Along free directions that are translations only, move the sensors as near to sensor 0 as possible."""
     if not free.shape[1]:
         return state
     moved = np.array([layout.spread(direction) for direction in free.T])[:, :, :6]  # (f, m, 6)
@@ -110,24 +110,24 @@ def settled(state: State, free: Array, layout: Layout) -> State:
     return replace(state, T=T)
 
 
-#: Rounds of the certified form: its turns, ways and weights are those of the round before.
+#: Rounds of the certified form. Each takes rotations, translations and weights from the round before.
 ROUNDS = 8
-#: The form has settled when no variance changes by more than this part.
+#: The rounds end when no variance changes by more than this share.
 SETTLED = 0.02
-#: Rounds of noise, freedom and refinement after it.
+#: After them, rounds of refinement, each with new noise and free directions.
 REFINED = 3
-#: A free direction is tested with noise that is larger by so many of its deviations, and by at most this factor.
+#: Free directions are tested with larger noise: by this many standard deviations, and at most by this factor.
 UNSURE, MOST_UNSURE = 3.0, 30.0
-#: At least so many windows must be left, and so large a part of those of a sensor.
+#: The fewest windows that must be left, and the smallest share of each sensor's windows.
 FEWEST, LEAST_SHARE = 6, 0.3
 
 
 @dataclass(frozen=True)
 class Task:
-    """What does not change with the windows."""
+    """The inputs that do not depend on the windows."""
 
     names: tuple[str, ...]  #: Sensors; the poses are in the frame of the first
-    #: scaled, stated: (m,) booleans: Whose scale is unknown, and whose noise was stated
+    #: scaled, stated: (m,) booleans: which sensors' scale is unknown, and which sensors' noise was stated
     scaled: np.ndarray
     stated: np.ndarray
     layout: Layout
@@ -137,7 +137,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Answer:
-    """What was found on one set of windows."""
+    """The solution on one set of windows."""
 
     windows: WindowMotions  #: Those that are used
     left_out: np.ndarray  #: (m, n') booleans: outlying windows of the set that was given
@@ -152,7 +152,7 @@ class Answer:
 def solve_windows(
     windows: WindowMotions, variances: Array, task: Task, start: State | None, progress: Progress
 ) -> Answer:
-    """All of it for one set of windows; ``start`` is an answer for other windows."""
+    """Solve, certify and refine on one set of windows; ``start`` is a solution on other windows."""
     progress("solving jointly")
     every = windows
     left_out = np.zeros_like(windows.used)
@@ -232,12 +232,12 @@ def _certified(
 
 
 def freedom_at(windows: WindowMotions, W: Array, variances: Array, state: State, task: Task) -> Freedom:
-    """What is free at a state."""
+    """The free directions at a state."""
     linear = linearised(windows, state)
     normal = eliminated(linear, W, task.layout)
     still = linear.r - np.einsum("mnij,nj->mni", linear.B, normal.motions(np.zeros(task.layout.size)))
     spare = 6.0 * float((windows.used.sum(axis=0) - 1).sum()) - task.layout.size
-    # The noise as it is known: what was found may be larger, and what was stated may be too small for the residuals.
+    # The largest plausible noise: the estimate may be too small, and stated noise may be too small for the residuals.
     unsure = uncertain_by(windows, linear, variances, task.stated, state.scale)
     excess = max(1.0, float(np.einsum("mni,mnij,mnj->", still, W, still)) / max(spare, 1.0))
     largest = variances * np.exp(np.minimum(UNSURE * unsure, np.log(MOST_UNSURE))) * excess
@@ -260,7 +260,7 @@ def freedom_at(windows: WindowMotions, W: Array, variances: Array, state: State,
 def _left_out(
     every: WindowMotions, windows: WindowMotions, left_out: np.ndarray, new: np.ndarray, task: Task
 ) -> tuple[np.ndarray, WindowMotions]:
-    """The outlying windows with new ones, in the numbers of all windows."""
+    """Add new outlying windows to ``left_out``, which has the indices of all windows; return both."""
     at = np.searchsorted(every.start, windows.start)
     left_out = left_out.copy()
     left_out[:, at] |= new
