@@ -49,10 +49,11 @@ def test_only_our_errors_leave_a_reader(reader: str, part: int, tmp_path: Path) 
 def test_errors_loops_and_memory_of_a_planted_reader_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "planted.py").write_text(PLANTED)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(run.HERE)}", prepend=":")
-    outcome = run.fuzz("planted", 8.0, tmp_path / "corpus", tmp_path / "findings", seed=1)
+    outcome = run.fuzz("planted", 60.0, tmp_path / "corpus", tmp_path / "findings", seed=1, most=1200)
     kinds = " ".join(outcome.findings)
-    for kind in ("KeyError at planted.py:9 read", "TooLongError at planted.py:1", "MemoryError: peak"):
-        assert kind in kinds
+    assert "KeyError at planted.py:9 read" in kinds
+    assert "TooLongError at planted.py:1" in kinds
+    assert "MemoryError: peak" in kinds or "oom" in kinds  # of libFuzzer, where its watch comes first
     assert 0 < outcome.refused < outcome.executions
     inputs = {(folder / "input.bin").read_bytes()[0] % 8 for folder in outcome.findings.values()}
     assert inputs == {1, b"l"[0] % 8, 3}
