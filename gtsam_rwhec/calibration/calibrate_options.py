@@ -1,4 +1,4 @@
-"""The options of ``calibrate``, each of which overrules a choice, and the record that its stages write."""
+"""The options of ``calibrate``, each of which overrules a choice, and the record of what its stages chose and found."""
 
 from __future__ import annotations
 
@@ -38,22 +38,23 @@ ObservationChoice = Literal["auto", "corners", "poses"]
 class CalibrateOptions(PoseOptions):
     """The options of ``calibrate``; the defaults leave every choice to the data."""
 
-    #: Errors of neighbours in time: found out, a random walk (odometry), with a correlation time, or independent.
+    #: Errors of measurements that are neighbours in time: "auto" (the data decide), a random walk (odometry), errors
+    #: with a correlation time, or independent errors.
     drift: Drift = "auto"
-    #: Whether A has errors that vary with the configuration (an arm's kinematics). The constant part, which no residual
-    #: shows, is assumed to be twice as large, as probably as the data say.
+    #: Whether A may have errors that vary with the configuration (an arm's kinematics), if the data show them. Their
+    #: constant part shows in no residual: it is assumed to be twice as large, weighted by the probability that the data
+    #: give such errors.
     systematic: bool = True
-    #: The carrier to which errors of A are fixed: an arm's hand. None: found out.
+    #: The carrier in whose frame errors of A are modelled, such as an arm's hand. None: the data decide.
     hand: About | None = None
     #: "auto" and "gnc": measurements that contradict the others are left out, and the rest is certified again. "auto"
     #: leaves this out where there are too few measurements to tell. "none": every measurement counts.
     robust: RobustChoice = "auto"
-    #: Look for likely mistakes in the reading of A and B. Where there are any, or residuals that no sensor has (these
-    #: are looked for whatever this says), nothing else is done.
+    #: Look for likely mistakes in the reading of A and B. If one is found, nothing else is computed. The same holds for
+    #: residuals that no sensor has, which are always looked for.
     misreadings: bool = True
-    #: Where the sizes of targets are said to be known (``scale="known"``). "check": a size that the motion contradicts
-    #: is found. "known": it is not looked for. "correct": it is found, and estimated in place of the stated one.
-    #: "estimate": all are.
+    #: For targets with known sizes (``scale="known"``). "check": report a stated size that the motion contradicts.
+    #: "known": do not check sizes. "correct": report such a size, and estimate it. "estimate": estimate all sizes.
     sizes: SizesChoice = "check"
     #: Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
     #: sensor where stamps and motion determine it, also where it is small; not over standstill, nor between stations
@@ -62,8 +63,8 @@ class CalibrateOptions(PoseOptions):
     #: What the answer is refined from. "auto": from the corners where the problem holds them for every measurement
     #: (``problem.add_corners``) and they give a better answer than the poses. "corners": such a problem is asked for.
     observations: ObservationChoice = "auto"
-    #: How: where the intrinsics are from, what of the boards is free. Left out: intrinsics are nominal, boards are as
-    #: stated, and A's noise is estimated, or as in ``carrier_noise``.
+    #: Options of the refinement from corners: where the intrinsics come from, what of the boards is free. None:
+    #: intrinsics are nominal, boards are as stated, and A's noise is estimated, or as in ``carrier_noise``.
     corners: CornerOptions | None = None
     #: Probability of the ellipsoids in the report, in task units.
     level: float = 0.95
@@ -106,7 +107,7 @@ def offsets_of(problem: Problem, options: CalibrateOptions) -> bool | tuple[str,
     return tuple(name for name in options.time_offsets if name in problem.sensors)
 
 
-#: The verdict says better what these warn of.
+#: Warnings that do not become notes, because the verdict reports them.
 SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
 
 
@@ -119,26 +120,26 @@ class Record:
     notes: dict[str, None] = field(default_factory=dict)
 
     def choose(self, what: str, chosen: str, evidence: str) -> None:
-        """Say what was chosen, and why."""
+        """Record a choice and its evidence."""
         self.choices.append(Choice(what, chosen, evidence))
 
     def find(self, ground: Ground, words: str) -> None:
-        """Say what was found against the poses."""
+        """Record a finding against the poses."""
         self.findings.append(Finding(ground, words))
 
     def start_again(self, ground: Ground, words: str) -> None:
-        """Forget all that was chosen and found: the answer to which it belongs is not given, for this reason."""
+        """Discard all choices and findings, because their answer is not returned; record the reason."""
         self.choices, self.findings = [], [Finding(ground, words)]
         self.notes.clear()
 
     def take(self, other: Record) -> None:
-        """Take over what an attempt chose and found, now that it counts."""
+        """Add the choices and findings of an attempt whose answer is kept."""
         self.choices += other.choices
         self.findings += other.findings
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Warnings of this library become notes, but for those that the verdict says better; others stay warnings."""
+        """Turn this library's warnings into notes, except those that the verdict reports; others stay warnings."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             yield
@@ -151,17 +152,17 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a log knows beside its measurements, and ``calibrate`` asks of it."""
+    """What ``calibrate`` uses of a log besides its measurements."""
 
-    #: The measurements with those that cleaning removed because they contradict the carriers' motion: a misreading
-    #: makes these
+    #: All measurements, including those that cleaning removed because they contradict the carriers' motion: a
+    #: misreading may be the cause
     uncleaned: Problem | None = None
     is_detected: bool = False  #: Whether this library found B in images: it was not misread
-    #: Whether A is the inverse of the carriers' poses as they were written: these may be what was misread
+    #: Whether A is the inverse of the carriers' poses in the log; then the poses in the log may have been misread
     is_inverse: bool = False
-    #: Stated clocks that the carriers' turning contradicts: nothing else is computed then
+    #: Stated clock offsets that the carriers' rotation contradicts; if there are any, nothing else is computed
     late: tuple[Finding, ...] = ()
-    #: Sensors whose corners contradict their stated intrinsics by far: where these lead nowhere, they are unknown
+    #: Sensors whose corners strongly contradict their stated intrinsics; if those give no answer, they count as unknown
     far_off: tuple[str, ...] = ()
 
 
@@ -174,14 +175,15 @@ class Run:
     tell: Progress  #: Is called with the name of each step
     recording: Recording | None = None  #: None for measurements of no log
     record: Record = field(default_factory=Record)
-    times: int = 1  #: How often it was begun, since poses of targets were computed again
-    #: The intrinsics by which they were, where these are not the stated ones
+    times: int = 1  #: The number of starts: one more each time that target poses were computed again
+    #: The intrinsics with which target poses were computed again, where they differ from the stated ones
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     #: The problem with sizes as they were stated, where some are estimated in their place
     stated: Problem | None = None
-    #: By sensor: how much later than its stamps said A was taken along the carriers' path
+    #: By sensor: the time that was added to its stamps when A was taken from the carriers' path
     moved_s: Mapping[str, float] = field(default_factory=dict)
-    #: The measurements that agree, where clocks and sizes told already, and their certified solution
+    #: The certified solution of the measurements that agree, and which these are, if the stage of clocks and sizes
+    #: found them
     agreed: tuple[Solution, Inliers] | None = None
 
     @property
@@ -190,7 +192,7 @@ class Run:
         return "an option says so" if self.recording is None else "the rig file says so"
 
     def again(self, problem: Problem, cameras: Mapping[str, Camera]) -> Run:
-        """The run of a problem with other poses of targets, from its beginning."""
+        """A new run, from the first stage, of a problem whose target poses were computed again."""
         if self.stated is not None:
             problem = with_sizes_of(problem, self.stated)
         return replace(
@@ -198,11 +200,11 @@ class Run:
         )
 
     def attempt(self) -> Run:
-        """The same with an empty record: it may be thrown away."""
+        """The same run with an empty record, which may be discarded."""
         return replace(self, record=Record())
 
     def with_time_offsets(self, of: tuple[str, ...]) -> Run:
-        """The same, told of which sensors to estimate the time offsets; the record is shared."""
+        """The same run, with time offsets estimated for the named sensors; the record is shared."""
         return replace(self, options=replace(self.options, time_offsets=of))
 
 

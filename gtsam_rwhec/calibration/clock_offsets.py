@@ -1,8 +1,8 @@
-"""Clocks: whether stamps and motion determine a sensor's offset, and the answer with the offsets that they determine.
+"""Clock offsets: which of them stamps and motion determine, and the answer with these offsets estimated.
 
-One step of Gauss-Newton with the offset beside the sensor's pose, its targets' poses and a scale tells how large the
-offset is about and how well it would be known. It is not worth estimating where the carriers' path between the stamps
-is not known: they stood still, or the poses are stations, and what lies between them is not in the data.
+One Gauss-Newton step, whose unknowns are the offset, the sensor's pose, its targets' poses and a scale, gives a first
+estimate of the offset and its standard deviation. It is not worth estimating where the carriers' path between the
+stamps is not known: they stood still, or the poses are stations, and what lies between them is not in the data.
 """
 
 from __future__ import annotations
@@ -29,21 +29,22 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution
 
-#: An offset that would be known less well than this, s, is not estimated: a camera's frames are about as far apart.
+#: An offset whose standard deviation (s) would be larger is not estimated: a camera's frame interval is about as long.
 LARGEST_SIGMA_S = 0.02
-#: More of the carriers' squared velocity than this may not be noise, or a guess between poses that are far apart.
+#: The largest share of the carriers' squared velocity that may be error (noise, or interpolation between distant
+#: poses).
 LARGEST_UNKNOWN_SHARE = 0.05
-#: Fewer stamps than this determine no offset that could be checked.
+#: With fewer stamps no offset is estimated: it could not be checked.
 FEWEST_STAMPS = 10
-#: Why a clock without stamps is not estimated.
+#: Why the offset of a sensor without stamps is not estimated.
 NO_STAMPS = "its measurements have no stamps"
 #: At most this many targets of a sensor are looked at, those with most measurements.
 MOST_TARGETS = 40
-#: An offset of so many standard deviations is not zero.
+#: An offset of more standard deviations than this is clearly not zero.
 CLEARLY = 4.0
 #: Residuals beyond this many standard deviations are left out.
 GROSS_SIGMAS = 4.5
-#: Blocks of time, with equal shares of the information; their scatter gives the standard deviation too.
+#: Number of time blocks with equal information; the scatter of their estimates gives a second standard deviation.
 BLOCKS_OF_TIME = 8
 
 
@@ -129,7 +130,7 @@ def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: T
             f"the carriers stood still, or how they moved between stamps {apart_s:.2g} s apart is not known{help_}",
         )
     offset_s, sigma_s = _one_step(_OffsetRows.of(data, solution, frozenset(problem.fixed_scales)))
-    # What is wrong in the velocities stretches the offset.
+    # An error of the velocities scales the offset.
     sigma_s = float(np.hypot(sigma_s, unknown * offset_s))
     about = f"motion tells it to +-{1e3 * sigma_s:.2g} ms"
     if not sigma_s <= LARGEST_SIGMA_S:
@@ -147,7 +148,7 @@ def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: T
 
 
 def _unknown_share(paths: dict[Pair, LocalPaths]) -> float:
-    """The part of the squared velocity that is error: of turning or of moving, whichever is known better."""
+    """The share of the squared velocity that is error: of the angular or the linear one, whichever is smaller."""
     squares, error = np.zeros(2), np.zeros(2)
     for path in paths.values():
         squares += (path.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
@@ -221,11 +222,11 @@ class _OffsetRows:
         return _OffsetRows(np.concatenate(r), np.concatenate(J), np.concatenate(stamps))
 
 
-#: A time offset of so many standard deviations explains rows that look shifted.
+#: A time offset of at least so many standard deviations explains rows that look shifted.
 LATE_SIGMAS = 5.0
-#: A clock that was taken as right moves poses by millimetres and more if it is off by more than this, s.
+#: A clock error above this (s) that is not estimated moves poses by millimetres or more.
 LATE_S = 0.005
-#: Where more than this share of a sensor's measurements are outliers, its clock may have made them.
+#: If more than this share of a sensor's measurements are outliers, a clock error may be the cause.
 MANY_LEFT_OUT = 0.25
 TIME_OFFSETS = "time offsets"
 
@@ -246,7 +247,7 @@ class Answer:
 
 
 def check_offsets(run: Run) -> None:
-    """An OptionError for time offsets that are asked of no sensor."""
+    """Raise an OptionError if time offsets are asked for a sensor that the problem does not have."""
     given = run.options.time_offsets
     if isinstance(given, tuple):
         unknown = [name for name in given if name not in run.problem.sensors]
@@ -266,7 +267,7 @@ def answer(run: Run, first: Solution | None) -> Answer:
 
 
 def late_in_place_of_shifted(run: Run, first: Solution | None) -> Answer | None:
-    """The answer where a late clock explains rows that look shifted; None where it does not."""
+    """The answer with time offsets, if a late clock explains rows that look shifted; else None."""
     if run.options.time_offsets != "auto":
         return None
     attempt = run.attempt()
@@ -290,7 +291,7 @@ def _by_option(run: Run, first: Solution | None) -> Answer:
 
 
 def _by_the_data(run: Run, first: Solution | None) -> Answer:
-    """Clocks are looked at before outliers are, and again without the outliers."""
+    """Choose the clocks to estimate from all measurements, and choose again without the outliers."""
     before = _clocks(run, first, {})
     attempt = run.attempt()
     found = _with_offsets(attempt, first, _worth_estimating(before), before)
@@ -303,7 +304,7 @@ def _by_the_data(run: Run, first: Solution | None) -> Answer:
     known = [name for name in worth if _is_known(found.refined, name)]
     new = [name for name in worth if name not in found.time_offsets_s]
     if new or len(known) != len(found.time_offsets_s):
-        # Outliers had hidden what the motion tells, or the motion of what is left tells less.
+        # Outliers hid an offset, or the measurements that are left do not determine one.
         attempt = run.attempt()
         found = _with_offsets(attempt, first, (*known, *new), after)
     run.record.take(attempt.record)
@@ -335,7 +336,7 @@ def _clocks(run: Run, solution: Solution | None, inliers: Inliers) -> tuple[Cloc
 
 
 def _evidence(clocks: tuple[Clock, ...]) -> str:
-    """The evidence of all clocks; what is true of several is said once."""
+    """The evidence of all clocks; evidence that several share is given once."""
     sensors: dict[str, list[str]] = {}
     for clock in clocks:
         sensors.setdefault(clock.evidence, []).append(clock.sensor)
@@ -345,9 +346,10 @@ def _evidence(clocks: tuple[Clock, ...]) -> str:
 
 
 def _stated_clocks(run: Run, found: Answer) -> tuple[Clock, ...]:
-    """The clocks that were taken as right, by the measurements that agree.
+    """What the measurements that agree say of the clocks that were taken as right.
 
-    A late clock makes outliers of what moves. So where many of a sensor's were left out, all of them are asked too.
+    A late clock makes outliers while carriers move. So where many measurements of a sensor are outliers, all of its
+    measurements are used.
     """
     stated = [name for name in run.problem.sensors if name not in found.time_offsets_s]
     if not stated:
@@ -365,7 +367,7 @@ def _stated_clocks(run: Run, found: Answer) -> tuple[Clock, ...]:
 
 
 def _doubt_stated_clocks(run: Run, clocks: tuple[Clock, ...]) -> None:
-    """Clocks that were taken as right, and that the motion contradicts."""
+    """Record a finding for each clock that was taken as right although the motion contradicts it."""
     for clock in clocks:
         if clock.is_clearly_off and clock.offset_s is not None:
             ground = Ground.LATE_CLOCK if abs(clock.offset_s) > LATE_S else Ground.COVARIANCE_DOUBTED

@@ -1,8 +1,8 @@
-"""The answer from corners: which model predicts images best that were left out, what comes out, and the poses again.
+"""The answer from corners: held-out images choose the noise model; target poses are computed again where needed.
 
-Poses of boards come first: they give the certified start, the outliers among images, and the noise in time and over the
-configuration. The corners then give the answer, with the cameras' intrinsics as variables. Poses were computed by the
-stated intrinsics, and a flat board's was chosen of two: where the answer says otherwise, they are computed again.
+The poses of boards come first: they give the certified start, the outlier images, and the noise in time and over the
+configuration. The corners then give the answer, with the cameras' intrinsics as variables. The board poses used the
+stated intrinsics, and a flat board has two possible poses: where the answer disagrees, they are computed again.
 """
 
 from __future__ import annotations
@@ -47,17 +47,18 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import nearer_poses, selected, with_poses
 from gtsam_rwhec.solver.solution import solve
 
-#: At most so many images are looked at, and of a pair at least so many.
+#: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
-#: Images are left out in so many blocks; of so few images, in more: the rest must still tell what all of them tell.
+#: Number of cross-validation folds; below `FEW_IMAGES` images more folds, so that enough images remain to calibrate
+#: from.
 FOLDS, FEW_IMAGES, FOLDS_OF_FEW = 4, 50, 8
-#: A counts as exact where the error is below this share of that with its noise.
+#: A counts as exact if this lowers the held-out error to less than this share of the error with noise of A.
 BETTER_SHARE = 0.95
 
 
 @dataclass(frozen=True)
 class Score:
-    """A model with its error in images that were left out, and the one that its covariances make one expect."""
+    """A model, its error in held-out images, and the error that its covariances predict."""
 
     words: str
     px: float
@@ -76,7 +77,7 @@ class Tried:
     """The model that was chosen."""
 
     options: CornerOptions
-    words: str  #: What it takes as known of A and of sizes
+    words: str  #: What it assumes about A and about sizes
     evidence: str
     scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
     left_out: LeftOut  #: Of the chosen one; empty where images are too few
@@ -90,7 +91,7 @@ def chosen_model(
     tell: Progress,
     thin: CornersRefined | None = None,
 ) -> Tried:
-    """The options under which images that were left out are predicted best: those given, or with A as exact.
+    """The options that predict held-out images best: the given ones, or the same with A as exact.
 
     Raises as ``refine_corners`` does.
     """
@@ -146,7 +147,7 @@ def _scored(
 
 
 def in_words(options: CornerOptions) -> str:
-    """What the options take as known of A and of sizes."""
+    """What the options assume about A and about sizes."""
     noise = options.carrier_noise
     if isinstance(noise, CarrierNoise):
         of_A = f"A's noise as stated ({np.degrees(noise.rotation_rad):.2g}° and {1e3 * noise.translation_m:.2g} mm)"
@@ -161,34 +162,34 @@ def in_words(options: CornerOptions) -> str:
     return f"{of_A} and {f'the size of {free[0]}' if len(free) == 1 else 'some sizes'} estimated"
 
 
-#: What is chosen: the measurements that the answer is from.
+#: The name of this choice: whether the answer is from corners or from poses.
 MEASUREMENTS = "refinement"
-#: Standard deviation of a size that is estimated, a share of 1.
+#: Prior standard deviation of an estimated size, relative.
 SIZE_SHARE = 0.2
-#: A growth of standard deviations below this is not said.
+#: A growth of standard deviations below this factor is not reported.
 SEEN_GROWTH = 1.05
-#: Images that were left out are off by more than this times what covariances say, where the model lacks something.
+#: If errors in held-out images are more than this many times what the covariances predict, the model is incomplete.
 UNEXPLAINED = 1.5
-#: Exact intrinsics that are off by more deviations of a calibration than this make wrong poses.
+#: Intrinsics taken as exact, but wrong by more than this many standard deviations of a calibration, give wrong poses.
 SURE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class CornersFound:
-    """What the corners gave."""
+    """The result of the refinement from corners."""
 
     corners: CornersRefined | None  #: None where they give no better answer than the poses
     intrinsics: dict[str, Intrinsics]
     reprojection: Reprojection | None
     choices: tuple[Choice, ...]
     findings: tuple[Finding, ...]
-    #: By how much each unknown's deviations are widened, since images that were left out are farther off than the
-    #: covariances say; empty where they are not
+    #: The factor on each unknown's standard deviations, where held-out images have larger errors than the covariances
+    #: predict; else empty
     wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @staticmethod
     def none(why: str, *findings: Finding) -> CornersFound:
-        """Nothing, and why; with what that says against the poses of the same images."""
+        """No answer from corners, and why; with findings against the poses of the same images."""
         choice = Choice(MEASUREMENTS, "from the poses of targets in the images", why)
         return CornersFound(None, {}, None, (choice,), findings)
 
@@ -201,7 +202,7 @@ class CornersFound:
         return tuple(name for name, one in corners.intrinsics.items() if one.innovation.is_contradicted)
 
     def refined(self, base: Refined, noise: NoiseInData | None) -> Refined:
-        """The answer: from the corners, with what the poses (`base`) say of their noise; `base` where there is none."""
+        """The answer from corners, with the noise that the poses (`base`) show; `base` if there is none."""
         if self.corners is None or self.reprojection is None:
             return base
         more = beyond_independent_errors(self.corners, noise, self.wider)
@@ -217,7 +218,7 @@ def corners_found(
     thin: CornersRefined | None = None,
     far_off: Collection[str] = (),
 ) -> CornersFound:
-    """Refine from corners under the options, or with A as exact where that predicts images better.
+    """Refine from corners with the given options, or with A as exact if this predicts held-out images better.
 
     Parameters
     ----------
@@ -264,9 +265,9 @@ def corners_found(
 
 
 def _against_poses(corners: CornersRefined) -> Iterator[Finding]:
-    """What corners that do not fit together say against poses of single images: these are of the same corners.
+    """Findings where the corners do not fit together: the poses of single images are from the same corners.
 
-    Noise of A alone says nothing against them: the noise of the poses has it.
+    Noise of A alone is no finding: the noise model of the poses contains it.
     """
     px = corners.noise.corner_px
     if px > DETECTOR_PX:
@@ -278,7 +279,8 @@ def _against_poses(corners: CornersRefined) -> Iterator[Finding]:
 
 
 def _against_exact(observations: Observations, corners: CornersRefined, options: CornerOptions) -> Iterator[Finding]:
-    """Where intrinsics count as exact no residual is large for certain: freed as a calibration's are, they may move."""
+    """Findings where exact intrinsics are contradicted: with a calibration's standard deviations they would move
+    far."""
     exact = [name for name in corners.Y if options.stated_of(options.camera_of(name)) == "exact"]
     if not exact:
         return
@@ -300,7 +302,7 @@ def _against_exact(observations: Observations, corners: CornersRefined, options:
 
 
 def _tried_models(tried: Tried) -> tuple[TriedModel, ...]:
-    """The models in numbers; without those that put a target behind its camera."""
+    """The errors of each model that was tried, except models that put a target behind its camera."""
     best = tried.scores[:1]
     return tuple(TriedModel(one.words, one.px, one.mm, one in best) for one in tried.scores if np.isfinite(one.px))
 
@@ -390,38 +392,38 @@ def _corner_findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[
 
 
 def _wider(tried: Tried) -> dict[tuple[str, str], float]:
-    """Where errors are unexplained: as much as these are, or as blocks of images disagree, whichever is more."""
+    """Factors for unexplained errors: their ratio, or the disagreement between folds, whichever is larger."""
     times = _unexplained(tried)
     return {slot: max(times, spread) for slot, spread in tried.left_out.spread.items()} if times > 1.0 else {}
 
 
 def _unexplained(tried: Tried) -> float:
-    """How many times as far off as the covariances say images are that were left out; 1 where that is by chance."""
+    """The ratio of held-out errors to those that the covariances predict; 1 if it may be chance."""
     times = tried.scores[0].px / tried.scores[0].expected_px if tried.scores else 1.0
     return times if times > UNEXPLAINED else 1.0
 
 
-#: Poses of targets are computed again at most so often.
+#: Target poses are computed again at most so many times.
 MOST_TIMES = 2
-#: Intrinsics are other ones than the stated ones where a parameter is off by so many standard deviations, and the image
-#: by so many pixels (root mean square).
+#: Intrinsics differ from the stated ones if a parameter changed by so many standard deviations, and the image by so
+#: many pixels (root mean square).
 OTHER_SIGMAS, OTHER_PX = 3.0, 0.5
-#: So many columns and rows of the image are looked at.
+#: Columns and rows of the pixel grid on which the two are compared.
 LOOKED_AT = 9
 
 
 def check_observations(problem: Problem, options: CalibrateOptions) -> None:
-    """A CountError or OptionError where corners are wanted, and the problem lacks them, or holds what they cannot."""
+    """Raise a CountError or OptionError if corners are asked for, and the problem lacks them or does not allow them."""
     if options.observations == "corners":
         check_corners_everywhere(problem)
         check_corners_can_hold(problem)
 
 
 def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefined | None]:
-    """The run again with images whose poses are those that the answer says, or None where they have them already.
+    """A new run with target poses computed again by the answer; None if they do not change.
 
-    Intrinsics are looked at once, in a part of the images where they are many; beside it is what these say. A log's
-    were looked at before: `with_estimated_intrinsics`.
+    Intrinsics are checked once; of many images a part is used, and its refinement is returned too. Those of a log were
+    checked before: `with_estimated_intrinsics`.
     """
     base = found.refined
     if base is None or base.free_directions or not run.problem.boards or run.times > MOST_TIMES or run.recording:
@@ -449,7 +451,7 @@ def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefin
 
 @dataclass(frozen=True, eq=False)
 class ByCorners:
-    """What corners gave, the answer from the poses that they started from, and how many measurements have none."""
+    """The result from corners, the answer from poses that was its start, and how many measurements lack corners."""
 
     found: CornersFound
     start: Refined
@@ -457,10 +459,10 @@ class ByCorners:
 
 
 def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tuple[Run, ByCorners]:
-    """What the corners of a log give, and the run with poses of targets by the intrinsics that they tell.
+    """The result from a log's corners, and the run with target poses by the intrinsics that the corners give.
 
-    ``base`` is an answer from the poses of the inliers. Where the corners contradict the stated intrinsics, the run is
-    at its beginning.
+    ``base`` is an answer from the poses of the inliers. If the corners contradict the stated intrinsics, the run starts
+    again.
     """
     kept = replace(run, problem=selected(run.problem, inliers) if inliers else run.problem)
     why = "an option says so" if run.options.observations == "poses" else _why_not(kept, base)
@@ -487,9 +489,9 @@ def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tupl
 def answered_by_corners(
     run: Run, found: Answer, thin: CornersRefined | None = None, by: ByCorners | None = None
 ) -> Answer:
-    """The answer from the corners, where the problem has them and they give a better one; what was chosen is noted.
+    """The answer from the corners, if the problem has them and they give a better one; the choice is recorded.
 
-    ``thin``: what a part of the images says already; ``by``: what all of them do.
+    ``thin``: the refinement of a part of the images, if there is one; ``by``: the result from all of them.
     """
     base = found.refined
     if base is None or run.options.observations == "poses" or not (run.problem.boards or run.recording):
@@ -513,7 +515,7 @@ def answered_by_corners(
 
 
 def _why_not(run: Run, base: Refined) -> str:
-    """Why the problem's corners cannot be refined from; empty where they can."""
+    """Why the problem's corners cannot be used; empty if they can."""
     problem = run.problem
     if not problem.boards:
         return "no measurement has corners and a camera's intrinsics"
@@ -562,7 +564,7 @@ def _observed(run: Run, found: Answer) -> tuple[Observations, CornerOptions, dic
 
 
 def _have_moved(found: RefinedIntrinsics, stated: Camera) -> bool:
-    """Whether intrinsics are surely others than the stated ones, and by enough to move poses."""
+    """Whether intrinsics clearly differ from the stated ones, and by enough to move poses."""
     size = np.array([stated.width, stated.height])
     pixels = np.stack(np.meshgrid(*np.linspace(0.0, size - 1.0, LOOKED_AT).T), axis=-1)
     off = np.linalg.norm(stated.pixels(found.camera.undistort(pixels)) - pixels, axis=-1)
@@ -571,9 +573,10 @@ def _have_moved(found: RefinedIntrinsics, stated: Camera) -> bool:
 
 
 def by_told_intrinsics(run: Run, sensors: Collection[str]) -> Run:
-    """The run from its beginning with poses of targets by intrinsics that a sensor's images of flat boards tell alone.
+    """Start again with target poses by intrinsics that are estimated from the sensor's images of flat boards alone.
 
-    They count as unknown then. Raises CameraError where the images determine none, or an image has no pose by them.
+    These intrinsics then count as unknown. Raises CameraError if the images do not determine them, or an image has no
+    pose.
     """
     problem = run.problem
     told: dict[str, Camera] = {}
@@ -602,7 +605,7 @@ def _images(problem: Problem, pair: Pair) -> Array:
 
 
 def by_intrinsics(problem: Problem, cameras: Mapping[str, Camera]) -> Problem:
-    """The problem with poses of targets by other intrinsics; of a plane's two, those near a certified solution."""
+    """The problem with target poses by other intrinsics; of a plane's two poses, the one near a certified solution."""
     every = {}
     for pair in problem.pairs:
         raw = every[pair] = problem.measurements(*pair)
