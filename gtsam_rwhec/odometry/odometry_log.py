@@ -1,4 +1,4 @@
-"""Solving of sensors that know only their own motion: from a cleaned log to the joint answer, and its files."""
+"""Calibrates sensors that know only their own motion: from a cleaned log to the joint answer and its files."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def solve_odometries(
 
 
 def _on_reference_clock(track: OdometryTrack, rig: Rig) -> OdometryTrack:
-    """The track with a stated time offset added to its stamps; an offset that is estimated is found from there."""
+    """The track with its stated time offset added to the stamps; a track whose offset is estimated does not change."""
     offset = rig.odometries[track.sensor].time_offset
     if offset == "estimate" or offset == 0.0:
         return track
@@ -110,7 +110,7 @@ def _on_reference_clock(track: OdometryTrack, rig: Rig) -> OdometryTrack:
 
 
 def given_of(rig: Rig) -> Given:
-    """What the rig file's ``given`` says, in SI units."""
+    """The prior knowledge in the rig file's ``given`` section, in SI units."""
     said = rig.given
     ground = said.ground
     return Given(
@@ -127,7 +127,7 @@ def given_of(rig: Rig) -> Given:
 
 
 def options_of(rig: Rig) -> OdometryOptions:
-    """The options: the widest gates of all sensors, and clocks where one is to be estimated."""
+    """The options: the widest gates of all sensors; time offsets are estimated if any sensor needs it."""
     gates = gates_of(rig)
     return OdometryOptions(
         estimate_time_offsets=any(one.time_offset == "estimate" for one in rig.odometries.values()),
@@ -190,7 +190,7 @@ def frames_of_odometries(solved: OdometrySolved) -> RigFrames:
 
 
 def is_of_odometries(rig: Rig | None, source: str | Path | None = None) -> bool:
-    """Whether a rig file, or the one in a log that a stage wrote, has odometries alone and one of them as reference."""
+    """Whether a rig file (or that in a stage's log) has odometries only, and one of them as reference."""
     if rig is not None:
         return rig.is_of_odometries
     if source is None or not Path(source).is_file():
@@ -225,7 +225,7 @@ def calibrate_odometry_log(
     out
         The folder; it is made if it does not exist.
     anyway : bool
-        Whether to write the frames of poses that are not to be used too, with the reason in the head of each file.
+        Whether to also write frames whose poses must not be used, with the reason in the head of each file.
     replace : bool
         As for ``calibrate_log``.
     progress : callable, optional
@@ -259,7 +259,7 @@ def calibrate_odometry_log(
 def _calibrate_files(
     folder: Path, rig: Rig, out: str | Path, *, anyway: bool, replace: bool, progress: Progress | None
 ) -> OdometrySolved:
-    """By way of a log of the files, which is removed at the end."""
+    """Calibrate from files: a temporary log is made of them, and removed at the end."""
     rig = rig.model_copy(update={"folder": folder})
     in_files = {name for name, _ in files_of(rig)}
     others = [name for name in rig.odometries if name not in in_files]
@@ -308,7 +308,7 @@ def _stages(
 def export_odometries(
     solved_path: str | Path, out: str | Path, *, anyway: bool = False, progress: Progress | None = None
 ) -> list[Path]:
-    """Write the frames for other programs from a solved log of odometries; none of poses that are not to be used."""
+    """Write the frames from a solved log of odometries for other programs; none if the poses must not be used."""
     out = made_folder(out)
     (progress or silent)("exporting")
     solved = read_odometries(solved_path)

@@ -1,4 +1,4 @@
-"""The record of a calibration from its answer: the frame that was asked for, covariance, dependence, findings."""
+"""Makes the record of a calibration from the solver's answer: poses in the requested frame, covariance, findings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def calibration_of(
     removed: dict[str, tuple[Removed, ...]],
     origin_ns: int,
 ) -> OdometryCalibration:
-    """The record of the calibration, from the answer."""
+    """The record of the calibration, made from the answer."""
     names, layout, state = task.names, task.layout, answer.fit.state
     sensors = (reference, *(name for name in names if name != reference))
     change, T, order = _in_frame_of(reference, task, state.T)
@@ -90,7 +90,7 @@ def calibration_of(
 
 
 def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tuple[str, ...]]:
-    """The matrix (d, p) from the unknowns to the record's tangents and scales, the poses (m - 1, 4, 4), their names.
+    """The matrix (d, p) from unknowns to the record's tangents and scales; the poses (m - 1, 4, 4); their names.
 
     With T_r the reference's pose in the frame of sensor 0, a pose is T_r^-1 T_k, and its tangent x_k - Ad(pose^-1) x_r.
     """
@@ -114,7 +114,7 @@ def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tu
 
 
 def _clock_sigmas(C: Array, at: list[int], names: tuple[str, ...], reference: str) -> dict[str, float]:
-    """Standard deviations of the offsets to the reference's clock."""
+    """Standard deviations (s) of the offsets to the reference's clock."""
     padded = np.pad(C, ((0, 1), (0, 1)))
     r = at[names.index(reference)]
     return {
@@ -142,7 +142,7 @@ def _free_directions(answer: Answer, task: Task) -> tuple[FreeDirection, ...]:
 
 
 def _influences(answer: Answer, task: Task, change: Array, order: tuple[str, ...]) -> tuple[Influence, ...]:
-    """dx / dg = (information)^-1 row' / sigma for each whitened row of what is given."""
+    """The influence of each given number: dx / dg = (information)^-1 row' / sigma, with its whitened row."""
     rows = answer.fit.rows
     Z = answer.freedom.complement()
     inner = Z.T @ answer.freedom.information @ Z
@@ -173,28 +173,28 @@ def _twist(x: Array) -> tuple[float, float, float, float, float, float]:
     return a, b, c, d, e, f
 
 
-#: Correlation of neighbouring windows' residuals above which errors are not independent from step to step.
+#: If residuals of neighbouring windows correlate more than this, errors are not independent between steps.
 CORRELATED = 0.3
-#: Correlation above which, with residuals of this part of the motions, a track is not of this vehicle, or is read in a
-#: wrong way. A bias or a wrong scale has smaller residuals.
+#: If residuals correlate more than this, and exceed this share of the motions, a track is of another vehicle or is
+#: read wrongly. A bias or a wrong scale has smaller residuals.
 SAME, SAME_PART = 0.9, 0.2
-#: Stated noise is doubted when residuals are so many times as large, or as small.
+#: Stated noise is doubted if residuals are larger or smaller by more than this factor.
 DOUBTED = 1.5
-#: A clock that the refinement knows to this, s, needs no first guess.
+#: If the refinement knows a time offset to this standard deviation (s), a missing first guess does not matter.
 CLOCK_KNOWN_S = 0.01
-#: The refined answer is that of the proof if it is within so many standard deviations of it.
+#: The proof also covers a refined answer within this many standard deviations of the certified one.
 FAR = 10.0
-#: A pose whose standard deviation along or about an axis is larger than this is said to be loose.
+#: A pose with a larger standard deviation along or about an axis is reported as poorly known.
 LOOSE_M, LOOSE_RAD = 0.2, float(np.radians(2.0))
-#: More of a track than this left out is said.
+#: A sensor is reported if more than this share of the windows is left out of its track.
 MANY = 0.1
 
 
 def _residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Root mean square of each sensor's residuals in their standard deviations, rotation and translation.
+    """Root mean square of each sensor's residuals over the expected one, for rotation and translation.
 
-    A residual r against the fused motion of all sensors is smaller than the sensor's noise: the mean square of each
-    entry is compared with the expected one.
+    The fused motion includes the sensor, so the residual against it is smaller than the sensor's noise. The expected
+    mean square takes this into account.
     """
     windows, r, B = answer.windows, answer.fit.linear.r, answer.fit.linear.B
     V = np.linalg.inv(answer.W + ~windows.used[:, :, None, None] * np.eye(6))
@@ -213,7 +213,7 @@ def _residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[f
 def _doubts(
     answer: Answer, task: Task, tracks: Sequence[OdometryTrack], clocks: Sequence[Clock], sigmas: dict[str, float]
 ) -> tuple[str, ...]:
-    """Sentences about doubtful results; none if there are no doubts. ``sigmas``: deviations of the clocks, s."""
+    """Sentences about doubtful results; ``sigmas``: standard deviations of time offsets, s."""
     said: list[str] = []
     sizes = _residual_sizes(answer, task.names)
     for k, name in enumerate(task.names):
@@ -281,7 +281,7 @@ def _contradictions(answer: Answer, task: Task) -> tuple[str, ...]:
 
 
 def _apart(answer: Answer, task: Task, k: int, sigma: Array) -> str:
-    """How far a pose moved, if by more than ``FAR`` deviations along axes that no free direction reaches, or ""."""
+    """How far a pose moved, in words; "" if less than ``FAR`` standard deviations along all determined axes."""
     at = task.layout.at[k, :6]
     moved = np.abs(se3.logmap(se3.inverse(answer.certified.T[k][None]) @ answer.fit.state.T[k])[0])
     loose = answer.freedom.by_data[at]
@@ -295,7 +295,7 @@ def _apart(answer: Answer, task: Task, k: int, sigma: Array) -> str:
 
 
 def _remarks(task: Task) -> tuple[str, ...]:
-    """Sentences about what was assumed."""
+    """Sentences about the assumptions."""
     said: list[str] = []
     if len(task.names) == 2 and not task.stated.any():
         said.append(
@@ -330,7 +330,7 @@ def _misfit(answer: Answer, k: int) -> float:
 
 
 def _correlations(answer: Answer, k: int) -> tuple[float, float]:
-    """The correlation of a sensor's residuals with those of the window before, of rotations and of translations."""
+    """The correlation of a sensor's residuals with those of the previous window: rotations, translations."""
     windows, r = answer.windows, answer.fit.linear.r[k]
     follows = windows.used[k, 1:] & windows.used[k, :-1] & (np.abs(windows.start[1:] - windows.end[:-1]) < 1e-6)
     if follows.sum() < 20:
@@ -344,16 +344,16 @@ def _correlations(answer: Answer, k: int) -> tuple[float, float]:
     return next(shares), next(shares)
 
 
-#: An answer fits equally well if it costs at most this much more than the best: two standard deviations.
+#: An answer fits equally well if its cost is at most this much above the best one's: two standard deviations.
 ALIKE = 2.0
-#: Two answers are one if no sensor is further apart than this, metres.
+#: Two answers are the same if no sensor differs by more than this, metres.
 SAME_M = 1e-3
 
 
 def other_answers(answer: Answer, task: Task, named: Callable[[Array], dict[str, Array]]) -> tuple[OtherAnswer, ...]:
     """Refine again from the mirror image of each distance's free shift; keep answers that fit equally well.
 
-    A distance is even in the shift that the drive leaves free: the sensor may be above or below.
+    A distance does not change if the sensor's free shift is mirrored: the sensor may be above or below.
     """
     given, free = task.given.given, answer.freedom
     if not given.distances_m or not free.by_data.shape[1]:

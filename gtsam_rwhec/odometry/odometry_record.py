@@ -1,4 +1,4 @@
-"""What a calibration of odometries found: poses, proof, windows, dependence, other answers, and the verdict on it."""
+"""The result of a calibration of odometries: poses, proof, windows, influences, other answers, and the verdict."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
 
-#: What is given is contradicted by the data from so many standard deviations on.
+#: The data contradict a given number that is more than this many standard deviations away.
 CONTRADICTED = 4.0
-#: So many of them are named.
+#: The most contradicted numbers that a message names.
 NAMED = 4
-#: A sensor takes part in a free direction from this part of the direction's largest shift or turn on.
+#: A sensor takes part in a free direction if it moves by more than this share of the largest shift or turn.
 TAKES_PART = 0.05
-#: An axis of the reference is named where the direction is within 8 degrees of it.
+#: A direction within 8 degrees of an axis of the reference is called by that axis.
 NEAR_AXIS = float(np.cos(np.radians(8.0)))
-#: What to do: where something is free, where a track is wrong as a whole, where what was given is contradicted.
+#: What to do: if a direction is free, if a whole track is wrong, if a given number is contradicted.
 ADVICE = {
     Ground.NOT_UNIQUE: "state the missing heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that "
     "of the reference), or the ground, directions or distances; or drive other turns and a ramp, and calibrate again",
@@ -44,9 +44,9 @@ class JointCertificate:
     """The proof for the joint quadratic cost of all sensors (design fact 24).
 
     The cost is half the squared residuals of the windows' rotation vectors and translations in all sensors at once,
-    with the vehicle's own motion eliminated. The turn of each window inside the lever arms' term, and the length of the
-    way that scales are compared with, are the fused ones. So the proof is of this cost; the exact likelihood is refined
-    from there.
+    with the vehicle's own motion eliminated. The fused motion gives each window's rotation in the lever arms' term,
+    and the translation that scales are compared with. So the proof is for this cost only; the exact likelihood is then
+    refined from its optimum.
     """
 
     status: Status
@@ -55,10 +55,10 @@ class JointCertificate:
     #: A lower bound on the certificate matrix's smallest eigenvalue, after its diagonal was scaled to one
     min_eigenvalue: float
     tolerance: float  #: The gap up to which the answer counts as optimal
-    #: The bound is about all answers whose sensors are at most this far from the reference along each axis
+    #: The bound holds for all answers with sensors at most this far from the reference along each axis
     region_m: float
-    #: A mirror image with a negative scale costs less, as a vehicle that turns about one axis may make it by chance
-    #: (design fact 5). Then cost and bound are of the form with a term that holds each unknown scale near its value
+    #: Whether a mirror image with a negative scale costs less; this happens by chance if the vehicle turns about one
+    #: axis (design fact 5). Then cost and bound contain a term that holds each unknown scale near its value
     scales_held: bool = False
 
     @property
@@ -102,8 +102,8 @@ class Influence:
     per_unit: dict[str, Twist] = field(hash=False)
     #: by sensor: how far the pose moves if the number is off by one sigma: rad and m
     per_sigma: dict[str, Twist] = field(hash=False)
-    #: How far the answer is from the number, in the sigmas of their difference; above ``CONTRADICTED`` the data
-    #: contradict it. Zero where the motions do not measure it
+    #: How far the answer is from the number, in standard deviations of the difference; above ``CONTRADICTED`` the
+    #: data contradict the number. Zero where the motions do not measure it
     off_by: float = 0.0
 
     @property
@@ -123,35 +123,35 @@ class OtherAnswer:
 
 @dataclass(frozen=True)
 class OdometryCalibration:
-    """Poses of sensors that know only their own motion, and what is known of them. ``str()`` has the verdict first."""
+    """Poses of sensors that know only their own motion, with their quality. ``str()`` begins with the verdict."""
 
     reference: str  #: The sensor in whose frame the poses are
     sensors: tuple[str, ...]  #: All sensors, the reference first
-    #: by sensor: the identity for the reference. Along a free direction a pose is as the search left it
+    #: by sensor: the identity for the reference. Along a free direction a pose is arbitrary
     T_reference_sensor: dict[str, Array] = field(hash=False)
-    #: by sensor: measured over true length, of the sensors of unknown scale
+    #: by sensor of unknown scale: measured over true length
     scales: dict[str, float] = field(hash=False)
     time_offsets_s: dict[str, float] = field(hash=False)  #: by sensor: a sensor's stamp t is the reference's t + offset
     #: by sensor: their standard deviations; empty where the clocks were not compared
     time_offset_sigmas_s: dict[str, float] = field(hash=False)
     order: tuple[str, ...]  #: The sensors in the order of ``covariance``: all but the reference
     #: (d, d): joint covariance: [omega, v] of each sensor in ``order`` (right perturbation, rad and m), then the
-    #: logarithms of ``scales`` in their order. Infinite on the diagonal (and zero elsewhere in the row) where a free
-    #: direction reaches
+    #: logarithms of ``scales`` in their order. Where a free direction moves an entry, its
+    #: row is infinite on the diagonal and zero elsewhere
     covariance: Array = field(hash=False)
     certificate: JointCertificate
-    #: How the answer can move while the measurements (and what was given) fit as well
+    #: Directions in which the answer can move without a worse fit to the measurements and given numbers
     free_directions: tuple[FreeDirection, ...]
     windows: Windows = field(hash=False)
     noise: dict[str, OdometryNoise] = field(hash=False)  #: by sensor: as it was stated or found
     noise_was_found: frozenset[str]  #: The sensors whose noise was estimated
     #: by sensor: poses and windows that were not used, and why
     removed: dict[str, tuple[Removed, ...]] = field(hash=False)
-    #: by sensor: root mean square of the windows' residuals, in their standard deviations: 1 is expected
+    #: by sensor: root mean square of the windows' residuals (rotation, translation) over the expected: 1 is good
     residuals: dict[str, tuple[float, float]] = field(hash=False)
     influences: tuple[Influence, ...] = ()  #: How the answer depends on what was given
     others: tuple[OtherAnswer, ...] = ()  #: Other answers that fit alike
-    #: CONTRADICTED: tracks look wrong as a whole, or contradict a given distance; COVARIANCE_DOUBTED: what is doubtful
+    #: CONTRADICTED: a whole track looks wrong, or contradicts a given distance; COVARIANCE_DOUBTED: doubtful results
     findings: tuple[Finding, ...] = ()
     remarks: tuple[str, ...] = ()  #: What was assumed, in sentences
 
@@ -174,7 +174,7 @@ class OdometryCalibration:
         return block
 
     def T(self, first: str, second: str) -> Array:
-        """The pose (4, 4) of sensor ``second`` in the frame of sensor ``first``: loops close exactly."""
+        """The pose (4, 4) of sensor ``second`` in the frame of sensor ``first``. Such poses close loops exactly."""
         inverse = np.linalg.inv(self.T_reference_sensor[first])
         pose: Array = inverse @ self.T_reference_sensor[second]
         return pose
@@ -197,7 +197,7 @@ class OdometryCalibration:
 
 
 def _contradicted(found: OdometryCalibration) -> list[Finding]:
-    """The given numbers that are farthest from the motions, if they contradict them; one that is wrong pulls others."""
+    """The given numbers that the motions contradict, the worst first; one wrong number can pull others."""
     wrong = sorted((one for one in found.influences if one.is_contradicted), key=lambda one: -one.off_by)
     if not wrong:
         return []
@@ -209,7 +209,7 @@ def _contradicted(found: OdometryCalibration) -> list[Finding]:
 
 
 def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:
-    """What is not determined of which sensors, and why: a sentence for the heights, and for each other direction."""
+    """Sentences on what is not determined, of which sensors, and why: one for all heights, others by direction."""
     said: list[str] = []
     heights: dict[str, list[str]] = {}
     for direction in found.free_directions:
@@ -223,7 +223,7 @@ def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:
 
 
 def _of_frames(direction: FreeDirection, found: OdometryCalibration, heights: dict[str, list[str]]) -> list[str]:
-    """The sentences of a direction; heights, which a plane leaves free, go by their axis into `heights`."""
+    """The sentences for a direction. Heights that a planar drive leaves free are added to `heights`, by their axis."""
     turns, shifts = (
         {
             name: _in_reference(found.T_reference_sensor, name, np.array(twist)[part])
@@ -242,7 +242,7 @@ def _of_frames(direction: FreeDirection, found: OdometryCalibration, heights: di
             )
         elif largest_turn <= TAKES_PART and np.linalg.norm(shifts[name]) > TAKES_PART * largest_shift:
             axis = _axis(shifts[name])
-            # A vehicle in a plane turns about one axis, along which nothing tells where a sensor is: its height.
+            # A vehicle in a plane turns about one axis only. Along this axis a sensor's position (its height) is free.
             if direction.reason is FreeReason.ONE_AXIS:
                 heights.setdefault(axis, []).append(name)
             else:

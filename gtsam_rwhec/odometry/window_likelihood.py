@@ -1,4 +1,4 @@
-"""The unknowns of a calibration of odometries: their numbers, and one state of them."""
+"""The unknowns of a calibration of odometries, their columns, one state of them, and the likelihood around it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gtsam_rwhec.odometry.window_motions import WindowMotions
 #: Columns of each sensor in the derivatives: pose (6), logarithm of the scale, time offset.
 COLUMNS = 8
 SCALE, OFFSET = 6, 7
-#: The ground's: tilts of its normal about two axes (rad), the reference's height (m).
+#: Columns of the ground: tilts of its normal about two axes (rad), the height of sensor 0 (m).
 GROUND = 3
 
 
@@ -27,7 +27,7 @@ class Layout:
 
     @staticmethod
     def of(scaled: np.ndarray, *, clocks: bool, has_ground: bool) -> Layout:
-        """Sensor 0 is the one in whose frame the poses are; ``scaled`` (m,) says whose scale is unknown."""
+        """The poses are in the frame of sensor 0; ``scaled`` (m,) marks the sensors of unknown scale."""
         is_open = np.ones((len(scaled), COLUMNS), dtype=bool)
         is_open[:, SCALE], is_open[:, OFFSET] = scaled, clocks
         is_open[0] = False
@@ -35,29 +35,29 @@ class Layout:
 
     @cached_property
     def size(self) -> int:
-        """How many unknowns there are."""
+        """The number of unknowns."""
         return int(self.open.sum()) + GROUND * self.has_ground
 
     @cached_property
     def at(self) -> np.ndarray:
-        """(m, 8) the number of each column, or ``size`` where it is none."""
+        """The index of the unknown of each sensor's column (m, 8); ``size`` where the column is not an unknown."""
         numbers = np.full(self.open.shape, self.size)
         numbers[self.open] = np.arange(int(self.open.sum()))
         return numbers
 
     @cached_property
     def ground(self) -> np.ndarray:
-        """The numbers of the ground's unknowns."""
+        """The indices of the ground's unknowns."""
         return np.arange(self.size - GROUND, self.size) if self.has_ground else np.arange(0)
 
     @cached_property
     def poses(self) -> np.ndarray:
-        """(m - 1, 6) the numbers of the poses' tangents."""
+        """The indices (m - 1, 6) of the poses' tangents."""
         numbers: np.ndarray = self.at[1:, :6]
         return numbers
 
     def spread(self, step: Array) -> Array:
-        """A step (size,) by sensor and column, (m, 8)."""
+        """A step (size,) arranged by sensor and column, (m, 8)."""
         by_column: Array = np.append(step, 0.0)[self.at]
         return by_column
 
@@ -75,7 +75,7 @@ class State:
 
     @staticmethod
     def at(T: Array, scale: Array, windows: WindowMotions, height: float = 0.0) -> State:
-        """At poses and scales; the motions are those of the first sensor that has each window."""
+        """The state at given poses and scales; each window's motion is from the first sensor that has the window."""
         m = len(T)
         motion = np.tile(np.eye(4), (len(windows), 1, 1))
         known = np.zeros(len(windows), dtype=bool)
@@ -88,7 +88,7 @@ class State:
         return State(T, scale, np.zeros(m), motion, np.zeros(2), height)
 
     def moved(self, layout: Layout, step: Array, of_motion: Array) -> State:
-        """After a step of the unknowns (size,) and of the motions (n, 6)."""
+        """The state after a step of the unknowns (size,) and of the motions (n, 6)."""
         by_sensor = layout.spread(step)
         ground = step[layout.ground]
         return replace(
@@ -104,7 +104,7 @@ class State:
 
 @dataclass(frozen=True)
 class Linear:
-    """Residuals and derivatives at a state."""
+    """The windows' residuals and their derivatives at a state."""
 
     r: Array  #: (m, n, 6)
     J: Array  #: (m, n, 6, 8): by the sensor's own columns (`COLUMNS`)
@@ -123,19 +123,19 @@ class Eliminated:
     cost: float  #: Half the weighted squares of the residuals
 
     def motions(self, step: Array) -> Array:
-        """The motions' step (n, 6) that goes with a step of the unknowns."""
+        """The best step (n, 6) of the motions for a step of the unknowns."""
         d: Array = np.linalg.solve(self.D, (self.of_motion - self.G @ step)[:, :, None])[:, :, 0]
         return d
 
 
 def weights(windows: WindowMotions, rotation: Array, translation: Array) -> Array:
-    """The inverse covariances (m, n, 6, 6) of the windows for variances a second (m,); zero where one is not used."""
+    """The windows' inverse covariances (m, n, 6, 6) for variances per second (m,); zero for unused windows."""
     inverse: Array = np.linalg.inv(covariances(windows, rotation, translation)) * windows.used[:, :, None, None]
     return inverse
 
 
 def covariances(windows: WindowMotions, rotation: Array, translation: Array) -> Array:
-    """The covariances (m, n, 6, 6) of the windows for variances a second (m,); the identity where one is not used."""
+    """The windows' covariances (m, n, 6, 6) for variances per second (m,); the identity for unused windows."""
     of_rotation, of_translation = windows.covariance_parts()
     covariance = rotation[:, None, None, None] * of_rotation + translation[:, None, None, None] * of_translation
     covariance[~windows.used] = np.eye(6)
@@ -184,7 +184,7 @@ def eliminated(linear: Linear, W: Array, layout: Layout) -> Eliminated:
 
 
 def covariance_of_motions(linear: Linear, W: Array, D: Array, V: Array) -> Array:
-    """The covariance (n, 6, 6) of the windows' estimated motions if the sensors' is V (m, n, 6, 6), whatever W says."""
+    """The covariance (n, 6, 6) of motions estimated with weights W, if the sensors' covariance is V (m, n, 6, 6)."""
     WB = W @ linear.B
     inverse = np.linalg.inv(D)
     covariance: Array = inverse @ np.einsum("mnia,mnij,mnjb->nab", WB, V, WB, optimize=True) @ inverse
@@ -192,13 +192,13 @@ def covariance_of_motions(linear: Linear, W: Array, D: Array, V: Array) -> Array
 
 
 def information_of_noise(linear: Linear, W: Array, layout: Layout, state: State, D: Array, of_motion: Array) -> Array:
-    """N (p, p): what the noise of the windows' estimated motions, with covariance ``of_motion``, alone adds to H."""
+    """N (p, p): the part of H that comes only from the estimated motions' noise, of covariance ``of_motion``."""
     m, n = W.shape[:2]
     M = predicted(state)
     true = M.copy()
     true[..., :3, 3] /= state.scale[:, None, None]
     back = se3.adjoint(se3.inverse(true.reshape(m * n, 4, 4))).reshape(m, n, 6, 6)
-    # The columns of a root of M's covariance, as each sensor sees them.
+    # The columns of a square root of the motions' covariance, in each sensor's frame.
     root = np.linalg.cholesky(of_motion)
     twists = np.einsum("mij,nja->mnia", se3.adjoint(se3.inverse(state.T)), root)
     R_t = np.einsum("mnji,mnj->mni", true[..., :3, :3], true[..., :3, 3])
@@ -219,7 +219,7 @@ def information_of_noise(linear: Linear, W: Array, layout: Layout, state: State,
 
 
 def _by_window(blocks: Array, layout: Layout) -> Array:
-    """(m, n, 6, 8) blocks as (n, 6, p), each in its sensor's columns."""
+    """Blocks (m, n, 6, 8) placed in their sensors' columns, (n, 6, p)."""
     G = np.zeros((blocks.shape[1], 6, layout.size + 1))
     for k in range(len(blocks)):
         G[:, :, layout.at[k]] += blocks[k]
@@ -227,7 +227,7 @@ def _by_window(blocks: Array, layout: Layout) -> Array:
 
 
 def _own(blocks: Array, layout: Layout) -> Array:
-    """(m, 8, 8) blocks on the diagonal of (p, p)."""
+    """Blocks (m, 8, 8) placed on the diagonal of a matrix (p, p)."""
     H = np.zeros((layout.size + 1, layout.size + 1))
     for k in range(len(blocks)):
         H[np.ix_(layout.at[k], layout.at[k])] += blocks[k]

@@ -37,17 +37,17 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig.log_contents import DriverTopic, LogContents
 from gtsam_rwhec.rig.sections import PoseNoise, PoseSource, Sensor
 
-#: A sensor's target counts with at least this number of images.
+#: A pair of a sensor and a target needs at least this number of images.
 LEAST_IMAGES = 6
-#: At most this number of pairs of a sensor and a target, those with the most images, are solved for.
+#: At most this number of pairs, those with the most images, are solved for.
 MOST_PAIRS = 12
-#: The product of the residuals' ratios, rotations and translations, must be at least this: one role fits far better.
+#: One role fits far better if the product of its rotation and translation residuals is smaller by this factor.
 FAR_BETTER = 9.0
-#: And what fits better must explain the rotations to this (rad), and the translations (m).
+#: The better role must also have residuals below these: rotation (rad), translation (m).
 EXPLAINED_RAD, EXPLAINED_M = math.radians(3.0), 0.05
-#: Corners have about this standard deviation where nobody has measured it, pixels.
+#: The assumed standard deviation of a corner, pixels, where nobody has measured it.
 CORNER_PX = 0.3
-#: Images have stamps this far apart where they have none, nanoseconds.
+#: Images get stamps this far apart, nanoseconds; their own are not used.
 STEP_NS = 10**9
 
 Role = Literal["child", "parent"]
@@ -55,7 +55,7 @@ Role = Literal["child", "parent"]
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A target in one image of a sensor, with the carriers' pose then."""
+    """A target in one image of a sensor, and the carriers' pose at that time."""
 
     sensor: str
     target: Target
@@ -84,7 +84,7 @@ class RoleEvidence:
         return None if not tells else "child" if better is self.child else "parent"
 
     def explains_far_better(self, other: RoleEvidence) -> bool:
-        """Whether one role explains these measurements, and far better than either does the other's."""
+        """Whether one role explains these measurements, with far smaller residuals than both roles of ``other``."""
         if self.role is None:
             return False
         fits = [fit for fit in (other.child, other.parent) if fit is not None]
@@ -92,7 +92,7 @@ class RoleEvidence:
         return all(_product(fit) > FAR_BETTER * mine for fit in fits)
 
     def is_better_than(self, other: RoleEvidence) -> bool:
-        """Whether the better of both roles has smaller residuals than that of other measurements' roles."""
+        """Whether the better role has smaller residuals than the better role of ``other``."""
         mine, theirs = (
             min((_product(fit) for fit in (one.child, one.parent) if fit is not None), default=math.inf)
             for one in (self, other)
@@ -101,7 +101,7 @@ class RoleEvidence:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """True lengths over guessed ones, by target, as the fit of the role says; empty where the data cannot tell."""
+        """True over guessed length of each target, by the fit of the role; empty if the role is unknown."""
         fit = {"child": self.child, "parent": self.parent, None: None}[self.role]
         if fit is None or not isinstance(fit.scale, dict):
             return {}
@@ -149,7 +149,7 @@ def _figures(fit: TrialFit | None) -> str:
 
 
 def _track(seen: Sequence[Seen], on_child: bool) -> tuple[Array, Array]:
-    """A = T_sensorcarrier_targetcarrier and B = T_sensor_target, of its candidates and turns the one that fits A."""
+    """A = T_sensorcarrier_targetcarrier and B = T_sensor_target: of its candidates and turns, those that fit A."""
     poses = np.array([one.T for one in seen])
     A = se3.inverse(poses) if on_child else poses
     T, squared, covariance = (
@@ -165,15 +165,15 @@ def _track(seen: Sequence[Seen], on_child: bool) -> tuple[Array, Array]:
     return A, T[np.arange(len(T)), best]
 
 
-#: Seconds. Between poses further apart in time nothing is interpolated.
+#: Seconds. Poses that are further apart in time are not interpolated.
 MAX_GAP_S = 0.5
-#: A driver's poses have this covariance where nobody states it: 0.6 degrees and 10 mm.
+#: The assumed covariance of a driver's poses if nobody states it: 0.6 degrees and 10 mm.
 OF_DRIVER = 1e-4 * np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
 class LogEvidence:
-    """What a log says about its carriers."""
+    """The evidence in a log about its carriers."""
 
     roles: RoleEvidence  #: What solving with the cameras on either frame says
     rest: dict[str, Rest]  #: By topic of images, whether they were taken at rest; empty where the poses do not tell
@@ -183,7 +183,7 @@ class LogEvidence:
 def evidence_of_log(
     log: Log, contents: LogContents, source: PoseSource, sensors: Mapping[str, Sensor], targets: list[Target]
 ) -> LogEvidence:
-    """Solve for roles, and look at the path, of the poses that `source` names."""
+    """Solve for both roles with the poses that `source` names, and examine their path."""
     parent, child = source.parent_and_child
     path = _path(log, contents, source)
     schema = next((topic.schema for topic in contents.topics if topic.name == source.topic), "")
@@ -199,7 +199,7 @@ def evidence_of_log(
 
 
 def _path(log: Log, contents: LogContents, source: PoseSource) -> Trajectory | None:
-    """T_parent_child over time; None where the log's poses do not give it."""
+    """T_parent_child over time; None if the log's poses do not contain it."""
     parent, child = source.parent_and_child
     try:
         if source.topic is not None:
@@ -251,7 +251,7 @@ def _of_driver(sensor: str, driver: DriverTopic, path: Trajectory, targets: list
 
 
 def _camera(contents: LogContents, sensor: Sensor) -> Camera | None:
-    """The camera of the topic of intrinsics; None without one."""
+    """The camera in the sensor's topic of intrinsics; None without one."""
     record = contents.cameras.get((sensor.intrinsics and sensor.intrinsics.topic) or "")
     if record is None:
         return None
@@ -265,7 +265,7 @@ def _camera(contents: LogContents, sensor: Sensor) -> Camera | None:
 ARM = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
 #: Motion capture with markers 20 cm apart.
 MOTION_CAPTURE = PoseNoise(rotation_deg=0.1, translation_mm=0.5)
-#: Visual or visual-inertial odometry over a room; it drifts besides.
+#: Visual or visual-inertial odometry over a room, without its drift.
 ODOMETRY = PoseNoise(rotation_deg=0.3, translation_mm=5.0)
 #: Words in names of frames and topics, by where poses come from; the first that fits counts.
 WORDS: tuple[tuple[str, PoseNoise, frozenset[str]], ...] = (
@@ -281,10 +281,10 @@ WORDS: tuple[tuple[str, PoseNoise, frozenset[str]], ...] = (
         "link8", "endeffector", "arm", "robot", "panda", "ur5", "ur10", "ur5e", "ur10e", "iiwa", "kuka", "abb", "fanuc",
     })),
 )  # fmt: skip
-#: Differences over this many poses see noise, and hardly motion: the third difference of white noise of standard
-#: deviation s has standard deviation sqrt(20) s (1 + 9 + 9 + 1).
+#: Third differences contain noise and hardly any motion. White noise of standard deviation s gives them the standard
+#: deviation sqrt(20) s (20 = 1 + 9 + 9 + 1).
 THIRD_DIFFERENCE = np.sqrt(20.0)
-#: A path says how smooth it is with at least this number of poses, at this rate.
+#: The smoothness of a path is computed from at least this number of poses, at this rate or more.
 LEAST_POSES, LEAST_HZ = 50, 15.0
 
 
@@ -311,13 +311,13 @@ def origin_of(names: Iterable[str], schema: str = "", path: Trajectory | None = 
 
 
 def smoothness_m(path: Trajectory) -> float:
-    """The white noise that positions have at most, metres: that of third differences, which see little motion."""
+    """An upper bound on the positions' white noise, metres, by third differences, which contain little motion."""
     third = np.diff(path.T[:, :3, 3], n=3, axis=0)
     return float(np.median(np.abs(third)) / 0.6745 / THIRD_DIFFERENCE)
 
 
 def _path_words(path: Trajectory | None) -> str:
-    """The path's rate, and its smoothness where the rate lets it be seen."""
+    """The path's rate, and its smoothness where the rate is high enough."""
     if path is None or len(path.stamps_ns) < LEAST_POSES:
         return ""
     rate_hz = 1e9 / float(np.median(np.diff(path.stamps_ns)))
@@ -336,11 +336,11 @@ class Rest:
     words: str
 
 
-#: Metres a second and radians a second: a carrier that is slower than both stands still.
+#: A carrier that is slower than both stands still: metres a second and radians a second.
 REST_M_S, REST_RAD_S = 0.003, np.radians(0.5)
 #: Nanoseconds on each side of an image's stamp, over which speeds are measured.
 SIDE_NS = 50_000_000
-#: Poses that are further apart than this (s), and at the images' stamps to this (ns), are those of stations.
+#: The robot stopped for each image if poses are further apart than this (s) and this near to images' stamps (ns).
 STATIONS_S, SAME_NS = 0.5, 10_000_000
 #: At most this number of images are compared with all poses.
 MOST_COMPARED = 200
@@ -351,7 +351,7 @@ MOST = 0.8
 def rest_of(image_ns: np.ndarray, path: Trajectory) -> Rest:
     """Whether the carrier stood still at the images' stamps (n,).
 
-    Poses that are at the images' stamps only, seconds apart, are those of stations: stop and shoot.
+    If poses exist only at the images' stamps, seconds apart, the robot stopped for each image.
     """
     inside = image_ns[(image_ns - SIDE_NS >= path.stamps_ns[0]) & (image_ns + SIDE_NS <= path.stamps_ns[-1])]
     apart_s = 1e-9 * float(np.median(np.diff(path.stamps_ns))) if len(path.stamps_ns) > 1 else np.inf

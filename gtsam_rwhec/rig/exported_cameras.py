@@ -21,14 +21,14 @@ from gtsam_rwhec.rig.rig_frames import RigFrames
 LONGEST_COMMENT = 2_000
 NOT_KNOWN = "whose intrinsics are not known."
 
-#: sensor_msgs/distortion_models: the name of a model by our model and the number of coefficients up to which it goes.
+#: Our model, the most coefficients, and the model's name in sensor_msgs/distortion_models.
 _ROS_MODELS = (
     ("pinhole", 5, "plumb_bob"),
     ("radtan", 5, "plumb_bob"),
     ("radtan", 8, "rational_polynomial"),
     ("equidistant", 4, "equidistant"),
 )
-#: The same of COLMAP, whose models have exactly as many coefficients.
+#: The same for COLMAP, whose models have exactly this number of coefficients.
 _COLMAP_MODELS = (
     ("pinhole", 0, "PINHOLE"),
     ("radtan", 4, "OPENCV"),
@@ -39,9 +39,9 @@ _COLMAP_MODELS = (
 _MODELS = ("pinhole", "radtan", "equidistant", "unified")
 #: Kalibr's radial-tangential distortion has four coefficients: k1, k2, p1, p2.
 RADTAN = 4
-#: A pinhole has so many zeros in OpenCV's files, as cv::calibrateCamera writes them.
+#: OpenCV's files have this many zeros for a pinhole, as cv::calibrateCamera writes them.
 FIVE = 5
-#: OpenCV's own files begin so; without it OpenCV does not read them.
+#: The beginning of OpenCV's own files; OpenCV reads no file without it.
 FIRST_LINES = "%YAML:1.0\n---\n"
 #: Metres. Fields of view are compared between these depths.
 NEAR_M, FAR_M = 0.2, 20.0
@@ -237,18 +237,18 @@ def _points_in_view(camera: Camera) -> Array:
 
 
 def _origin(frames: RigFrames, name: str) -> str:
-    """Where a camera's intrinsics are from."""
+    """Where a camera's intrinsics come from, in words."""
     return comment(f"intrinsics {frames.camera_origins.get(name, 'as stated')}")
 
 
 def _model(camera: Camera, models: Iterable[tuple[str, int, str]]) -> tuple[str, int] | None:
-    """A program's name of a camera's model, and how many coefficients it has there; None if it has none."""
+    """A program's name for a camera's model, and its number of coefficients; None if the program lacks the model."""
     fitting = ((word, count) for ours, count, word in models if camera.model == ours and not camera.D[count:].any())
     return next(fitting, None)
 
 
 def _lacks(camera: Camera | None, models: tuple[str, ...], program: str) -> str:
-    """Why a program, which has these models, cannot have a camera; empty if it can."""
+    """Why a program with these models cannot use a camera; empty if it can."""
     if camera is None:
         return NOT_KNOWN
     known = camera.model in models
@@ -256,7 +256,7 @@ def _lacks(camera: Camera | None, models: tuple[str, ...], program: str) -> str:
 
 
 def _not_in_kalibr(camera: Camera | None) -> str:
-    """Why a camchain cannot have a camera; empty if it can."""
+    """Why a camchain cannot contain a camera; empty if it can."""
     lacks = _lacks(camera, _MODELS, "Kalibr")
     if lacks or camera is None or camera.model != "radtan" or not camera.D[RADTAN:].any():
         return lacks
@@ -274,7 +274,7 @@ def _sorted_out(reasons: dict[str, str]) -> tuple[list[str], str]:
 
 
 def _plain_names(names: Iterable[str]) -> dict[str, str]:
-    """For each name one of letters, digits and _, no two of which differ in capitals alone."""
+    """For each name, a new one of letters, digits and _. No two new names differ only in upper and lower case."""
     plain: dict[str, str] = {}
     taken: set[str] = set()
     for name in names:

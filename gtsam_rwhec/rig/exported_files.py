@@ -28,7 +28,7 @@ FILES: dict[str, Callable[[RigFrames], str]] = {
     "cameras.opencv.yaml": opencv_yaml,
     "cameras.txt": colmap_cameras_txt,
 }
-#: The texts with poses that people copy, by the name of each.
+#: These functions give the texts with poses for people to copy, by the text's name.
 COPIED: dict[str, Callable[[RigFrames], str]] = {
     "static_tf.launch.py": static_tf_launch,
     "rig.urdf.xacro": urdf_xacro,
@@ -76,7 +76,7 @@ def copied_texts(frames: RigFrames) -> dict[str, str]:
 
 
 def _remarks(frames: RigFrames) -> tuple[str, ...]:
-    """What the head of every file says."""
+    """The remarks at the head of every file."""
     return (*frames.warnings, *(f"Left out, because it has no answer: {why}" for why in frames.left_out.values()))
 
 

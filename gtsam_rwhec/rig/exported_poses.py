@@ -120,7 +120,7 @@ _WITH_LINKS = """\
 def static_tf_launch(frames: RigFrames) -> str:
     """The text of ``static_tf.launch.py``: every frame, with the new-style arguments (ROS 2 Humble and later).
 
-    Of a camera with a link it publishes the link; its optical frame too, where the launch argument says so.
+    For a camera with a link it publishes the link, and also the optical frame if the launch argument says so.
     """
     listed = _FRAMES.format(rows=_rows(frames.frames()))
     if not frames.links:
@@ -166,7 +166,7 @@ def python_poses(frames: RigFrames) -> str:
 def urdf_xacro(frames: RigFrames) -> str:
     """The text of ``rig.urdf.xacro``: the macro ``calibrated_sensors``, on the sensors' carrier by default.
 
-    Of a camera with a link it has the link; its optical frame too, where the macro's parameter says so.
+    For a camera with a link it has the link, and also the optical frame if the macro's parameter says so.
     """
     parent = frames.sensor_carrier
     sensors = [_joint(frame, "${parent}") for frame in frames.sensor_frames()]

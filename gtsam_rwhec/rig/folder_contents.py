@@ -1,7 +1,7 @@
-"""The content of a folder for a rig file: folders of images, poses beside them, and files of intrinsics.
+"""The content of a folder, for a rig file: folders of images, poses for them, and files of intrinsics.
 
-What a file is, is found out by reading it: a file of poses is one whose poses fit the images, a file of intrinsics one
-that has a camera of the images' size.
+Every file is identified by its content: a file of poses has poses that fit the images, a file of intrinsics has a
+camera of the images' size.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, TABLES, image_
 from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement
 from gtsam_rwhec.logs.pose_trees import TREES
 
-#: Folders are looked at to this depth.
+#: Folders are searched to this depth.
 DEPTH = 4
 #: A folder of images has at least this number.
 LEAST_IMAGES = 2
 #: Files of intrinsics have these endings.
 INTRINSICS = (".yaml", ".yml", ".xml", ".json", ".txt")
-#: At most this number of files in a folder are tried as poses, and as intrinsics: others are of single images.
+#: A folder with more files than this is not tried as poses or intrinsics: its files are for single images.
 MOST_TRIED = 12
-#: What files may not say, in the order in which it is tried.
+#: Formats that a file of poses may leave open, in the order in which they are tried.
 STATEMENTS = (
     PoseStatement(),
     PoseStatement(length="mm"),
@@ -57,7 +57,7 @@ class FolderPoses:
 
 @dataclass(frozen=True, eq=False)
 class ImageFolder:
-    """A folder of images: one camera's."""
+    """A folder of images of one camera."""
 
     path: str  #: From the folder that was looked at; ``.`` for itself.
     files: tuple[Path, ...]  #: In natural order
@@ -69,7 +69,7 @@ class ImageFolder:
 
 
 def is_folder_without_logs(path: Path) -> bool:
-    """Whether a path is a folder with neither logs nor files of bags in it."""
+    """Whether a path is a folder without logs and without files of bags."""
     return path.is_dir() and not any(file.suffix.lower() in (".mcap", ".db3", ".bag") for file in path.iterdir())
 
 
@@ -119,19 +119,19 @@ def _inside(folder: Path, path: Path) -> str:
 
 
 def _around(folder: Path, place: Path, image_folders: Iterable[Path]) -> Iterator[Path]:
-    """Folders for a folder of images, the nearest first: itself, those above it, and those beside them."""
+    """Where to look for a folder of images, the nearest first: itself, the folders above it, and those beside them."""
     with_images = set(image_folders)
     yield place
     while place != folder:
         place = place.parent
         yield place
         beside = sorted((d for d in place.iterdir() if d.is_dir()), key=lambda d: natural_key(d.name))
-        # Folders beside, of another camera's poses too: what fits best counts.
+        # A folder beside may have another camera's poses; the poses that fit best are taken.
         yield from (d for d in beside if d not in with_images and not d.name.startswith("."))
 
 
 def _poses(folder: Path, place: Path, files: list[Path], image_folders: Iterable[Path]) -> FolderPoses | None:
-    """The poses that fit most of the images; of equals, those in the nearest place."""
+    """The poses that fit the most images; of several, those in the nearest folder."""
     best: tuple[int, FolderPoses] | None = None
     for near in _around(folder, place, image_folders):
         there = sorted(_files(near, (*TREES, *TABLES)), key=lambda file: natural_key(file.name))
@@ -186,7 +186,7 @@ def _intrinsics(
     words = set(place.relative_to(folder).parts)
     for near in _around(folder, place, image_folders):
         there = sorted(_files(near, INTRINSICS), key=lambda file: natural_key(file.name))
-        # A file that has the name of the camera's folder goes first.
+        # A file named like the camera's folder goes first.
         there.sort(key=lambda file: not any(word in file.stem for word in words))
         for file in there[:MOST_TRIED]:
             try:

@@ -29,9 +29,9 @@ from gtsam_rwhec.rig.section_types import is_text
 from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 
-#: At most this number of images of each folder, spread over all, is searched for targets, and solved for roles.
+#: At most this number of images of each folder, spread evenly, is searched for targets and used to solve for roles.
 IMAGES = 16
-#: The frames of a folder's poses, whose names no file has.
+#: Names for the frames of a folder's poses; files do not name them.
 PARENT, CHILD = "base", "hand"
 
 
@@ -224,7 +224,7 @@ def _carriers(reading: PoseReading) -> tuple[Carriers, str]:
 
 #: Conventions of three angles that arms' controllers and programs write, the commonest first.
 AXES = ("ZYX", "xyz", "XYZ", "rotation_vector", "ZYZ", "zyx")
-#: Poses are the same if their matrices differ by less than this.
+#: Poses are equal if their matrices differ by less than this.
 SAME = 1e-6
 
 
@@ -245,12 +245,12 @@ class PoseReading:
 
     stated: PoseStatement  #: What the rig file must say
     evidence: RoleEvidence  #: Of the poses that are read so
-    #: Of the poses as they are read without a statement, where another reading explains the images far better
+    #: Evidence for the usual reading, if another reading explains the images far better
     otherwise: RoleEvidence | None
 
 
 def best_reading(folder: Path, cameras: Sequence[ImageFolder], views: Sequence[View]) -> PoseReading:
-    """The reading of the poses that explains the images; the usual one where no other is far better."""
+    """The reading of the poses that best explains the images; the usual one unless another is far better."""
     usual = [camera.poses for camera in cameras if camera.poses is not None]
     stated = usual[0].stated
     as_read = _evidence(usual, views)

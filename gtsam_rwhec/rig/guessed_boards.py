@@ -1,8 +1,8 @@
-"""Boards without tags in some images: how many corners or circles they have, found out from the images.
+"""Boards without tags: finds the number of their corners or circles from some images.
 
-Detectors must be told a board's size. Candidates come from lattices that saddles or blobs form. Each candidate is then
-looked for in all the images by the detection itself, which tests every square and circle and that nothing goes on
-beyond the board; a board is what passes in at least two images, the one that passes most often.
+A detector needs the board's size. Lattices of saddle points or blobs give candidates. The normal detection then looks
+for each candidate in all images; it tests every square and circle, and that the pattern does not continue beyond the
+board. The candidate detected in the most images, at least two, is the board.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from gtsam_rwhec.rig.sections import Intrinsics
 SMALLEST, LARGEST = 3, 30
 #: A board must pass in at least this number of images.
 LEAST_IMAGES = 2
-#: At most this number of candidates of each kind, the most frequent, are looked for in all images; of this number of
-#: images, those that `LEAST_IMAGES` of them propose.
+#: At most this number of candidates of each kind, the most frequent, are looked for in all images. If there are this
+#: many images, at least `LEAST_IMAGES` of them must propose a candidate.
 MOST_CANDIDATES, ENOUGH_IMAGES = 3, 6
 #: Circles have at least this area, pixels.
 LEAST_AREA_PX = 20.0
@@ -41,7 +41,7 @@ LEAST_AREA_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class BoardSeen:
-    """A board that was found out."""
+    """A board that was found in the images."""
 
     board: Checkerboard | CircleGrid  #: With 1 m for the length that is not known
     images: tuple[int, ...]  #: The images in which it was found
@@ -50,7 +50,7 @@ class BoardSeen:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many corners or circles, [across, down]."""
+        """The number of corners or circles, [across, down]."""
         return self.board.columns, self.board.rows
 
 
@@ -128,7 +128,7 @@ def _with_circles(images: Sequence[Gray], columns: int, rows: int, *, asymmetric
         good = []
         for i, gray in enumerate(images):
             height, width = gray.shape
-            # No lens that cameras on robots have bends a small grid much: a pinhole serves to test it.
+            # No usual robot camera distorts a small grid much, so a pinhole camera is enough for this test.
             camera = Camera.of(width, height, "pinhole", _any_K(width, height), (), "a first guess")
             seen = find_circle_grid(gray, board, camera)
             if seen is not None and seen.rejection is None:
@@ -149,9 +149,9 @@ def _any_K(width: int, height: int) -> Array:
 
 #: A neighbour is off its predicted place by at most this share of the step to it.
 NEAR = 0.25
-#: A neighbour's size is this share of the point's own at least, and at most one over it: larger dots belong to it.
+#: The ratio of neighbours' sizes is between this and its inverse: a grid may have larger dots.
 ALIKE = 0.4
-#: Points from which lattices are grown, spread over all.
+#: The number of points from which lattices are grown, spread over all points.
 STARTS = 12
 #: Steps of neighbours, along the lattice.
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -164,7 +164,7 @@ def lattice_size(points: Array, sizes: Array) -> tuple[int, int] | None:
     ----------
     points : (n, 2) array
     sizes : (n,) array
-        What neighbours have about equal: diameters of blobs.
+        Sizes that are about equal for neighbours, such as diameters of blobs.
     """
     return _largest(points, sizes, _rectangle)
 
@@ -194,9 +194,9 @@ def _rectangle(cells: Array) -> tuple[int, int] | None:
 
 
 def _shifted_rows(cells: Array) -> tuple[int, int] | None:
-    """Points in a row, and rows, if these cells (n, 2) are rows that are shifted in turn.
+    """Points in a row, and rows, if every other row of these cells (n, 2) is shifted by half a step.
 
-    The two steps of the lattice may be any two of those between neighbours, in half steps along a row and in rows.
+    All pairs of steps between neighbours are tried as the lattice's two axes: half steps along a row, and rows.
     """
     for first, second in permutations(((1, 1), (1, -1), (2, 0), (0, 2)), 2):
         x, row = (cells @ np.array([first, second])).T
@@ -258,21 +258,21 @@ def _grown(points: Array, sizes: Array, start: int) -> dict[tuple[int, int], int
     return cells
 
 
-#: Beside intrinsics that were found: who calibrated the camera says so.
+#: The comment beside intrinsics that were found: the user states whether the camera was calibrated.
 STATED = "stated: calibration if this camera was calibrated, with this lens and focus"
 #: A board's views determine a focal length with at least this number of images.
 LEAST_VIEWS = 6
 #: Focal lengths, over the images' width, that lenses on robots have.
 SHORTEST, LONGEST = 0.25, 6.0
-#: A camera that fits worse than this (pixels) is not the one.
+#: A fitted camera with a larger residual (pixels) is rejected.
 LARGEST_RMS_PX = 1.5
-#: The focal length over the width where nothing tells it: about 60 degrees across.
+#: The focal length over the width where it is unknown: about 60 degrees across.
 USUAL = 0.87
 
 
 @dataclass(frozen=True)
 class GuessedIntrinsics:
-    """What the rig file has, the comment beside it (with ``TODO`` where a person must state another), and a camera."""
+    """The rig file's section, the comment beside it (``TODO`` if a person must replace the section), and a camera."""
 
     section: Intrinsics
     words: str
@@ -282,8 +282,8 @@ class GuessedIntrinsics:
 def guessed_intrinsics(size: tuple[int, int], boards: Iterable[BoardSeen]) -> GuessedIntrinsics:
     """Intrinsics for images of this size (width, height) that saw some boards.
 
-    Where a board determines them the rig file leaves them to be estimated: the calibration has more images than were
-    looked at here, and frees the lens with the poses.
+    If a board determines them, the rig file says that they are to be estimated: the calibration uses more images than
+    this function, and estimates the lens together with the poses.
     """
     width, height = size
     for seen in boards:

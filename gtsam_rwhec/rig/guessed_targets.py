@@ -111,7 +111,7 @@ def boards_guessed(seen: Iterable[tuple[str, int, BoardSeen]]) -> list[Guess]:
 
 
 def with_size(section: TargetSection, factor: float) -> TargetSection:
-    """The section with its lengths times this factor, to four digits."""
+    """The section with its lengths multiplied by this factor, to four digits."""
     lengths = {
         name: float(f"{getattr(section, name) * factor:.4g}")
         for name in type(section).model_fields
@@ -121,7 +121,7 @@ def with_size(section: TargetSection, factor: float) -> TargetSection:
 
 
 def least_sightings(family: str, looked_at: int) -> int:
-    """In how many images a tag must be. Families of few bits need more, since their false detections are frequent."""
+    """The number of images that must show a tag. Families of few bits need more: false detections are frequent."""
     if looked_at < 3 or family == "tag36h11":
         return 1
     return 3 if family in ("tag16h5", "aruco_4x4_1000", "aruco_original") else 2
@@ -160,7 +160,7 @@ def _of_family(family: str, ids: dict[int, int], looked_at: int, views: Sequence
 
 
 def _of_layout(family: str, first: int, layout: Layout) -> Guess:
-    """A board whose columns and rows the images tell."""
+    """A board with the columns and rows found in the images."""
     counts = layout.columns, layout.rows
     fits = (
         f"the tags lie so in {layout.images} images, to {rounded(layout.off, 2)} of a tag's side; other columns and "
@@ -218,7 +218,7 @@ def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Ite
 
 
 def _squares(markers: int) -> tuple[int, int]:
-    """Columns and rows of a board with so many markers, as near to a square as possible."""
+    """Columns and rows of a board with this number of markers, as near to a square as possible."""
     boards = [(columns, rows) for columns in range(2, 101) for rows in range(2, columns + 1)]
     fitting = [(columns, rows) for columns, rows in boards if columns * rows // 2 == markers]
     return min(fitting, key=lambda board: board[0] - board[1], default=(7, 5))
@@ -232,13 +232,13 @@ def _listed(ids: list[int]) -> str:
 
 #: A ChArUco board is counted by squares, the others by tags.
 Kind = Literal["charuco", "aprilgrid", "tag_grid"]
-#: An image counts with at least this number of the board's tags: four middles fit any homography.
+#: An image needs at least this number of the board's tags: a homography fits any four tag centres.
 LEAST_TAGS = 6
 #: A board needs at least this number of images.
 LEAST_IMAGES = 2
-#: Middles are off their places by at most this share of a tag's side, and those of other layouts by this factor more.
+#: The most that tag centres may be off, over a tag's side; other layouts must be worse by this factor.
 MOST_OFF, WORSE = 0.12, 3.0
-#: A board has at most this number of columns and rows, and this many times as many of one as of the other.
+#: A board has at most this number of columns and of rows, and this ratio between the two.
 MOST, LONGEST = 40, 5.0
 
 
@@ -251,16 +251,16 @@ class Layout:
     columns: int
     rows: int
     share: float  #: A tag's side over the step from one to the next; of a ChArUco board over a square's side
-    #: Root mean square distance of the tags' middles from their places, over a tag's side, median over images
+    #: Root mean square error of the tags' centres, over a tag's side; the median over images
     off: float
     images: int  #: The images that were compared
 
 
 def layout_of(kinds: Iterable[Kind], ids: Sequence[int], views: Iterable[Sequence[SeenTag]]) -> Layout | None:
-    """The layout of the tags with ids from ``ids[0]`` to ``ids[-1]``, in increasing order; None where images do not
-    tell.
+    """The layout of the tags with ids from ``ids[0]`` to ``ids[-1]``, in increasing order; None if the images do
+    not determine it.
 
-    `kinds` are what the board may be, and `views` the tags of its family in each image.
+    `kinds` are the possible kinds of the board, and `views` the tags of its family in each image.
     """
     first, count = ids[0], ids[-1] - ids[0] + 1
     wanted = set(ids)
@@ -279,7 +279,7 @@ def layout_of(kinds: Iterable[Kind], ids: Sequence[int], views: Iterable[Sequenc
     tried.sort(key=lambda layout: layout.off)
     if not tried or tried[0].off > MOST_OFF or not 0.05 < tried[0].share < 1.0:
         return None
-    # One square more or less, without a marker, leaves the markers where they are: the smaller board is taken.
+    # One more square without a marker does not move the markers: the smaller board is taken.
     best, *others = tried
     same = [other for other in others if other.kind == best.kind and abs(other.off - best.off) < 1e-9]
     if any(other.off < WORSE * best.off for other in others if other not in same):
@@ -294,7 +294,7 @@ def _sizes(kind: Kind, count: int) -> list[tuple[int, int]]:
 
 
 def _places(kind: Kind, columns: int, rows: int) -> Array:
-    """The tags' middles (n, 2) in steps, x to the right and y up as printed."""
+    """The tags' centres (n, 2) in steps, x to the right and y up on the printed board."""
     cells = np.meshgrid(np.arange(columns), np.arange(rows))
     x, y = cells[0].ravel(), cells[1].ravel()
     if kind == "charuco":  # markers are in the white squares, and the upper left one is black
@@ -305,7 +305,7 @@ def _places(kind: Kind, columns: int, rows: int) -> Array:
 
 
 def _fit(places: Array, tags: Sequence[SeenTag]) -> tuple[float, float]:
-    """How far middles are off, over a tag's side, and a tag's side in steps; infinite where the tags are turned."""
+    """The error of the centres over a tag's side, and a tag's side in steps; infinite if the tags are rotated."""
     middles = np.array([tag.middle_px for tag in tags], dtype=float)
     sides = np.array([tag.side_px for tag in tags])
     H = cv2.findHomography(places, middles, 0)[0]

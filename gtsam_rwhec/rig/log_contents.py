@@ -60,7 +60,7 @@ class ImageTopic:
     stamps_ns: list[int] = field(default_factory=list)
 
     def search(self, gray: Gray, place: int) -> None:
-        """Search an image for tags, and keep it; its place is its stamp in a log, its number in a folder."""
+        """Search an image for tags, and keep it; `place` is its stamp in a log, or its number in a folder."""
         # The first few images show which families there are; the search for all of them takes a second for each image.
         families = BY_TRUST if self.looked_at < IMAGES_FOR_ALL else tuple(self.tags)
         self.looked_at += 1
@@ -142,7 +142,7 @@ def read_contents(log: Log) -> LogContents:
     topics = log.topics()
     contents = LogContents(topics)
     readable = {topic.name for topic in topics if is_text(topic.name)}
-    # A message with several poses has poses of several things, most often of targets, and not of a carrier.
+    # A message with several poses is about several objects, most often targets, and not about a carrier.
     readable -= {topic.name for topic in topics if topic.unreadable or schema_word(topic.schema) == "PosesInFrame"}
     transforms = {topic.name for topic in topics if topic.is_tf}
     for topic in topics:
@@ -238,7 +238,7 @@ def _of_tf(series: list[PoseTopic], cameras: list[str]) -> tuple[list[MovingPair
         return chain
 
     def body(frame: str) -> str:
-        """The frame that stands for the body of a frame: its nearest moving frame, or its root."""
+        """The frame that represents a frame's body: its nearest moving frame, or its root."""
         chain = up(frame)
         return next((f for f in chain if f in moving), chain[-1])
 
@@ -273,7 +273,7 @@ def _words(series: PoseTopic, where: str) -> str:
     return f"{where}: {series.count} poses, up to {moved:.2f} m and {math.degrees(turned):.0f} degrees"
 
 
-#: These words in names of topics say what is published, and not by which camera.
+#: Words in topic names that describe the kind of data, and not the camera.
 COMMON = frozenset({
     "image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw", "compressed",
     "raw", "color", "colour", "rgb", "detections", "tag_detections", "apriltag_detections", "detection", "tags",

@@ -32,7 +32,7 @@ from gtsam_rwhec.rig.section_types import is_name, is_text
 from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 
-#: Written where a log has none, for a person to replace.
+#: Written if a log has no intrinsics; a person must replace it.
 _NO_INTRINSICS = Intrinsics(file="camera.yaml")
 #: Comment on a sensor's time offset.
 _TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
@@ -221,7 +221,7 @@ def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]
 
 
 def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> tuple[Intrinsics | None, str]:
-    """The topic of intrinsics for another topic. It has the same frame, or its name begins in the same way."""
+    """The intrinsics for a topic, from a topic with the same frame or with a name that begins in the same way."""
     same_frame = [name for name, its_frame in known.items() if frame and its_frame == frame]
     candidates = same_frame or list(known)
     shared = {name: _shared(topic, name) for name in candidates}
@@ -253,9 +253,9 @@ def _topics(contents: LogContents) -> str:
     return f"topics: {listed or 'none'}"
 
 
-#: Words of topics that say what is published, and not by which sensor.
+#: Words in topic names that describe the kind of data, and not the sensor.
 OF_KIND = ("odom", "odometry", "pose", "poses", "odometry_pose", "pose_stamped", "local", "filtered")
-#: Names that point to visual odometry of one camera, whose lengths are not metres.
+#: Words that indicate visual odometry of one camera, whose lengths are not in metres.
 OF_ONE_CAMERA = ("mono", "vo", "cam", "camera", "orb", "dso", "svo")
 _SCALE = (
     "scale: estimate, inside odometry, where its lengths are not metres (visual odometry of one camera); "
@@ -325,7 +325,7 @@ def _found(poses: Iterable[PoseTopic]) -> list[_Found]:
 
 
 def _name(topic: str) -> str:
-    """The sensor's name: the topic without what says what is published."""
+    """The sensor's name: the topic without the words for the kind of data."""
     parts = [part for part in topic.strip("/").split("/") if part]
     while len(parts) > 1 and parts[-1].lower() in OF_KIND:
         parts.pop()

@@ -93,7 +93,7 @@ class RigFile(Section):
 
     @cached_property
     def calibrated(self) -> tuple[str, ...]:
-        """The names of all sensors whose poses are asked for: all but the reference, which carries them."""
+        """The names of all sensors whose poses are estimated: all but the reference."""
         return tuple(name for name in self.all_sensors if name != self.reference)
 
     @cached_property
@@ -122,7 +122,7 @@ class RigFile(Section):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> RigFile:
-        # pydantic keeps the places of the faults of a ValidationError that is raised here.
+        # pydantic keeps the fault locations of a ValidationError that is raised here.
         faults = [
             InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
             for path, words in (
@@ -137,13 +137,13 @@ class RigFile(Section):
 
 @dataclass(frozen=True)
 class Lines:
-    """Where the values of a rig file stand, for messages; rig files of equal content are equal wherever they stand."""
+    """The lines of a rig file's values, for messages; they do not count when rig files are compared."""
 
     where: str = field(default="", compare=False)  #: The file; empty for a rig that was made in Python
     lines: Mapping[KeyPath, int] = field(default_factory=dict, compare=False)  #: The line of each value
 
     def place(self, *paths: KeyPath) -> str:
-        """``FILE, lines N and M: a.b and a.c``, as far as known; of a value that is not written, its section's line."""
+        """``FILE, lines N and M: a.b and a.c``, as far as known; for a value that is not written, the section's."""
         names = " and ".join(map(dotted, paths))
         numbers = list(dict.fromkeys(filter(None, map(self._line, paths))))
         if not self.where or not numbers:

@@ -37,7 +37,7 @@ _TARGETS: dict[str, type[BaseModel]] = {
     "checkerboard": target_sections.CheckerboardTarget,
     "circle_grid": target_sections.CircleGridTarget,
 }
-#: Each place has this section; * stands for any name.
+#: The section of each place in the file; * stands for any name.
 _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     (): RigFile,
     ("carriers",): sections.Carriers,
@@ -54,7 +54,7 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("given", "directions", "*"): odometry_sections.GivenDirection,
     ("given", "distances", "*"): odometry_sections.GivenDistance,
 }
-#: These words say what to do about a fault, by pydantic's name for its kind.
+#: What to do about a fault, by pydantic's name for its kind.
 _KINDS = {
     "float_type": "give a number",
     "int_type": "give a whole number",
@@ -198,7 +198,7 @@ def _about(key: str, field: FieldInfo) -> str:
 
 
 def _counts_before(target: dict[str, Any], counted: str) -> str:
-    """What replaces columns and rows of rig files of before."""
+    """The keys that replace columns and rows of old rig files."""
     across, down = (target.get(key) for key in ("columns", "rows"))
     if isinstance(across, int) and isinstance(down, int):
         return f"columns: {across}, rows: {down} is now {counted}: [{across}, {down}]"
@@ -319,7 +319,7 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
 
 
 def _sections(rig: RigFile) -> Iterator[tuple[str, Any]]:
-    """The sections by their keys, without what follows from the others."""
+    """The sections by their keys, without those that follow from others."""
     for name, field in RigFile.model_fields.items():
         follows = name == "carriers" and rig.reference is not None
         if not follows and not (name == "targets" and not rig.targets) and not (name == "given" and rig.given == NONE):
@@ -371,5 +371,5 @@ _FOLDER = Path(__file__).with_name("template_files")
 
 
 def template_text(name: TemplateName) -> str:
-    """The text of a template; TODO marks what is different in every cell."""
+    """The text of a template; TODO marks values that differ for every robot cell."""
     return (_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")

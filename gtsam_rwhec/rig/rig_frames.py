@@ -37,7 +37,7 @@ class CameraLink(NamedTuple):
 class RigFrames:
     """Calibrated frames by name, in the order in which they are written.
 
-    Names are written into Python, YAML and XML. They have only characters that mean nothing special there: first a
+    Names are written into Python, YAML and XML. They have only characters without a special meaning there: first a
     letter, then letters, digits and _, in parts joined by /.
 
     Raises
@@ -56,8 +56,8 @@ class RigFrames:
     sensors: Mapping[str, Array]  #: dict of str to (4, 4): T_sensorcarrier_sensor, metres
     targets: Mapping[str, Array]  #: dict of str to (4, 4): T_targetcarrier_target, metres
     cameras: Mapping[str, Camera] = field(default_factory=dict)  #: Intrinsics by sensor; may lack a sensor
-    #: Where the intrinsics of a sensor are from, in words that are written beside them; may lack a sensor, whose
-    #: intrinsics are as stated
+    #: Where a sensor's intrinsics come from, in words that are written beside them. A missing sensor has its stated
+    #: intrinsics
     camera_origins: Mapping[str, str] = field(default_factory=dict)
     #: Time offsets by sensor, seconds: the sensor's stamp t is the carriers' t + offset. A missing offset is 0.
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class RigFrames:
             yield CalibratedFrame(self.target_carrier, name, T)
 
     def sensor_frames(self) -> Iterator[CalibratedFrame]:
-        """Each sensor on the sensors' carrier; of a camera with a link the link, so that the driver's own tree holds.
+        """Each sensor on the carrier; for a camera with a link, the link, so that the driver's own tf tree stays valid.
 
         T_carrier_link = T_carrier_optical T_link_optical^-1: with the driver's T_link_optical it composes to the
         calibrated pose, and no frame has two parents.
@@ -124,7 +124,7 @@ class RigFrames:
                 yield CalibratedFrame(self.sensor_carrier, link.name, T @ inverse(link.T_link_optical))
 
     def optical_frames(self) -> Iterator[CalibratedFrame]:
-        """The optical frame of each camera with a link, on its link: what its driver publishes."""
+        """The optical frame of each camera with a link, on its link, as its driver publishes it."""
         for name, link in self.links.items():
             yield CalibratedFrame(link.name, name, link.T_link_optical)
 
@@ -150,7 +150,7 @@ def frames_of_refined(
     refined : Refined, RefinedPoses or CornersRefined
         Of ``rw.refine``, ``rw.read_refined``, ``rw.refine_corners`` or ``rw.calibrate_corners(...).refined``.
     cameras : dict of str to Camera, optional
-        Stated intrinsics by sensor: they count where none were estimated.
+        Stated intrinsics by sensor, used where none were estimated.
     sensor_carrier, target_carrier : str
         Names of the frames that carry the sensors and the targets.
     warnings : tuple of str
@@ -177,7 +177,7 @@ def frames_of_refined(
 def known_cameras(
     stated: Mapping[str, Camera], estimated: Mapping[str, Intrinsics] | Mapping[str, RefinedIntrinsics]
 ) -> tuple[dict[str, Camera], dict[str, str]]:
-    """The cameras to use by sensor, estimated ones before stated ones; and where the former are from, in words."""
+    """The cameras to use by sensor, estimated or else stated; and, in words, where the estimated ones come from."""
     cameras = {**stated, **{name: intrinsics.camera for name, intrinsics in estimated.items()}}
     return cameras, {name: _origin(intrinsics) for name, intrinsics in estimated.items()}
 

@@ -1,4 +1,4 @@
-"""The reference of rig files, as Markdown, made of their sections: every key, its unit, default and an example."""
+"""Makes the reference of rig files in Markdown from the sections: every key, its unit, default and an example."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ A rig file names the sensors and the targets, what carries them, and where the l
   (`gtsam-rwhec init --schema` prints it). Rig files that `init` writes name it in their first line; in one of your own,
   write `# yaml-language-server: $schema=PATH`.
 """
-#: Sections with the path of their place; targets follow.
+#: Sections and their path in the file; targets follow.
 SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("carriers", Carriers),
     ("carriers: poses", PoseSource),
@@ -145,7 +145,7 @@ def _example(said: dict[str, Any], field: FieldInfo) -> Any:
 
 
 def _kind(said: dict[str, Any]) -> str:
-    """What a value is, in words, from its schema."""
+    """The kind of a value in words, from its schema."""
     return " or ".join(dict.fromkeys(_kinds(said)))
 
 
@@ -171,14 +171,14 @@ def _kinds(said: dict[str, Any]) -> Iterator[str]:
         yield {"string": "text", "integer": "whole number", "boolean": "true or false"}[said["type"]]
 
 
-#: Editors know this version of JSON Schema, all of them.
+#: All editors know this version of JSON Schema.
 DIALECT = "http://json-schema.org/draft-07/schema#"
 #: The schema as the package ships it; `schema_text` makes its content.
 SCHEMA_FILE = Path(__file__).with_name("rig_file.schema.json")
 
 
 class _Draft07(GenerateJsonSchema):
-    """Lists of a fixed length as draft 07 has them, and no titles: the keys say as much."""
+    """Writes lists of fixed length as in draft 07, and no titles, because the keys say the same."""
 
     def tuple_schema(self, schema: core_schema.TupleSchema) -> JsonSchemaValue:
         made = super().tuple_schema(schema)
@@ -229,7 +229,7 @@ def detection_keys() -> list[tuple[str, float, str]]:
 
 
 def _without(node: Any, key: str) -> None:
-    """Take a schema's own words with this key away; keys of rig files stand under ``properties``."""
+    """Remove this keyword from a schema; keys of rig files, which stand under ``properties``, stay."""
     if isinstance(node, dict):
         node.pop(key, None)
         for name, value in node.items():

@@ -29,7 +29,7 @@ UNITS = {
 
 
 class InSchema:
-    """What the JSON Schema of a value says beside its type, for values that a function checks."""
+    """Keywords for the JSON Schema of a value, in addition to its type, for values that a function checks."""
 
     def __init__(self, **keywords: Any) -> None:
         self.keywords = keywords
@@ -148,7 +148,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     def _given(self, *names: str) -> list[str]:
-        """Those of these keys that the section has."""
+        """The keys among `names` that the section has."""
         return [name for name in names if getattr(self, name) is not None]
 
 
