@@ -1,9 +1,10 @@
 """Corners of boards, the points where two dark squares meet: blur and gamma do not move them.
 
-The tags that were read say where the board is. All of its corners are looked for at the places which that predicts,
-also those beside tags that could not be read. A corner counts if its four quadrants are dark and light as printed, and
-if it is at its place in the board's plane. At a point p of an edge the gradient g is across the edge, g . (q - p) = 0
-for the corner q (Förstner and Gülch 1987; OpenCV's cornerSubPix): here summed over two strips along the edges.
+The tags that were read give the board's pose. It predicts the places of all corners, also beside tags that could not be
+read, and each corner is searched there. A corner counts if its four quadrants are dark and light as printed, and if it
+is at its place in the board's plane. At a point p of an edge the gradient g is perpendicular to the edge, so g . (q -
+p) = 0 for the corner q (Förstner and Gülch 1987; OpenCV's cornerSubPix). Here the points are those of two strips along
+the edges.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from gtsam_rwhec.geometry.poses import Array
 
 #: Strips reach at most this far along and across the edges, pixels.
 MOST_ALONG, MOST_ACROSS = 7.0, 7.0
-#: They reach at least this far.
+#: Strips reach at least this far along and across the edges, pixels.
 LEAST_ALONG, LEAST_ACROSS = 2.5, 1.2
-#: Rounds end with the last step below this (pixels), or after this number.
+#: The iteration ends when a step is below this (pixels), or after this number of rounds.
 SETTLED_PX, ROUNDS = 2e-3, 15
-#: A corner with less of its gradients along the weaker direction than this share has one edge only.
+#: If the weaker direction has less than this share of the gradients, there is only one edge, and no corner.
 LEAST_SHARE = 0.08
 
 
@@ -35,13 +36,13 @@ class Strips:
 
     corners_px: Array  #: (n, 2)
     directions: Array  #: (n, 2, 2): unit vectors along the two edges in the image
-    #: (n, 2): how far along and across each edge there is nothing else, pixels
+    #: (n, 2): the free length along each edge and the free width across it, where nothing else is printed, pixels
     along_px: Array
     across_px: Array
 
 
 def crossings_of_edges(gray: Gray, strips: Strips) -> Array:
-    """Places (n, 2) of the corners, pixels; nan where there are not two edges."""
+    """Places (n, 2) of the corners, pixels; nan where two edges were not found."""
     along = np.clip(strips.along_px, LEAST_ALONG, MOST_ALONG)[:, None].astype(np.float32)
     across = np.clip(strips.across_px, LEAST_ACROSS, MOST_ACROSS)[:, None].astype(np.float32)
     half = int(np.ceil(along.max(initial=LEAST_ALONG))) + 1
@@ -88,14 +89,14 @@ def crossings_of_edges(gray: Gray, strips: Strips) -> Array:
 
 #: cornerSubPix ends after 30 rounds, or with a step of at most 1e-3 pixels.
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
-#: Blur and the gradient's window carry the edge of what is printed outwards by this many pixels.
+#: Blur and the gradient's window widen each printed edge by this many pixels.
 GRADIENT_PX = 2.0
 #: Corners nearer to the image's border than this are not measured, pixels.
 MARGIN_PX = 3.0
-#: Corners are looked for as far from known ones as this many squares, or tags with their gap.
+#: Corners are searched up to this far from known ones, in squares or in tags with their gap.
 NEAR = 1.6
-#: A corner that is found further from where it is looked for than this share of the distance to the next thing printed,
-#: and than this many pixels, is another one.
+#: A corner found further from its predicted place than this share of the distance to the next printed edge, and than
+#: this many pixels, is another corner.
 MOST_MOVED, LEAST_MOVED_PX = 0.7, 1.0
 #: A corner further than this (pixels) from the place that the other corners predict is not used,
 ASTRAY_PX = 1.5
@@ -109,8 +110,8 @@ LEAST_CONTRAST, LEAST_GRAY = 0.25, 6.0
 class _Corners:
     """Corners of a board in its plane, metres: (n, 2), and what is printed around each.
 
-    `dark` and `light` (n, 2, 2) are offsets to points in the dark and in the light quadrants, `along` and
-    `across` how far along and across the edges that meet in a corner nothing else is printed.
+    `dark` and `light` (n, 2, 2) are offsets to points in the dark and in the light quadrants. `along` and `across` are
+    the distances along and across the corner's edges within which nothing else is printed.
     """
 
     places: Array
@@ -142,7 +143,7 @@ def _of_aprilgrid(board: AprilGrid) -> _Corners:
 
 
 def board_corners(gray: Gray, board: Charuco | AprilGrid, tags: BoardTags, camera: Camera) -> tuple[np.ndarray, Array]:
-    """Indices (n,) and places (n, 2) of the corners that are seen of a board, from two of its tags and more."""
+    """Indices (n,) and places (n, 2) of a board's corners that are seen; at least two of its tags are needed."""
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if len(tags.ids) < 2:
         return nothing
@@ -153,7 +154,7 @@ def board_corners(gray: Gray, board: Charuco | AprilGrid, tags: BoardTags, camer
     known, seen = tag_plane, tags_px
     numbers, found = nothing
     looked_for = np.zeros(len(corners.places), dtype=bool)
-    # A pattern repeats itself: what is known grows by one square or tag at a time.
+    # The pattern repeats itself, so the search must not jump: the known part grows by one square or tag at a time.
     pitch = board.square_m if isinstance(board, Charuco) else board.tag_m * (1.0 + board.spacing)
     while True:
         places = _Places.of(camera, known, seen)
@@ -182,20 +183,22 @@ def board_corners(gray: Gray, board: Charuco | AprilGrid, tags: BoardTags, camer
 
 
 def _span_a_plane(points: Array) -> bool:
-    """Whether points (n, 2) are not all on one line, nor nearly."""
+    """Whether points (n, 2) are clearly not all on one line."""
     extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(extent[1] > 0.1 * extent[0])
 
 
 def _are_there(places: _Places, tag_plane: Array, tags_px: Array) -> bool:
-    """Whether the tags' corners (4 m, 2) are where the board's corners say."""
+    """Whether the tags' corners (4 m, 2) are where the board's corners predict them."""
     off = np.linalg.norm(places.pixels(tag_plane) - tags_px, axis=1).reshape(-1, 4).max(axis=1)
     return bool(np.median(off / largest_off(tags_px.reshape(-1, 4, 2))) <= 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where a plane's points are in the image, by a homography (3, 3) to a camera without distortion."""
+    """Projects a plane's points into the image: a homography (3, 3) to a camera without distortion, then the
+    distortion.
+    """
 
     H: Array
     focal: float
@@ -203,7 +206,7 @@ class _Places:
 
     @staticmethod
     def of(camera: Camera, plane: Array, pixels: Array) -> _Places | None:
-        """From points (n, 2) of the plane, seen at (n, 2)."""
+        """Fit the homography to points (n, 2) of the plane and their pixels (n, 2); None where it cannot be fitted."""
         focal = camera.focal_px
         flat = camera.undistort(pixels) * focal
         good = np.isfinite(flat).all(axis=1)
@@ -220,7 +223,7 @@ class _Places:
 
 
 def _found(gray: Gray, corners: _Corners, places: _Places, which: np.ndarray) -> tuple[np.ndarray, Array]:
-    """Numbers and places of those corners of `which` that look as printed."""
+    """Indices and places of the corners of `which` that look as printed."""
     at = corners.places[which]
     predicted = places.pixels(at)
     nudge = 1e-3 * corners.along
@@ -229,7 +232,7 @@ def _found(gray: Gray, corners: _Corners, places: _Places, which: np.ndarray) ->
     length = np.linalg.norm(steps, axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
         directions = steps / length[..., None]
-        # From an edge to its parallels, pixels.
+        # Distance from an edge to the next parallel edges, pixels.
         apart = np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])[:, None] / length
     edge = np.array(gray.shape[::-1]) - 1.0 - MARGIN_PX
     with np.errstate(invalid="ignore"):

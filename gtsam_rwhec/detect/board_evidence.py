@@ -1,8 +1,8 @@
 """Whether corners are those of a checkerboard: each square, the outermost too, must be there, dark or light as printed.
 
-A board one square off fits a homography as well as the right one. Its outermost squares lie on the paper's margin or
-beyond, and do not alternate. A light falls on both of two neighbours, so that shade leaves the contrast
-(light - dark) / (light + dark) between them (Michelson's) much as it is.
+A board that is detected one square off fits a homography as well as the right one. But its outermost squares lie on the
+paper's margin or beyond, and do not alternate. Two neighbouring squares have nearly the same light, so that shade
+hardly changes their contrast (light - dark) / (light + dark) (Michelson's).
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from gtsam_rwhec.geometry.poses import Array
 #: A corner is off its place in the plane by at most this (pixels), or by `MOST_OFF` of the distance between lines.
 MOST_OFF_PX = 0.5
 MOST_OFF = 0.02
-#: At least this share of the corners must be at their places; those that are not do not count. Of each row and column
-#: more than half must be: a row that is not on the board is nowhere at its places.
+#: At least this share of the corners must be at their places, and more than half of each row and column: of a row that
+#: is not on the board no corner is at its place. The other corners are not used.
 LEAST_KEPT = 0.8
 #: Two neighbouring squares have at least this share of the median contrast of all neighbours.
 LEAST_CONTRAST = 0.3
 #: Two neighbouring squares differ by at least this, in gray values.
 LEAST_GRAY = 4.0
-#: A row of squares goes on beyond the board if its squares have this share of the median contrast.
+#: The pattern goes on beyond the board if the next row of squares has this share of the median contrast.
 GOES_ON = 0.6
 #: The gray value of a square is the median of PER_SIDE^2 samples in this part of it, about its middle.
 MIDDLE, PER_SIDE = 0.5, 5
@@ -35,7 +35,7 @@ MIDDLE, PER_SIDE = 0.5, 5
 
 @dataclass(frozen=True, eq=False)
 class FoundBoard:
-    """Corners (n, 2) of a board, or centres of its circles; their indices (n,) in its rows from the top, and why they
+    """Corners (n, 2) of a board, or centres of its circles, their indices (n,) row by row from the top, and why they
     are not used.
     """
 
@@ -64,7 +64,7 @@ class BoardPlane:
 
     @staticmethod
     def through(steps: Array, pixels: Array, camera: Camera | None, method: int = 0) -> BoardPlane | None:
-        """The plane that fits pixels (..., 2) of places (..., 2), by OpenCV's method; None where there is none."""
+        """The plane that fits pixels (..., 2) of places (..., 2), by `method` of OpenCV; None where no plane fits."""
         focal = 1.0 if camera is None else camera.focal_px
         flat = pixels.reshape(-1, 2) if camera is None else camera.undistort(pixels.reshape(-1, 2)) * focal
         H = None
@@ -86,7 +86,7 @@ class BoardPlane:
         return np.stack(columns, axis=-1)
 
     def scales(self, steps: Array) -> Array:
-        """Pixels of a step (...): the geometric mean over directions."""
+        """Length (...) of a step in pixels: the geometric mean over directions."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.jacobians(steps)))))
 
 
@@ -95,7 +95,7 @@ def plane_through(
 ) -> tuple[BoardPlane, Array] | None:
     """The plane of those corners (rows, columns, 2) that are `good`, and how far (rows, columns) each is off, pixels.
 
-    It is that of least squares if no corner is off by more than most_px, else that of the least median.
+    It is fitted by least squares; if then a corner is off by more than `most_px`, by the least median of squares.
     """
     rows, columns = grid.shape[:2]
     squares: Array = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
@@ -111,9 +111,9 @@ def plane_through(
 
 
 def evidence(gray: Gray, grid: Array, camera: Camera | None, good: np.ndarray | None = None) -> Evidence:
-    """Test a board's inner corners (rows, columns, 2), pixels; without a camera, as one of no distortion.
+    """Test a board's inner corners (rows, columns, 2), pixels; without a camera, no distortion is assumed.
 
-    `good` says which corners (rows, columns) were measured; the others are at no place.
+    `good` (rows, columns) says which corners were measured; the others are not used.
     """
     rows, columns = grid.shape[:2]
     counted = np.ones((rows, columns), dtype=bool) if good is None else good
@@ -137,7 +137,8 @@ def evidence(gray: Gray, grid: Array, camera: Camera | None, good: np.ndarray | 
     usual = float(np.median(on_board))
     if not (on_board >= LEAST_CONTRAST * usual).all() or usual <= 0.0:
         return Evidence(Rejection.SQUARES, kept)
-    # Beyond the board, where all of a row or column of squares alternates on and against the outermost squares.
+    # The pattern goes on where a whole row or column beyond the board alternates in itself and with the outermost
+    # squares.
     beyond = ((across[k, 1:-1], down[k, 1:-1]) for k in (0, -1))
     beside = ((down[1:-1, k], across[1:-1, k]) for k in (0, -1))
     if any((np.concatenate(pair) >= GOES_ON * usual).all() for pair in (*beyond, *beside)):

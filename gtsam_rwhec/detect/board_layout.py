@@ -1,8 +1,8 @@
-"""Whether a board's tags are where the board has them, by one homography or one pose, and the layout that fits if not.
+"""Whether tags are at their places on the stated board, by one homography or one pose; if not, the layout that fits.
 
 A tag that was read wrongly, or a board that is not the stated one, is off by a tag's side and more. Errors of corners
-and of intrinsics are far smaller than that, so that `LARGEST_OFF` tells them apart. Layouts are tried in the order in
-which people take one for another; the first that fits is what the message proposes.
+and of intrinsics are far smaller, so that the limit `LARGEST_OFF` separates the two cases. Other layouts are tried,
+those that are confused most often first; the message proposes the first that fits.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SAMPLES = 200
 
 
 def agreeing(places: Array, flat: Array, off_px: Array | None = None) -> np.ndarray:
-    """Say which (m,) of a board's tags agree with the largest set of them that agrees. One tag agrees with itself.
+    """Say which (m,) of a board's tags are in the largest set that fits one pose. A single tag agrees with itself.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def largest_off(flat: Array) -> Array:
 
 
 def agreeing_in_space(places: Array, x: Array, off: Array) -> np.ndarray:
-    """Do as `agreeing` for tags of several planes, with x (m, 4, 2) and off (m,) in normalised coordinates."""
+    """`agreeing` for tags in several planes, with x (m, 4, 2) and off (m,) in normalised coordinates."""
     seen = np.asarray(np.isfinite(x).all(axis=(1, 2)))
     agrees = np.zeros(len(places), dtype=bool)
     if seen.sum() < 2:
@@ -88,7 +88,7 @@ def agreeing_in_space(places: Array, x: Array, off: Array) -> np.ndarray:
 
 
 def all_agree(plane: Array, flat: Array) -> bool:
-    """Whether all tags, in their plane (m, 4, 2) and seen at `flat` (m, 4, 2), agree with the least squares of all."""
+    """Whether all tags (m, 4, 2) of a plane, seen at `flat` (m, 4, 2), fit one least-squares homography."""
     H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), 0)
     return bool(_near(np.asarray(H), plane, flat, largest_off(flat)).all())
 
@@ -102,7 +102,7 @@ def spans_a_plane(plane: Array) -> bool:
 
 
 def plane_coordinates(places: Array) -> Array | None:
-    """Coordinates (m, 4, 2) of corners (m, 4, 3) in their plane, with the side that is seen towards the viewer.
+    """Coordinates (m, 4, 2) of corners (m, 4, 3) in their plane, as seen from the printed side.
 
     None where they are not in one plane.
     """
@@ -114,7 +114,7 @@ def plane_coordinates(places: Array) -> Array | None:
     if extent[2] > FLAT * extent[0]:
         return None
     across, down = places[0, 1] - places[0, 0], places[0, 2] - places[0, 1]
-    # A tag's normal is the cross product of its right and its up, the latter minus its third corner minus its second.
+    # A tag's normal is right x up; up is minus the vector from its second corner to its third.
     up = -down
     sign = np.sign(np.linalg.det(np.stack([axes[0], axes[1], np.cross(across, up)])))
     both = np.stack([axes[0], sign * axes[1]])
@@ -122,7 +122,7 @@ def plane_coordinates(places: Array) -> Array | None:
 
 
 def _by_homography(plane: Array, flat: Array, largest: Array) -> np.ndarray:
-    """As `agreeing`, in the plane: RANSAC over the corners, then least squares over the tags that agree."""
+    """`agreeing` for tags in one plane: RANSAC over the corners, then least squares over the tags that agree."""
     everything = np.ones(len(plane), dtype=bool)
     H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), 0)
     agrees = _near(np.asarray(H), plane, flat, largest)
@@ -158,7 +158,7 @@ ORDERS = [(left, top, along) for along in (True, False) for top in (True, False)
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Where tags would be, (m, 4, 2) in any unit, and what the rig file would say."""
+    """The tags' places (m, 4, 2) in a possible layout, any unit, and what the rig file must say for it."""
 
     plane: Array
     cure: str
@@ -167,7 +167,7 @@ class _Layout:
 def layout_that_fits(board: Charuco | AprilGrid | TagGrid, ids: np.ndarray, flat: Array) -> str:
     """What to write in the rig file so that all tags `ids` (m,), seen at `flat` (m, 4, 2), are where the board says.
 
-    Empty where nothing that is tried fits, and where fewer than three tags, or tags of one row, were seen.
+    Empty if no layout that is tried fits, or if fewer than three tags, or tags of one row only, were seen.
     """
     if len(np.unique(ids)) < max(LEAST_TAGS, len(ids)) or not np.isfinite(flat).all():
         return ""
@@ -264,7 +264,7 @@ def _cells(k: np.ndarray, columns: int, rows: int, order: tuple[bool, bool, bool
 
 
 def _listed(columns: int, rows: int, order: tuple[bool, bool, bool], first: int) -> list[int]:
-    """All ids, left to right, from the top."""
+    """All ids of the grid, row by row from the top, left to right."""
     cells = _cells(np.arange(columns * rows), columns, rows, order).astype(int)
     found = np.zeros((rows, columns), dtype=int)
     found[cells[:, 1], cells[:, 0]] = first + np.arange(columns * rows)
@@ -279,8 +279,8 @@ def _tags(cells: Array, step_m: float, side_m: float) -> Array:
 
 #: Boards whose corners come from several tags.
 TagBoard: TypeAlias = Charuco | AprilGrid | TagGrid | Bundle
-#: At most this share of a board's tags, or one of three and more, may be elsewhere: they do not count. Where more are,
-#: the board is another.
+#: At most this share of a board's tags, or one of three and more, may be at wrong places: they are not used. If there
+#: are more, it is another board.
 MOST_ELSEWHERE = 0.25
 
 
@@ -297,7 +297,7 @@ class BoardTags:
 
 @cache
 def charuco_board(board: Charuco, is_legacy: bool = False) -> cv2.aruco.CharucoBoard:
-    """OpenCV's board. Boards with an even number of rows were printed with another phase before OpenCV 4.6."""
+    """OpenCV's board. Before OpenCV 4.6, boards with an even number of rows had dark and light squares exchanged."""
     made = cv2.aruco.CharucoBoard(
         (board.columns, board.rows),
         board.square_m,
@@ -355,7 +355,7 @@ def _agrees(board: TagBoard, of_board: np.ndarray, x: Array, focal: float, is_le
 
 
 def _quarter_turns(places: Array, flat: Array) -> int:
-    """By how many corners the tags of a grid are turned in their places: generators print them differently."""
+    """By how many quarter turns a grid's tags are turned in their places: generators of grids differ in this."""
     if not np.isfinite(flat).all():
         return 0
     errors = []

@@ -1,9 +1,9 @@
 """Checkerboards: lattices of saddles, tested square by square, their corners measured by a model of the edges.
 
 Of 346 rendered boards (whole, squares of 12 pixels and more, blur to 1.5 pixels, shade) lattices of saddles give 342
-that pass the test (`board_evidence`), and none wrong; OpenCV's classic detector reads 288 and its sector-based one
-296, each with boards read one square off or turned. Corners have 0.017 pixels by the model of the edges, and 0.057 by
-``cornerSubPix``.
+that pass the test (`board_evidence`), and none wrong; OpenCV's classic detector reads 288 and its sector-based one 296,
+each with boards read one square off or turned. The error of corners is 0.017 pixels by the model of the edges, and
+0.057 by ``cornerSubPix``.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from gtsam_rwhec.detect.saddle_lattices import LEVELS, boards_in, groups_of, lat
 from gtsam_rwhec.geometry.poses import Array
 
 #: The half window at a corner is this share of the distance between neighbouring lines of corners, at most 9 pixels.
-#: The second is tried where corners are not on a grid.
+#: The second share is tried if the first gives corners that are not on a grid.
 OF_SQUARE = (0.4, 0.25)
-#: Before they are measured, corners are off their places in a plane by at most this (pixels), or by this share of the
+#: Rough corners, before they are measured, may be off their places in a plane by this (pixels), or by this share of the
 #: distance between lines: a shadow's edge moves them.
 ROUGHLY_PX, ROUGHLY = 1.0, 0.06
-#: Corners that are not sharp do not count if at least this share is.
+#: If at least this share of the corners is sharp, the others are not used.
 LEAST_SHARP = 0.5
 
 
 def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = None) -> FoundBoard | None:
     """Find a board that is whole in the image; None where there is none.
 
-    The top is where the first corner's outer square is black; a board of two even or two odd numbers of corners looks
-    the same turned by half a turn, and is read in one of these ways. Two such boards in one image are told by no sign:
-    neither counts. Nor can one image tell a board from its image in a mirror: its pattern is the same, turned, but for
-    two odd numbers of corners that differ (and then it is that of a board printed with its colours exchanged).
+    The top is where the first corner's outer square is black. A board whose two numbers of corners are both even or
+    both odd looks the same after half a turn; it is read in one of these two ways. If one image has two such boards,
+    neither is used, because nothing distinguishes them. A mirrored board cannot be recognised in one image: its pattern
+    is that of the board, turned. (If both numbers are odd and differ, it is that of a board with its colours
+    exchanged.)
     """
     rejected: FoundBoard | None = None
     found: FoundBoard | None = None
@@ -68,13 +69,14 @@ def _is_apart(grid: Array, corners_px: Array) -> bool:
 
 
 def _in_order(gray: Gray, board: Checkerboard, level: int) -> Iterator[tuple[Array, bool]]:
-    """Grids of corners (rows, columns, 2) that lattices of saddles give, and whether these go on beyond them."""
+    """Grids of corners (rows, columns, 2) from lattices of saddles, and whether a lattice goes on beyond its grid."""
     corners = board.columns * board.rows
     seen = saddles(scaled_down(gray, level))
     for members in groups_of(seen.places, corners):
         for lattice in lattices(seen, members, corners):
             for grid, goes_on in boards_in(lattice, seen.places, board.rows, board.columns):
-                # Pixel centres are integers: halved once, the first pixel's centre is at 1/2.
+                # Pixel centres are integers: the first pixel of an image halved once has its centre at 1/2 of the full
+                # image.
                 yield grid * 2**level + 0.5 * (2**level - 1), goes_on
 
 
@@ -99,7 +101,9 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
 
 
 def _measured(gray: Gray, rough: Array, most_px: float, camera: Camera | None) -> tuple[Array, Evidence]:
-    """Corners (rows, columns, 2) measured where the plane of most of the rough ones says, and what they show."""
+    """Corners (rows, columns, 2), measured where the plane through most rough corners predicts them, and their
+    evidence.
+    """
     rows, columns = rough.shape[:2]
     everyone = np.ones((rows, columns), dtype=bool)
     found = plane_through(rough, camera, most_px, everyone)
@@ -121,15 +125,15 @@ def _other_colour(grid: np.ndarray) -> np.ndarray:
     return grid
 
 
-#: An edge is used up to this share of a square from the corner, but `BLURS` standard deviations from the next edge.
+#: An edge is used up to this share of a square from the corner, but not within `BLURS` blurs of the next edge.
 REACH, BLURS = 0.75, 2.5
-#: It is used over this share of a square at least, and up to this many pixels.
+#: An edge is used at least over this share of a square, and at most over this many pixels.
 LEAST_REACH, REACH_PX = 0.4, 12
 #: Blur in the first round, and its limits, pixels.
 BLUR_PX, LEAST_BLUR_PX, MOST_BLUR_PX = 1.0, 0.3, 4.0
-#: This number of pixels about a corner are used at most.
+#: At most this number of pixels around a corner is used.
 MOST_PIXELS = 400
-#: Rounds of Gauss and Newton, in windows where corners are expected, then where they were found.
+#: Gauss-Newton rounds: first in windows where corners are expected, then in windows where they were found.
 ROUNDS = (2, 3)
 #: A step changes a place by at most this share of a square.
 MOST_STEP = 0.1
@@ -139,8 +143,8 @@ MOST_MOVED = 0.3
 OUTLYING, OUTLYING_MEANS = 0.08, 3.0
 #: Residuals' root mean square over half the contrast is at most this.
 MOST_LEFT = 0.5
-#: Of a sharp corner it is at most this, or at most this many times the board's median: noise is in all windows, and a
-#: shadow's edge in a few.
+#: For a sharp corner this value is at most `LEFT`, or at most `LEFT_MEDIANS` times the board's median: noise is in all
+#: windows, a shadow's edge only in a few.
 LEFT, LEFT_MEDIANS = 0.1, 2.0
 
 
@@ -150,7 +154,8 @@ class FittedCorners:
 
     corners_px: Array  #: (rows, columns, 2): pixels
     good: np.ndarray  #: (rows, columns): whether there is a corner, near where it was expected
-    #: (rows, columns): whether the model explains all about it: the other good ones may be some tenths of a pixel off
+    #: (rows, columns): whether the model fits all of the window; good corners that are not sharp may be off by 0.1
+    #: pixels and more
     sharp: np.ndarray
     blur_px: Array  #: (rows, columns): standard deviation of the blur, pixels
 
@@ -159,15 +164,15 @@ def fitted_corners(gray: Gray, on_image: Callable[[Array], Array], rows: int, co
     """Fit two blurred edges that cross to the gray values around each corner of a board.
 
     An edge is used over three quarters of a square on each side, along the curves that the plane and the lens give it.
-    Light changes linearly, apart for paper and ink. What does not fit, as a shadow's edge, weighs little; a corner
-    where much does not fit is not sharp.
+    The model's light changes linearly, separately for paper and ink. Pixels that do not fit, as at a shadow's edge,
+    weigh little; a corner where many do not fit is not sharp.
 
     Parameters
     ----------
     gray : (height, width) uint8
     on_image : callable
-        Pixels (..., 2), right to one or two, of places (..., 2) on the board, in squares to the right and down from the
-        first corner.
+        Takes places (..., 2) on the board, in squares to the right and down from the first corner, to pixels (..., 2)
+        that are right to one or two pixels.
     """
     first = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     at, sigma = first, None
@@ -190,7 +195,9 @@ def fitted_corners(gray: Gray, on_image: Callable[[Array], Array], rows: int, co
 
 
 def _started(gray: Gray, on_image: Callable[[Array], Array], at: Array, sigma: Array | None) -> _Fit:
-    """The fit in windows about places (n, 2) on the board: a window's middle must be the corner's where light bends."""
+    """The fit in windows around places (n, 2) on the board. Where light is not linear, the corner must be in the
+    middle.
+    """
     centre, J, bend = _expansion(on_image, at)
     inverse = np.linalg.inv(J)  # of squares by pixels
     slope = np.linalg.norm(inverse, axis=2)  # (n, 2): squares a pixel across the edges
@@ -206,7 +213,7 @@ def _started(gray: Gray, on_image: Callable[[Array], Array], at: Array, sigma: A
     curved = products @ bend[:, [0, 0, 1], [0, 1, 1]]
     flat = (away - curved) @ inverse.swapaxes(1, 2)  # (n, p, 2): squares from the place
     inside &= (np.abs(flat) <= REACH).all(axis=2)
-    # Those nearest to an edge tell most.
+    # Pixels nearest to an edge have the most information.
     near = np.where(inside, (np.abs(flat) / slope[:, None]).min(axis=2), np.inf)
     most = int(np.clip(inside.sum(axis=1).max(), 1, MOST_PIXELS))
     chosen = np.argpartition(near, most - 1, axis=1)[:, :most]
@@ -242,7 +249,7 @@ class _Fit:
         np.multiply(basis[:, :3], sign.prod(axis=1, keepdims=True), out=basis[:, 3:6])
         reach = np.clip(np.minimum(REACH, 1.0 - BLURS * self.sigma), LEAST_REACH, REACH)[..., None]
         used = self.inside & (np.abs(self.flat) <= reach).all(axis=1)
-        # What did not fit in the round before weighs little.
+        # Pixels that did not fit in the previous round weigh little.
         weight = (used / (1.0 + (self.residual / self.outlying[:, None]) ** 2) ** 2).astype(np.float32)
         linear = basis[:, :6]
         weighed = linear * weight[:, None]
@@ -271,14 +278,16 @@ class _Fit:
 
 
 def _solved(normal: Array, right: Array) -> Array:
-    """Solutions (n, k, 1); a share of 1e-6 is added to the diagonal, for windows that do not show an unknown."""
+    """Solutions (n, k, 1); the diagonal grows by a share of 1e-6, for windows that do not determine an unknown."""
     diagonal = np.einsum("nii->ni", normal)
     ridge = (1e-6 * diagonal + 1e-6)[..., None] * np.eye(normal.shape[-1])
     return np.asarray(np.linalg.solve(normal + ridge, right.astype(float)), dtype=float)
 
 
 def _expansion(on_image: Callable[[Array], Array], at: Array) -> tuple[Array, Array, Array]:
-    """Pixels (n, 2) at places, their derivatives J (n, 2, 2) and second derivatives (n, 2, 2, 2): by i, by j, pixel."""
+    """Pixels (n, 2) at places, first derivatives J (n, 2, 2), second derivatives (n, 2, 2, 2) with axes (by i, by j,
+    pixel).
+    """
     h = 0.25
     e = h * np.eye(2)
     centre = on_image(at)
