@@ -1,8 +1,8 @@
 """In which order the frames of a graph are eliminated, and what fill that makes.
 
-Frames that have no coupling with one another are eliminated at once, those with few neighbours first: in each round,
-the frames that have fewer neighbours than any of theirs (multiple minimum degree, Liu 1985). For a star that is one
-round: the leaves. What is left when nearly all is coupled with all, or little is left, is dense.
+Frames without a coupling between them are eliminated together, those with few neighbours first: in each round, the
+frames that have fewer neighbours than any of theirs (multiple minimum degree, Liu 1985). For a star that is one round:
+the leaves. When the remaining frames are few, or almost all pairs of them are coupled, the rest is one dense matrix.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import SAFETY, gammas
 
-#: In a round frames with up to this many times the fewest neighbours are eliminated, and a few more.
+#: A round eliminates frames with at most ``TIMES_FEWEST`` * (fewest neighbours) + ``MORE`` neighbours.
 TIMES_FEWEST, MORE = 2, 2
-#: Where this part of all couplings is there, the rest is dense.
+#: When this fraction of all possible couplings exists, the rest is one dense matrix.
 DENSE = 0.8
-#: So few frames are dense in any case: to eliminate them singly takes longer.
+#: Up to this many frames are always one dense matrix: to eliminate them one by one takes longer.
 FEW = 30
-#: Frames with fewer neighbours are counted as if they had more, where that makes fewer groups at little cost: in
-#: numbers of blocks, squared.
+#: Groups with different numbers of neighbours are padded and merged if that costs at most this much: numbers of blocks,
+#: squared.
 PADDING = 12_000
-#: So many frames with the same neighbours are eliminated by one product.
+#: From this many frames with the same neighbours on, one matrix product eliminates them.
 ALIKE = 8
 #: Frames with the same number of neighbours are tried in a random order, drawn once and for all.
 SEED = 0
@@ -32,7 +32,7 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Group:
-    """k frames with d neighbours each that are eliminated at once; the number of frames stands for no neighbour.
+    """k frames with d neighbours each that are eliminated together; the index n (number of frames) means no neighbour.
 
     ``edges`` (k, d) are the couplings with the neighbours, which are stored ``flipped`` where the neighbour comes first
     by number; ``are_alike`` says that all have the same neighbours.
@@ -47,7 +47,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Elimination:
-    """The order of n frames, and all couplings that there are at some time.
+    """The order of n frames, and all couplings that exist at any time of the elimination.
 
     Couplings are pairs ``first`` < ``second`` of frames: the ``given`` ones, in their order, and then the fill.
     ``changed`` is the place of each coupling among those that the elimination of other frames changes, or one past the
@@ -67,7 +67,7 @@ class Elimination:
     def of(n: int, first: np.ndarray, second: np.ndarray, few: int = FEW) -> Elimination:
         """The order for frames 0 to n - 1 with couplings of ``first`` and ``second`` (F,), each first < second, once.
 
-        As soon as no more than ``few`` frames are left, they are dense.
+        When at most ``few`` frames are left, they are one dense matrix.
         """
         return _Ordering(n, np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)).run(few)
 
@@ -78,12 +78,12 @@ class Elimination:
 
     @cached_property
     def neighbours(self) -> np.ndarray:
-        """How many frames each frame is coupled with at first, (n,)."""
+        """The number of frames that each frame is coupled with before the elimination, (n,)."""
         return np.bincount(np.r_[self.first[: self.given], self.second[: self.given]], minlength=self.n)
 
     @cached_property
     def eliminated(self) -> int:
-        """How many blocks of the factor are beside those of the frames and the dense rest."""
+        """The number of blocks of the factor outside the frames' own blocks and the dense rest."""
         return sum(group.neighbours.size for group in self.groups)
 
     @cached_property
@@ -94,7 +94,7 @@ class Elimination:
         return keys[order], order
 
     def couplings_of(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """The numbers of couplings by their frames; for pairs with the frame n, one past the last."""
+        """The indices of the couplings of given frames; one past the last index for pairs with the frame n."""
         keys, order = self.key_order
         wanted = first * (self.n + 1) + second
         place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
@@ -105,7 +105,7 @@ class Elimination:
 
     @cached_property
     def terms(self) -> np.ndarray:
-        """How many frames, its own included, a frame's rows of the factor reach to, (n,); without the tail."""
+        """The number of blocks in each frame's rows of the factor, its own included, (n,); without the tail."""
         result = np.ones(self.n + 1, dtype=np.int64)
         for group in self.groups:
             np.add.at(result, group.neighbours, 1)
@@ -113,7 +113,8 @@ class Elimination:
         return result[: self.n]
 
     def spread(self, m: int, q: int) -> tuple[Array, float]:
-        """What a factorisation in blocks of m, and a tail of q, may take from the diagonal, as a part of it: (n,), one.
+        """Rounding of a factorisation with blocks of m and a tail of q, as a fraction of the diagonal: (n,), one
+        number.
 
         Higham 2002, theorem 10.3, for any order of summation: dA_ij is at most g_ij sqrt(a_ii a_jj), g = gamma_(k+1) /
         (1 - gamma_(k+1)) for k terms in the sum, and zero outside the fill. A symmetric matrix of numbers that are not
@@ -174,7 +175,7 @@ class _Ordering:
         )
 
     def _chosen(self) -> np.ndarray:
-        """Frames with no couplings among them, and fewer neighbours than all of theirs that are not chosen."""
+        """Frames without couplings between them, each with fewer neighbours than its neighbours have."""
         ends = np.concatenate([self.first[self.current], self.second[self.current]])
         others = np.concatenate([self.second[self.current], self.first[self.current]])
         degree = np.bincount(ends, minlength=self.n)
@@ -192,7 +193,7 @@ class _Ordering:
         return chosen
 
     def _eliminated(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, bool]]:
-        """Take the chosen frames out; their groups."""
+        """Eliminate the chosen frames, and return their groups."""
         first, second = self.first[self.current], self.second[self.current]
         ends, others = np.concatenate([first, second]), np.concatenate([second, first])
         mine = chosen[ends]
@@ -220,7 +221,7 @@ class _Ordering:
         return groups
 
     def _add(self, keys: np.ndarray) -> None:
-        """Couplings that an elimination changes, of which some are new."""
+        """Add the couplings that an elimination changes; some of them are new."""
         of_current = self.first[self.current] * (self.n + 1) + self.second[self.current]
         self.is_changed[self.current[np.isin(of_current, keys)]] = True
         new = np.setdiff1d(keys, of_current, assume_unique=True)

@@ -1,4 +1,4 @@
-"""Free directions: how an answer can move while the measurements fit as well, up to their noise."""
+"""Free directions: how an answer can move while the measurements still fit equally well, up to their noise."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMED = 4
 AXIS_COSINE = np.cos(np.radians(8.0))
 #: A motion that turns by more than this (root mean square) really turned, even if its residuals are as large.
 TURNED_RAD = np.radians(3.0)
-#: So many measurements of a pair are one motion, which has one axis.
+#: Up to this many measurements of a pair are one motion, which has one axis.
 FEW = 2
 
 Twist = tuple[float, float, float, float, float, float]
@@ -124,8 +124,9 @@ class FreeDirection:
 def reason_for(axes: int, turned_rad: float, residual_rad: float, measurements: int) -> FreeReason:
     """Why a direction of a pair is free.
 
-    ``axes`` says about how many axes the pair's motion turned beyond the noise: 0, 1, or 2 for two and more. The next
-    two are root mean squares: one of its turning, noise included, and one of its rotation residuals.
+    ``axes``: about how many axes the pair's motion turned by more than the noise (0, 1, or 2 for two and more).
+    ``turned_rad`` and ``residual_rad``: root mean squares of its turning, noise included, and of its rotation
+    residuals.
     """
     if axes < 2 and turned_rad > TURNED_RAD and residual_rad > 0.5 * turned_rad:
         return FreeReason.CONTRADICTION
@@ -165,7 +166,8 @@ def sparse_basis(basis: Array, length_m: float) -> Array:
 def free_directions_of(
     names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
 ) -> tuple[FreeDirection, ...]:
-    """A record of each column of a ``sparse_basis`` of the frames ``names``, with what takes part in it.
+    """One record for each column of a ``sparse_basis`` of the frames ``names``, with the frames and scales that take
+    part.
 
     ``reasons``: the reason of each frame, from ``reason_for``.
     """

@@ -23,7 +23,7 @@ from gtsam_rwhec.solver.parts import Part
 
 #: Positions among a pair's 28 numbers: target (13), sensor (13), alpha, h.
 SIDES, ALPHA, H = (slice(0, 13), slice(13, 26)), 26, 27
-#: The forms of so many pairs are made at once: a few megabytes.
+#: The forms of this many pairs are computed at once: a few megabytes.
 PAIRS_AT_ONCE = 256
 _I3, _I9 = np.eye(3), np.eye(9)
 _UPPER = np.triu_indices(25, 1)
@@ -31,7 +31,7 @@ _UPPER = np.triu_indices(25, 1)
 
 @dataclass(frozen=True)
 class Slots:
-    """What the variables of each pair are in the form.
+    """Where the variables of each pair are in the form.
 
     ``frames`` (E, 2) are the free frames of target and sensor, by their places, one past the last where there is none;
     a motion has its sensor alone. The 25 variables of a pair come from the 28 numbers of these frames (13 each), alpha
@@ -50,7 +50,7 @@ class Slots:
     scale: Array  #: (E,): and times what
 
     def matrices(self, at: slice | np.ndarray = slice(None)) -> Array:
-        """The pairs' 25 variables from their 28 numbers, (k, 25, 28): k pairs are kilobytes, so take some at a time."""
+        """Matrices (k, 25, 28) from k pairs' 28 numbers to their 25 variables. They are large: ask for few pairs."""
         first, fixed = self.first[at], self.fixed[at]
         k = len(first)
         S = np.zeros((k, 25, 28))
@@ -69,7 +69,8 @@ class Slots:
         return S
 
     def alike(self, at: slice) -> list[tuple[np.ndarray, np.ndarray | None]]:
-        """Sets of pairs of a slice with the same place for everything, and which of the 25 variables each number is.
+        """Sets of pairs of a slice with the same layout, and for each of the 28 numbers the index of its variable (of
+        25).
 
         -1 stands for none. Pairs with a fixed frame, and motions, are one set without such a table.
         """
@@ -100,7 +101,7 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
     where = np.cumsum(coupled) - 1
     order = Elimination.of(n, *slots.frames[coupled].T)
     couplings = np.zeros((int(coupled.sum()), 13, 13))
-    # The residuals of translations have no rotation of the front pose: rotations are coupled by their own alone.
+    # Translation residuals have no rotation of the front pose: only rotation residuals couple the rotations.
     forms = [
         BlockMatrix(order, np.zeros((n, m, m)), couplings[:, -m:, -m:], np.zeros((n, m, 2)), np.zeros((2, 2)))
         for m in (13, 9)
@@ -148,7 +149,7 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
 class _Numbers:
     """The forms of k pairs over their 28 numbers.
 
-    They are stored over other variables, of which ``source`` says which each number is, or -1 for none.
+    They are stored over other variables; ``source`` has the variable of each number, or -1 for none.
     """
 
     forms: Array
@@ -198,7 +199,7 @@ def slots_of(part: Part) -> Slots:
 
 
 def as_variable(T: Array, part: Part) -> Array:
-    """A pose as the form's variables see it: itself, or its inverse."""
+    """A pose as variables of the form: itself, or its inverse in the inverse form."""
     if part.kind == "direct":
         return T
     inverse = np.eye(4)
@@ -208,7 +209,7 @@ def as_variable(T: Array, part: Part) -> Array:
 
 
 def _make_symmetric(blocks: Array) -> None:
-    """Take off what rounding made of symmetric blocks (n, m, m)."""
+    """Remove the asymmetry that rounding caused in symmetric blocks (n, m, m)."""
     for begin in range(0, len(blocks), PAIRS_AT_ONCE):
         some = blocks[begin : begin + PAIRS_AT_ONCE]
         some[...] = 0.5 * (some + some.transpose(0, 2, 1))
@@ -250,7 +251,7 @@ def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) 
 
 
 def rounding_of_fixed(part: Part) -> Array:
-    """What rounding may take from a fixed frame's translation about the gauge where alpha multiplies it, (E, 2, 3)."""
+    """Bound on the rounding of a fixed frame's translation about the gauge, where alpha multiplies it, (E, 2, 3)."""
     result = np.zeros((len(part.pairs), 2, 3))
     if part.kind == "direct" and part.scale == "shared" and part.fixed:
         for e, pair in enumerate(part.pairs):
@@ -262,7 +263,7 @@ def rounding_of_fixed(part: Part) -> Array:
 
 
 def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
-    """What rounding did to each pair's form, as diagonals (E, 25) that dominate it.
+    """The rounding error of each pair's form, as diagonals (E, 25) that dominate it.
 
     The form of the measurements in exact arithmetic differs from the form as stored for two reasons: the rounding of
     the moments (`Moments`), and that R'R is the identity only up to rounding. If every entry of a pair's form is off by
@@ -275,7 +276,8 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
     magnitude, error = moments.magnitude, moments.feature_error.copy()
     error[:, T_A] += of_fixed[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Of the larger length: where A does not move, its own undetermined column must not spoil the others.
+        # The larger length is used: where A does not move, its own column is undetermined and must not spoil the
+        # others.
         length = np.maximum(magnitude[:, T_A].max(axis=1), magnitude[:, T_B].max(axis=1))
         worst = np.nan_to_num(error[:, T_A].max(axis=1) / length, nan=1.0, posinf=1.0)
     if part.kind == "inverse":
@@ -301,7 +303,7 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
 
 
 def rounding_of(part: Part, slots: Slots) -> Array:
-    """What rounding did to Q, as a diagonal (13 n + 1,) over [frames, alpha] that dominates it."""
+    """The rounding error of Q, as a diagonal (13 n + 1,) over [frames, alpha] that dominates it."""
     n = len(part.free)
     result, of_pairs = np.zeros((n, 13)), _rounding_of_pairs(part, slots)
     of_alpha = 0.0

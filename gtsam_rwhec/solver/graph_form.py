@@ -1,4 +1,4 @@
-"""The reduced form Q' of a part with many frames, which is never written down: the graph of the full form is followed.
+"""The reduced form Q' of a part with many frames. It is never formed as a matrix: products use the full form's graph.
 
 Q' x = Q_rr x - Q_rt Q_tt^-1 Q_tr x, with t the translations and scales. Where eliminating the translations would
 couple every frame with every other, Q_tt itself has no more couplings than there are pairs. So products with Q' solve
@@ -20,10 +20,10 @@ from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
 from gtsam_rwhec.solver.reduced_form import ABSENT, RANK_TOLERANCE
 from gtsam_rwhec.solver.rotations import tangent_curvature
 
-#: Where a pivot of the eliminated block is rounding error, a direction is free. Then this part of the diagonal is
-#: added, which changes costs by its square.
+#: Where a pivot of the eliminated block is only rounding error, a direction is free. Then this fraction of the diagonal
+#: is added; it changes costs by its square.
 DAMPING = 1e-11
-#: Steps of Lanczos for the smallest eigenvalue, which the search for a bound then corrects.
+#: Lanczos steps for an estimate of the smallest eigenvalue, which the search for a bound corrects later.
 LANCZOS_STEPS = 80
 
 
@@ -42,7 +42,7 @@ class GraphForm:
     def of(full: BlockMatrix) -> GraphForm | None:
         """The form that follows a graph; None where Q_tt has no factor.
 
-        Free translations stay near the gauge's origin, free scales near 1, and those that the problem does not have
+        Free translations stay near the gauge's origin, and free scales near 1. Scales that the problem does not have
         are 1.
         """
         frames, n = full.frames, len(full.frames)
@@ -99,7 +99,7 @@ class GraphForm:
         return w, np.append(by_frame[:, 4:].ravel(), product[-1] + rest[-1])
 
     def _without_h(self, of_rotations: float = 0.0) -> BlockMatrix:
-        """Q over the numbers of the frames and alpha, with what makes Q_tt definite, and more for rotations."""
+        """Q over the numbers of the frames and alpha, plus diagonals: one that makes Q_tt definite, one for rotations."""
         n = self.rotations
         matrix = replace(self.full, tails=self.full.tails[:, :, :1], tail=self.full.tail[:1, :1])
         added = np.full((n, 13), of_rotations)
@@ -140,7 +140,7 @@ class GraphForm:
         return solved
 
     def smallest_eigenpair(self, Lambda: Array) -> tuple[float, Array]:
-        """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,): an upper bound, and near it.
+        """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,): a close estimate from above.
 
         Lambda (n, 9, 9). By Lanczos' method with full orthogonalisation.
         """

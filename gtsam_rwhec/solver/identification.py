@@ -1,4 +1,4 @@
-"""What each pair determines alone: the test of the whole problem, on 15 x 15 matrices of some pairs at a time."""
+"""What each pair determines alone: the test of the whole problem, applied to one 15 x 15 matrix for each pair."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def typical_length(part: Part) -> float:
 
 @dataclass(frozen=True)
 class PairsAlone:
-    """The pairs of a part, what they tell, and the noise."""
+    """The pairs of a part, their information, and the noise."""
 
     pairs: tuple[Pair, ...]
     free: tuple[str, ...]
@@ -134,8 +134,8 @@ class PairsAlone:
         """The pairs of a part; ``singular_values`` (E, 3) are of the mean of R_A, and J_R (E,) the costs.
 
         Axes by Corollary 2, tested against A's noise: the mean of R_A shortens every direction but a common axis, and
-        1 - s^2 is the mean square sine of the turning that leaves that direction. Noise alone makes it 2 q^2. The axis
-        is fitted at both ends.
+        1 - s^2 is the mean square sine of the turning that leaves that direction. Noise alone makes this 2 q^2. The
+        axis is fitted at both ends.
         """
         counts = part.moments.count
         ratio = (1.0 - singular_values**2) / (2.0 * noise.carrier[:, None])
@@ -195,7 +195,7 @@ class PairsAlone:
         # Corollary 4: a pair that turns about one axis leaves a direction free.
         open_ = np.flatnonzero(~free.any(axis=1) & (axes < 2) & ends.all(axis=1))
         free[open_, rest[open_].argmin(axis=1)] = True
-        # The weaker of the tests counts: of rotations, where they are determined, and of the rest.
+        # The weaker of two tests counts: that of the rotations, where they are determined, and that of the rest.
         weakest, limit = rest.min(axis=1), threshold.copy()
         of_rotations = turning.min(axis=1)
         by_rotations = settled[:, 0] & (of_rotations * limit < weakest * of_turning)
@@ -278,7 +278,7 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array, order: Elimin
 def identify_with_basis(
     part: Part, poses: PairPoses, J_t: Array, J_R: Array, order: Elimination | None = None
 ) -> tuple[Identifiability, Array]:
-    """``identify``, and the free directions with their small shares, which the records leave out.
+    """``identify``, and a basis of the free directions that also has the small shares, which the records leave out.
 
     The basis (7 n + 1, k) has a column for each record: [omega (rad), v (m), log own scale] for each of ``part.free``,
     then the shared scale's logarithm. It spans exactly what is free.
@@ -304,7 +304,7 @@ def identify_with_basis(
 
 
 def _weakest_of_part(part: Part, told: PartInformation, noise: PairNoise) -> Weak:
-    """Test rotations; then, if all are determined, the rest at those rotations, and else everything together."""
+    """Test the rotations. If all are determined, test the rest at fixed rotations; else test everything together."""
     n, count = len(part.free), part.moments.count
     is_free = part.ends < n
     # A motion's two ends are one frame; a fixed frame leaves both to the other.
@@ -319,7 +319,7 @@ def _weakest_of_part(part: Part, told: PartInformation, noise: PairNoise) -> Wea
         spare = min(spare, noise.spare_translation)
         tests = [weakest(told.together, of_all, told.used, ends, spare, few=few)]
     else:
-        # Only A's noise, where sizes are known, tells of what is not a rotation.
+        # Where sizes are known, only A's noise passes for information about parameters other than rotations.
         spare = spare if part.scale == "known" else min(spare, noise.spare_translation)
         tests.append(weakest(told.translation, of_translations, told.used & ~turns, ends, spare, few=few))
     return min(tests, key=lambda test: test.ratio)

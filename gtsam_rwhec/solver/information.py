@@ -28,7 +28,7 @@ from gtsam_rwhec.solver.rotations import HATS
 #: A pair has 15 parameters: seven of the target, seven of the sensor, the logarithm of the shared scale. A frame has
 #: seven: rotation, translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
-#: The information of so many pairs is made at once: some megabytes.
+#: The information of this many pairs is computed at once: some megabytes.
 PAIRS_AT_ONCE = 512
 
 BLOCKS = "frames", "couplings", "tails", "tail"
@@ -45,7 +45,7 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True)
 class PairInformation:
-    """What each pair's information is made of; the matrices themselves are made for some pairs at a time."""
+    """The sums from which each pair's information is computed; the matrices are computed for some pairs at a time."""
 
     kappa: Array  #: (E,)
     weight: Array  #: (E,)
@@ -172,7 +172,8 @@ def information(
 ) -> BlockMatrix:
     """The information of all frames, seven parameters each, and of the logarithm of the shared scale, the tail.
 
-    ``of_pairs`` gives that of some pairs (k, 15, 15), as `PairInformation` does; ``priors`` (n, 7) is a diagonal.
+    ``of_pairs`` returns the information of some pairs (k, 15, 15), as `PairInformation` does; ``priors`` (n, 7) is a
+    diagonal.
     """
     n, E = len(part.free), len(part.pairs)
     coupled = _coupled(part)
@@ -220,7 +221,7 @@ def prior_information(part: Part) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PartInformation:
-    """What rotation residuals and translation residuals tell of all frames; which parameters there are (7 n + 1,)."""
+    """The information of rotation residuals and of translation residuals, and which parameters exist (7 n + 1,)."""
 
     rotation: BlockMatrix
     translation: BlockMatrix
@@ -244,6 +245,6 @@ class PartInformation:
 
     @property
     def together(self) -> BlockMatrix:
-        """What all residuals tell."""
+        """The information of all residuals."""
         sums = (getattr(self.rotation, name) + getattr(self.translation, name) for name in BLOCKS)
         return BlockMatrix(self.rotation.order, *sums)

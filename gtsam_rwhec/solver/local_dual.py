@@ -1,15 +1,15 @@
 """The small dual of many frames: only the few whose Z curves down get other multipliers (design fact 4a).
 
-The redundant constraints are needed where measurements are few or contradict one another, and that is local: of
-hundreds of frames a few. Write S for their rotations and T for all other variables. With the multipliers of R'R = I
-kept for T, Z is positive definite exactly when Z_TT is, and the Schur complement too::
+The redundant constraints are needed where measurements are few or contradict one another, and that is local: it
+concerns a few of hundreds of frames. Write S for their rotations and T for all other variables. With the multipliers of
+R'R = I kept for T, Z is positive definite exactly when Z_TT is, and the Schur complement too::
 
     Z_S = Z_SS - Z_ST Z_TT^-1 Z_TS,        P_S of Q in the same way
 
 So the small dual is solved for Z_S in the measure P_S. S begins with the frames that the negative eigenvectors of Z in
 the measure of Q reach. Where their multipliers are too few, S grows by the frames whose multipliers would raise t most:
-the derivatives of t are known for every frame. Nothing here needs to be exact: `bound` proves with whatever comes out.
-Z is used by products and a factor alone.
+the derivatives of t are known for every frame. Nothing here needs to be exact: `bound` gives a proof with any
+multipliers. Z is used by products and a factor alone.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from gtsam_rwhec.solver.rotations import CONSTRAINTS, multiplier_blocks, project
 from gtsam_rwhec.solver.small_dual import maximise, null_multipliers, scatter
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
-#: What is added to the own translation's and scale's diagonal, as a part of it, where they are free.
+#: This fraction of the diagonal of a frame's own translation and scale is added to it, where they are free.
 FREE = 1e-9
 
 
 def own_curvature(whole: PartForm, multipliers: Array) -> Array:
-    """The smallest mu (n,) with Z v = mu Q v for vectors v of one frame alone: Z is surely negative where mu is."""
+    """The smallest mu (n,) with Z v = mu Q v for vectors v of one frame alone. Where mu < 0, Z is surely negative."""
     own, inner = _own_blocks(whole)
     M = own[:, 4:, 4:] - np.matmul(own[:, 4:, :4], np.linalg.solve(inner, own[:, :4, 4:]))
     Lambda = multiplier_blocks(multipliers)[0][:, :9, :9]
@@ -52,15 +52,16 @@ def _own_blocks(whole: PartForm) -> tuple[Array, Array]:
     return own, inner
 
 
-#: Parts of Q's diagonal that are added to Q and to Z, where the measurements leave translations and scales free.
+#: Fractions of Q's diagonal that are added to Q and to Z, because translations and scales may be free.
 OF_Q, OF_Z = 1e-9, 1e-12
 #: Curvature below this part of Q's is negative, and not rounding.
 NEGATIVE = -1e-6
 #: A frame belongs to a direction when it has this part of the direction's squared length.
 SHARE = 0.1
-#: So many of the weakest directions are looked for at once.
+#: Number of the weakest directions that are computed at once.
 DIRECTIONS = 20
-#: S grows by frames whose promise is above this part of the best one's, and to at most so many times its size.
+#: S grows by the frames whose derivative of t is above ``PROMISE`` of the largest one, to at most ``GROWTH`` times its
+#: size.
 PROMISE, GROWTH = 0.02, 3
 #: S has grown enough when a step has raised t by less than this part of it.
 WORTH = 0.1
@@ -81,7 +82,7 @@ class LocalForm:
 
 @dataclass(frozen=True)
 class LocalDual:
-    """What the small dual of a few frames gave."""
+    """The result of the small dual of a few frames."""
 
     multipliers: Array  #: (n, 20), of all frames
     t: float  #: Z >= t Q at these multipliers; positive where they prove the point
@@ -194,7 +195,8 @@ def weak_frames(whole: PartForm, Q: Curvature, Z: Curvature, kkt: Array, most: i
 def weakest_directions(Q: Curvature, Z: Curvature, count: int) -> tuple[Array, Array]:
     """The smallest mu, ascending, and vectors (13 n + 1, count) with Z v = mu Q v: estimates.
 
-    In this measure most of the spectrum is near 1, and what the multipliers spoil is far below: Lanczos finds it soon.
+    In this measure most of the spectrum is near 1, and and the negative directions are far below: Lanczos finds them in
+    few steps.
     """
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # slow to import, few problems need it
 
@@ -232,7 +234,8 @@ def helpful_frames(
     """The frames outside of S whose multipliers would raise t most, the best first.
 
     With W = (Z_S - t P_S)^-1 the derivative of t by a multiplier of the matrix N of frame j is that of tr(N W_j), where
-    W_j = F_j W F_j' and F_j says how the frame follows S. A multiplier may be as large as the frame's own curvature.
+    W_j = F_j W F_j' and F_j maps the variables of S to the frame's variables. A multiplier may be as large as the
+    frame's own curvature.
     """
     n, k = len(evaluation.point.numbers), len(form.frames)
     Z = form.Z - scatter(np.einsum("nk,kpq->npq", multipliers - form.kkt, CONSTRAINTS))
@@ -266,7 +269,7 @@ class LocalRelaxation:
 def relax_locally(
     evaluation: Evaluation, kkt: Array, form: LocalForm, options: SolveOptions, progress: Progress | None = None
 ) -> LocalRelaxation:
-    """Solve the relaxation of the frames of ``form``; ``kkt`` (n, 20) are those of R'R = I at the evaluated point."""
+    """Solve the relaxation of the frames of ``form``; ``kkt`` (n, 20): R'R = I's multipliers at the evaluated point."""
     Q = form.Z + scatter(np.einsum("nk,kpq->npq", form.kkt, CONSTRAINTS))
     Q[-1, -1] += evaluation.cost  # Z has it taken off, so that Z x = 0
     relaxation = solve_relaxation(Q, options.relaxation_tolerance, options.max_relaxation_iterations, progress)

@@ -30,7 +30,7 @@ from gtsam_rwhec.solver.full_form import ALPHA, SIDES, Slots, rounding_of_fixed
 from gtsam_rwhec.solver.parts import Given, Part
 from gtsam_rwhec.solver.residual_sums import Coefficients, Measured, Sums, plain_sums, weighted_sums
 
-#: More rounded operations than any number of a prior needs after its residual, which has a relative error of one.
+#: An upper limit of the rounded operations of a prior after its residual, which is accurate to one rounding.
 OPERATIONS = 40
 
 
@@ -65,7 +65,7 @@ class MeasuredPriors:
         return self._evaluated(R, residuals)
 
     def action(self, point: Point, V: Array) -> Action:
-        """What the priors' form does to directions V (13 n + 1, D)."""
+        """The products of the priors' form with directions V (13 n + 1, D)."""
         D = V.shape[1]
         QV, size = np.zeros_like(V), np.zeros_like(V)
         products, of_products = np.zeros((D, D + 1)), np.zeros((D, D + 1))
@@ -79,7 +79,7 @@ class MeasuredPriors:
                 weight = 0.5 / prior.sigma**2
                 about = self._about_gauge(i, prior).value
                 rows = t if self.part.kind == "direct" else t + _times(r, about)
-                # The size of the terms that cancel in the rows.
+                # The magnitude of the terms that cancel in the rows.
                 terms = np.abs(t) if self.part.kind == "direct" else np.abs(t) + _times(np.abs(r), np.abs(about))
                 for out, value, s in ((QV, rows, about), (size, terms, np.abs(about))):
                     out[first : first + 3] += weight * value
@@ -97,7 +97,7 @@ class MeasuredPriors:
         return Action(QV, unit * size, products[:, :D], unit * of_products[:, :D], VQx, VQx_error)
 
     def _each(self) -> Iterator[tuple[int, Prior, int]]:
-        """The frame's index, the prior, and its number, of each prior of a free frame."""
+        """For each prior of a free frame: the frame's index, the prior, and the prior's number."""
         for i, name in enumerate(self.part.free):
             for number, prior in enumerate(self.priors.get(name, [])):
                 yield i, prior, number
@@ -142,7 +142,7 @@ def _times(r: Array, v: Array) -> Array:
     return result
 
 
-#: So many pairs are evaluated at once: their coefficients and sums are 15 kB a pair.
+#: This many pairs are evaluated at once: their coefficients and sums take 15 kB for each pair.
 PAIRS_AT_ONCE = 2048
 
 
@@ -159,7 +159,7 @@ class _Ends:
 
 @dataclass(frozen=True)
 class _Measured(Evaluation):
-    """An evaluation, and the coefficients that it was made with."""
+    """An evaluation, and the coefficients from which it was computed."""
 
     ends: Callable[[slice], _Ends] | None = None
 
@@ -203,11 +203,11 @@ class MeasuredForm:
         return self._evaluated(point, self._of_point(point), self._priors.at(point))
 
     def _blocks(self) -> Iterator[slice]:
-        """The pairs, so many at a time that what is made of them fits."""
+        """Slices of the pairs, short enough that the arrays computed from one slice fit in memory."""
         return (slice(begin, begin + PAIRS_AT_ONCE) for begin in range(0, len(self.part.pairs), PAIRS_AT_ONCE))
 
     def action(self, evaluation: Evaluation, V: Array) -> Action:
-        """What the form does to directions."""
+        """The form's products with directions."""
         D = V.shape[1]
         point = evaluation.point
         ends = evaluation.ends if isinstance(evaluation, _Measured) else None
@@ -316,7 +316,7 @@ class MeasuredForm:
         return _Ends(R_1, R_2, of("u"), of("s"), of("one"))
 
     def _coefficients(self, ends: _Ends, at: slice) -> tuple[Measured, Coefficients]:
-        """What the sums over the measurements of some pairs are made of."""
+        """The measurements and coefficients from which the sums of some pairs are computed."""
         E, D = ends.R_1.shape[:2]
         a, c = (each[at] for each in self._centres)
         front, back = Doubled.zeros(E, 3, 4, D, 12), Doubled.zeros(E, 3, 4, D, 12)

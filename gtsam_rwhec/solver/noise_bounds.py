@@ -15,17 +15,17 @@ from gtsam_rwhec.solver.parts import Part
 
 #: The probability that a free direction counts as determined.
 SIGNIFICANCE = 1e-3
-#: Fewer equations to spare than this count as so many; the quantile is 1e60 there, and would overflow below.
+#: Redundant equations (``spare``) count as at least this many: the quantile is 1e60 here, and would overflow below.
 LEAST_SPARE = 0.1
 
 
 def free_threshold(squares: Array | float, fitted: Array | float, spare: Array | float) -> Array:
     """Information up to which a direction is free, in units of the information that noise alone would create in it.
 
-    The information sums ``squares`` squares of noise. The direction is the weakest, so it fits ``fitted`` of them away;
-    one at least is left. ``spare`` is the number of equations to spare that tell the noise. So this is an F quantile,
-    times the share of the squares that is left. Without equations to spare only the weights tell the noise, and it is
-    the chi-square quantile over ``squares``.
+    The information sums ``squares`` squares of noise. The direction is the weakest, so its fit removes ``fitted`` of
+    them; at least one is left. ``spare`` is the number of redundant equations from which the noise is estimated. So
+    this is an F quantile, times the share of the squares that is left. Without redundant equations only the weights
+    give the noise, and it is the chi-square quantile over ``squares``.
     """
     left = np.maximum(np.subtract(squares, fitted), 1.0)
     quantile = fdtri(left, np.maximum(spare, LEAST_SPARE), 1.0 - SIGNIFICANCE)
@@ -37,7 +37,7 @@ def free_threshold(squares: Array | float, fitted: Array | float, spare: Array |
 #: The noise counts as at least this, in radians and as a part of the measured lengths. If it were zero, rounding errors
 #: of the eigenvalues (1e-16 / floor^2) would look like information.
 FLOOR = 1e-7
-#: With as many equations to spare in the worst case, it does not matter which of them the fit took: the threshold
+#: With this many redundant equations in the worst case, it does not matter which equations the fit used: the threshold
 #: changes by a few per cent.
 PLENTY = 100
 #: Above this many parameters the worst case counts, and no dense matrix is made.
@@ -50,13 +50,14 @@ ROUNDING = 1e-12
 class PartVarianceFactors:
     """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
 
-    The numbers of equations to spare say how well the residuals tell them. All are 0 where only the weights tell them.
+    The numbers of redundant equations (``spare``) say how well the residuals determine them; all are 0 where only the
+    weights do.
     """
 
     rotation: Array
-    #: At given rotations: for what is tested once all rotations are determined.
+    #: At given rotations: for the parameters that are tested after all rotations are determined.
     translation: Array
-    #: As rotations were fitted to translations too: for the bound on A's rotation noise.
+    #: With rotations fitted to the translations too: for the bound on A's rotation noise.
     on_arm: Array
     spare_rotation: float
     spare_translation: float
@@ -96,7 +97,7 @@ def variance_factors(part: Part, told: PartInformation, J_t: Array, J_R: Array) 
 
 
 def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]:
-    """How many equations of translations and of rotations the fit has left.
+    """The numbers of redundant equations of translations and of rotations after the fit.
 
     In the worst case all unknowns were fitted to the translations, and all rotations to the rotations.
     """
@@ -128,11 +129,12 @@ class PairNoise:
     translation: Array
     #: (E,), rad^2: the largest variance that an axis of A's rotations may have.
     carrier: Array
-    #: (E,): the equations to spare that tell it.
+    #: (E,): the redundant equations from which it is estimated.
     spare: Array
-    #: The equations to spare that tell the noise of translations.
+    #: The redundant equations from which the noise of translations is estimated.
     spare_translation: float
-    #: Whether equations are few: then the squares that are fitted away count, where else the safe side costs little.
+    #: Whether redundant equations are few. Only then are the squares that the fit removes counted; else the safe bound
+    #: costs little.
     few: bool
 
 
