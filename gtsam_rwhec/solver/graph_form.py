@@ -99,7 +99,7 @@ class GraphForm:
         return w, np.append(by_frame[:, 4:].ravel(), product[-1] + rest[-1])
 
     def _without_h(self, of_rotations: float = 0.0) -> BlockMatrix:
-        """Q over the numbers of the frames and alpha, plus diagonals: one that makes Q_tt definite, one for rotations."""
+        """Q over the frames' numbers and alpha, plus diagonals: one makes Q_tt definite, one is for the rotations."""
         n = self.rotations
         matrix = replace(self.full, tails=self.full.tails[:, :, :1], tail=self.full.tail[:1, :1])
         added = np.full((n, 13), of_rotations)

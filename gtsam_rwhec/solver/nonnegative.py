@@ -34,7 +34,7 @@ def scale_row(form: ReducedForm) -> Array:
 
 
 def scale_spread(form: ReducedForm) -> float:
-    """s: a scale that is d away from the best scale costs d^2 / s more."""
+    """s: a scale at a distance d from the best scale costs d^2 / s more."""
     return float(form.factor[-1] @ form.factor[-1])
 
 
@@ -62,12 +62,12 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     with search.stages.of("descent"):
         starts = round_to_rotations(relaxation) + search.random_starts(options.random_starts)
         at_zero = _descend(without_scale(form), starts, options.max_descent_iterations)
-        # From a scale held at zero the cost may fall towards positive scales.
+        # From an optimum with the scale held at zero, the cost may still fall towards positive scales.
         ends = _descend(form, starts + [end.R for end in at_zero], options.max_descent_iterations)
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
     with search.stages.of("dual certificate"):
         bounds = _bounds(search, relaxation, at_zero[0].R, positive[0].R if positive else None)
-    # A bound without the constraint holds with it.
+    # A bound on the problem without the constraint also holds with it.
     bound = max([*bounds, found.bound], key=lambda each: each.lower_bound)
     lower = bound.lower_bound
     if not positive or positive[0].cost > at_zero[0].cost:
@@ -96,7 +96,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
 
 
 def without_scale(form: ReducedForm) -> ReducedForm:
-    """Q' with the scale held at zero: what the elimination of the scale took off is there again."""
+    """Q' with the scale held at zero: the term that the elimination of the scale subtracted is added again."""
     of_scale = form.factor[-1] / np.linalg.norm(form.factor[-1])
     row = of_scale @ form.G
     return dataclasses.replace(form, Q=form.Q + np.outer(row, row), G=form.G - np.outer(of_scale, row))

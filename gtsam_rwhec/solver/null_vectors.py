@@ -1,8 +1,8 @@
-"""Directions that the measurements leave free, and what exactly the Lagrangian does along them.
+"""Directions that the measurements leave free, and the exact products of the Lagrangian's Z with them.
 
-A free direction is an eigenvector of Z with an eigenvalue of zero, up to rounding. The moments cannot tell how near to
-zero it is, but the raw measurements can: their residuals along such a direction are zero up to the last digit of the
-measurements, and so the form's action on it is known without cancellation.
+A free direction is an eigenvector of Z with an eigenvalue of zero, up to rounding. The moments do not show how near to
+zero it is, but the raw measurements do: their residuals along such a direction are zero up to the last digit of the
+measurements, so the form's product with it is known without cancellation.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ SMALLEST = 1e-10
 UNDETERMINED = 1e-3
 #: Such a variable gets a unit in which its diagonal entry is about this small: it is a null vector of its own.
 LOWERED = 1e-12
-#: Entries of rotations are held rather than translations, which have no limit, unless they take this much less part.
+#: Entries of rotations are limited, translations are not. So a rotation's entry is held, unless it is this much
+#: smaller.
 PREFERENCE = 1e3
-#: What a free direction does to moments is known up to about this part of the terms that cancel in it.
+#: From moments, products with a free direction are known up to about this fraction of the terms that cancel in them.
 ROUNDING_OF_MOMENTS = 2.0**-44
-#: The vectors are corrected at most so many times by what they do to the raw measurements.
+#: The vectors are corrected at most this many times, by their products computed from the raw measurements.
 CORRECTIONS = 8
-#: With more vectors than this, whose corrections take their time, there is one.
+#: With more vectors than this, a correction takes long, and there is only one.
 MANY = 16
-#: A correction goes on while it makes the form's action on the vectors smaller by this factor.
+#: Corrections continue while each one makes the form's products with the vectors smaller by this factor.
 SMALLER = 0.3
 
 
@@ -113,9 +114,9 @@ def free_vectors(
     """The null vectors of Z; None where Z has none, or a negative eigenvalue.
 
     Z includes ``slack`` on the diagonal of rotations. With ``by_rounding``, every variable's unit is lowered by its
-    rounding: with wild weights more vectors are found. Without, those alone that are undetermined have such a unit.
-    The second result is the multipliers (n, 20), with what it takes
-    to make the gradient vanish along the vectors: the point's own rounding keeps it from that.
+    rounding: this finds more vectors with extreme weights. Without it, only undetermined variables have such a unit.
+    The second result is the multipliers (n, 20), changed so that the gradient vanishes along the vectors. With the
+    given ones it does not, as the point is rounded.
     """
     scale = np.abs(form.curvature.diagonal)
     undetermined = Z.rounding > UNDETERMINED * scale
@@ -173,7 +174,7 @@ def _with_multipliers(
     of_scale: float,
     slack: float,
 ) -> NullVectors:
-    """What Z = Q - Lambda + slack does to V, from what Q does."""
+    """The products of Z = Q - Lambda + slack with V, from those of Q."""
     n, k = len(multipliers), V.shape[1]
     Lambda, size = multiplier_blocks(multipliers)
     r = V[:-1].reshape(n, 13, k)[:, 4:]
@@ -192,7 +193,7 @@ def _with_multipliers(
     VZV = action.VQV - np.einsum("nik,nil->kl", r, of_V)
     VZV_error = action.VQV_error + many * np.einsum("nik,nil->kl", np.abs(r), of_V_size) + few * np.abs(VZV)
     if action.sizes is not None:
-        # Moments tell no more than their rounding: there their form may even be negative.
+        # Moments are known only up to their rounding: within it, their form may even be negative.
         of_QV, of_VQV, of_VQx = action.sizes
         of_ZV = of_QV.copy()
         of_ZV[:-1].reshape(n, 13, k)[:, 4:] += of_V_size

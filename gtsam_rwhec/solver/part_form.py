@@ -20,9 +20,9 @@ from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, project, retract, tangent_basis, unvec, vec
 from gtsam_rwhec.solver.stored_form import StoredForm
 
-#: A gradient that can lower the cost by less than about this part of it is left as it is.
+#: No step is taken if the gradient can lower the cost by less than about this fraction of it.
 WORTH = 1e-18
-#: What is added to the Hessian's diagonal, as a part of it, where the measurements leave directions free.
+#: This fraction of the Hessian's diagonal is added to it, because the measurements may leave directions free.
 DAMPING = 1e-9
 #: A step that moves a rotation (rad), a translation over the largest, or a scale over itself, by more than this is not
 #: taken: the start was near the optimum already.
@@ -81,9 +81,9 @@ def _tangent_gradient(evaluation: Evaluation) -> Array:
     return np.append(np.c_[gradient[:, :4], turning].ravel(), evaluation.gradient[-1])
 
 
-#: Up to so many frames Q' is one matrix for the search.
+#: Up to this many frames, the search uses Q' as one matrix.
 DENSE_FRAMES = 40
-#: Newton steps that follow the elimination; one is usual with extreme weights, and none without.
+#: The most Newton steps after the elimination; one is usual with extreme weights, none with other weights.
 STEPS = 6
 
 
@@ -104,18 +104,18 @@ class PartForm:
 
     @cached_property
     def reduced(self) -> ReducedForm:
-        """Translations and scales eliminated, for all that needs Q' as a matrix."""
+        """The form with translations and scales eliminated, where Q' is needed as a matrix."""
         return ReducedForm.of(self.full)
 
     @cached_property
     def form(self) -> SearchForm:
-        """Where the search looks for answers: Q' as a matrix, or by the graph where frames are many."""
+        """The form that the search uses: Q' as a matrix, or as products over the graph for many frames."""
         by_graph = GraphForm.of(self.full) if len(self.part.free) > DENSE_FRAMES else None
         return by_graph or self.reduced
 
     @cached_property
     def curvature(self) -> Curvature:
-        """Q without h, with what dominates its rounding."""
+        """Q without h, with a diagonal that dominates its rounding error."""
         rounding = None if self.part.given is None else rounding_of(self.part, self.slots)
         return Curvature.of(self.full, rounding)
 
@@ -132,7 +132,7 @@ class PartForm:
     def evaluated(self, answer: Answer, t: Array | None = None) -> Evaluation:
         """The cost of an answer as it is returned: poses in double precision about the user's origin.
 
-        ``t`` (n, 3) are translations as they were given, which the answer has about the gauge, rounded.
+        ``t`` (n, 3): the translations as they were given; the answer has them about the gauge, with a rounding.
         """
         if self._measured is None or not answer.has_positive_scales:
             return self.cost.at(as_point(self.part, answer))

@@ -169,7 +169,7 @@ def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
             if name not in place:
                 place[name] = len(above)
                 above.append(len(above))
-        # Rem's algorithm (Patwary, Blair, Manne 2010): up both ways at once, joined on the way.
+        # Rem's algorithm (Patwary, Blair, Manne 2010): climb from both frames at once, and join the trees on the way.
         low, high = place[pair[0]], place[pair[1]]
         while above[low] != above[high]:
             if above[low] < above[high]:

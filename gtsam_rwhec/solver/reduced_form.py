@@ -23,7 +23,7 @@ RANK_TOLERANCE = 1e-14
 #: A variable with a smaller diagonal, relative to the largest, is absent. This is the square of the rounding of a zero,
 #: and it is far below any ratio of weights.
 ABSENT = 1e-26
-#: A null direction moves a scale where the scale has more than this part of its length.
+#: A null direction moves a scale if the scale's component is larger than this fraction of the direction's length.
 MOVES = 1e-6
 
 
@@ -31,8 +31,8 @@ MOVES = 1e-6
 class ReducedForm:
     """Q' (9 n + 1, 9 n + 1), exactly symmetric, and the way back to translations and scales.
 
-    The best [t, own scale] of each frame and alpha are -factor (G x), (4 n + 1,). ``null`` (4 n + 1, m) has the
-    directions of them that no measurement determines, at any rotations.
+    The best [t, own scale] of each frame and alpha are -factor (G x), (4 n + 1,). ``null`` (4 n + 1, m): directions in
+    these variables that no measurement determines, at any rotations.
     """
 
     Q: Array

@@ -1,8 +1,8 @@
 """The region in which a bound holds, where the measurements leave a translation or a scale free.
 
-Exactly free directions exist only in exact arithmetic. The measurements as given differ from that by the rounding of
-their doubles, and an answer that is far enough away can use this. So where a bound rests on a free direction, it holds
-up to a distance, and the certificate names it.
+Exactly free directions exist only in exact arithmetic. The measurements as given are rounded to doubles, and an answer
+that is far enough away can have a lower cost because of this rounding. So where a bound rests on a free direction, it
+holds up to a distance, and the certificate names it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ LARGER = (1e4, 1e3, 1e2, 1e1)
 
 @dataclass(frozen=True)
 class Region:
-    """The answers that a lower bound is about: all rotations, and translations and scales as below; ``str()`` says it.
+    """The answers that a lower bound is about: all rotations, and translations and scales as below; ``str()`` is a
+    text.
 
     The translation of each frame differs from that of the returned pose by at most ``radius_m``, and each unknown scale
     from the returned one by at most a ``scale_factor``, either way.
@@ -40,14 +41,14 @@ class Region:
 
     @staticmethod
     def common(regions: list[Region | None]) -> Region | None:
-        """What is in all of the regions; None stands for all answers."""
+        """The intersection of the regions; None stands for all answers."""
         named = [region for region in regions if region is not None]
         if not named:
             return None
         return Region(min(r.radius_m for r in named), min(r.scale_factor for r in named))
 
     def around(self, distance_m: float, scale_ratio: float) -> Region:
-        """What is surely left of it about another answer, so far away, whose scales differ by at most this ratio."""
+        """The region about another answer at this distance and scale ratio (at most) that is surely inside this one."""
         return Region(self.radius_m - distance_m, self.scale_factor / scale_ratio)
 
     def __str__(self) -> str:
@@ -110,7 +111,7 @@ def extent_of(part: Part, point: Point) -> float:
 
 
 def smallest_region(part: Part, point: Point, contains: Answer | None) -> Region:
-    """The region that a bound is given for at least; twice as large as it takes to have ``contains`` in it."""
+    """The smallest region for a bound; if ``contains`` is given, at least twice as large as needed to contain it."""
     radius, factor = AT_LEAST * extent_of(part, point), AT_LEAST
     if contains is not None:
         reach = float(np.linalg.norm(contains.t, axis=1).max(initial=0.0))

@@ -155,8 +155,8 @@ class _Newton:
         lower = scipy.linalg.cho_factor(point.Z, lower=True, check_finite=False)
         W = _symmetric(scipy.linalg.cho_solve(lower, np.eye(len(point.Z)), check_finite=False))
         M = _schur(family, point.X, W)
-        # X tends to rank one and M to a singular matrix. The smallest addition that makes M positive definite replaces
-        # what rounding took from its diagonal. The next step corrects the infeasibility that this causes.
+        # X tends to rank one and M to a singular matrix. The smallest addition that makes M positive definite
+        # compensates the rounding of its diagonal. The next step corrects the infeasibility that this causes.
         diagonal = np.diagonal(M).copy()
         for relative in (0.0, 1e-14, 1e-12, 1e-10):
             M[np.diag_indices_from(M)] = diagonal * (1.0 + relative)

@@ -3,8 +3,8 @@
 A measurement's twelve residuals are linear in the entries of its two poses: nine of the rotation equation, three of the
 translation equation. Features and coefficients are split into a high slice, whose products and their sums are exact in
 double precision in any order, and a low slice, whose products are so small that their rounding does not count (Ozaki,
-Ogita, Oishi and Rump 2012). So large terms cancel exactly, a BLAS product does the work, and no platform's long double
-is needed.
+Ogita, Oishi and Rump 2012). So large terms cancel exactly, BLAS computes the products, and no long double of the
+platform is needed.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from gtsam_rwhec.geometry.rounding import Doubled, gamma
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.solver.parts import SMALL, Shared
 
-#: So many measurements are evaluated at once: the slices of a block stay in the processor's cache.
+#: This many measurements are evaluated at once: the slices of a block stay in the processor's cache.
 BLOCK = 1024
-#: A stack of small batches has about so many measurements: more at once, as calls take longer than numbers there.
+#: A stack of small batches has about this many measurements: for small batches the calls take longer than the
+#: arithmetic.
 STACK = 4096
 #: Batches in one stack have at least this part of its longest batch, so that little is padding.
 FULL = 0.6
@@ -115,7 +116,7 @@ def stacks_of(measured: Measured) -> Iterator[Stack]:
 
 
 def small_stacks(measured: Measured) -> Iterator[Stack]:
-    """The measurements of pairs with few in a batch, in stacks of pairs with about as many."""
+    """The small batches of measurements, in stacks of batches of similar length."""
     for shared in measured.shared:
         many = shared.many
         for group in many.groups(np.flatnonzero(shared.pair >= 0)):
@@ -199,7 +200,7 @@ def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
                     total_of_pairs[stack.pairs] += of_stack
                 else:
                     np.add.at(total_of_pairs, stack.pairs, of_stack)
-    # Blocks of one pair are added up exactly, so that a million measurements lose no more than one block does.
+    # Blocks of one pair are added exactly, so a million measurements have no larger rounding error than one block.
     summed = np.zeros(shape)
     for pair, parts in products.items():
         if len(parts) == 1:
@@ -219,7 +220,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
 def _together(weighted: Array, residuals: Array, root: Array, slack: Array) -> tuple[Array, Array]:
     """Products of directions summed over a stack's measurements and residuals, and a bound on them: (1, D, D, 1) each.
 
-    weighted, residuals (k, m, D, 12); root, slack (k, D, 12): of each sum of squares, and of what it may be off by.
+    weighted, residuals (k, m, D, 12); root, slack (k, D, 12): the root of each sum of squares, and a bound on its
+    error.
     """
     D = residuals.shape[2]
     left, right = (each.transpose(2, 0, 1, 3).reshape(D, -1) for each in (weighted, residuals))
@@ -277,7 +279,7 @@ def _feature_units(x: Array) -> Array:
 
 
 def _power_above(values: Array) -> Array:
-    """The smallest powers of two that are not below the values; 1 for zero."""
+    """For each value the smallest power of two that is not below it; 1 for zero."""
     mantissa, exponent = np.frexp(values)
     powers: Array = np.where(values > 0.0, np.ldexp(1.0, exponent - (mantissa == 0.5)), 1.0)
     return powers
@@ -285,7 +287,7 @@ def _power_above(values: Array) -> Array:
 
 #: With fewer measurements the exact sums are quick enough.
 MANY = 10_000
-#: Sums are taken as they are where the cost is known up to this part of it: a hundredth of a percent of the tolerance.
+#: Plain sums are used if the cost's relative error is below this: a hundredth of a percent of the tolerance.
 KNOWN = 1e-10
 #: A residual sums 24 products, a constant, and the low parts of its coefficients.
 OPERATIONS = 30
@@ -298,7 +300,7 @@ _T = slice(3, 12, 4)
 
 
 def plain_sums(measured: Measured, coefficients: Coefficients) -> Sums | None:
-    """The sums for one direction; None where there are few measurements, or doubles do not tell the cost well enough.
+    """The sums for one direction; None for few measurements, or if sums in doubles are not accurate enough.
 
     The result is that of `exact_residuals.weighted_sums`, with larger bounds.
     """
@@ -345,7 +347,7 @@ def plain_sums(measured: Measured, coefficients: Coefficients) -> Sums | None:
 def _sums_of(
     measured: Measured, of_A_and_B: tuple[Array, Array], one: Array
 ) -> Iterator[tuple[np.ndarray, _BatchSums]]:
-    """Pairs (k,) and the sums over a batch of each: of small batches many at once."""
+    """Pairs (k,) and the sums over one batch of each pair; small batches come many at once."""
     of_A, of_B = of_A_and_B
     for stack in small_stacks(measured):
         at = stack.pairs
@@ -357,7 +359,7 @@ def _sums_of(
 
 
 def _wide(of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> tuple[Array, Array, Array]:
-    """What makes the columns [12 residuals, t_A + R_A c - a, t_A, t_B, 1] of k pairs from A, from B, and constants."""
+    """Matrices from A, from B and from 1 to the columns [12 residuals, t_A + R_A c - a, t_A, t_B, 1] of k pairs."""
     k = len(one)
     wide_A, wide_B, constant = np.zeros((k, 12, 22)), np.zeros((k, 12, 22)), np.zeros((k, 22))
     wide_A[:, :, :12], wide_B[:, :, :12], constant[:, :12] = of_A, of_B, one
@@ -388,7 +390,7 @@ class _BatchSums:
 
     @staticmethod
     def of(raw: Measurements, of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> _BatchSums:
-        """One pass over a batch: few products of wide matrices, as other operations take as long for three columns."""
+        """One pass over a batch, with few products of wide matrices: operations on narrow ones take as long."""
         n = len(raw.A)
         A, B = raw.A.reshape(n, 16)[:, :12], raw.B.reshape(n, 16)[:, :12]
         is_uniform = raw.sigma.strides == (0,) and raw.kappa.strides == (0,)
@@ -425,7 +427,7 @@ class _BatchSums:
 
     @staticmethod
     def of_stack(stack: Stack, of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> _BatchSums:
-        """The sums over small batches of k pairs; what pads them has no weight."""
+        """The sums over small batches of k pairs; padding has weight zero."""
         wide_A, wide_B, constant = _wide(of_A, of_B, one, a, c)
         columns = np.matmul(stack.A, wide_A) + np.matmul(stack.B, wide_B) + constant[:, None, :]
         turned = columns.transpose(0, 2, 1)
@@ -441,7 +443,7 @@ class _BatchSums:
 
     @staticmethod
     def _of_products(count: int, of_kappa: Array, of_weight: Array, by_A: Array, by_B: Array) -> _BatchSums:
-        """From the weighted products of all columns, (k, 22, 22) for each kind of weight."""
+        """The sums from the weighted products of all columns, (k, 22, 22) for each kind of weight."""
         by_residual = np.concatenate([of_kappa[:, :, :9], of_weight[:, :, 9:12]], axis=2)
         squares = (
             np.repeat(np.einsum("kii->ki", each)[:, 12:, None], columns, axis=2)

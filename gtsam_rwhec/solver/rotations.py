@@ -96,7 +96,7 @@ def tangent_basis(R: Array) -> Array:
 
 
 def tangent_curvature(R: Array, q: Array) -> Array:
-    """What the Hessian on SO(3) has beside basis' Q' basis, for q = Q' x: sym(M) - tr(M) I with M = G'R."""
+    """The second term of the Hessian on SO(3), beside basis' Q' basis, for q = Q' x: sym(M) - tr(M) I with M = G'R."""
     M = unvec(q[:-1]).transpose(0, 2, 1) @ R
     result: Array = 0.5 * (M + M.transpose(0, 2, 1)) - np.einsum("nii->n", M)[:, None, None] * np.eye(3)
     return result

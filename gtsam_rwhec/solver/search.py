@@ -44,9 +44,9 @@ class Stages:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-#: With unit weights and exact data, costs below this part of the form's magnitude are the rounding of the measurements.
+#: With unit weights and exact data, a cost below this fraction of the form's magnitude is rounding of the measurements.
 OF_MEASUREMENTS = 1e-30
-#: The same part of what a far origin adds: poses about it are rounded to 1.1e-16 of their distance.
+#: The same fraction of the terms that a far origin adds: poses about it are rounded to 1.1e-16 of their distance.
 OF_ORIGIN = 1e-31
 #: The same where only moments are known, whose sums are rounded.
 OF_MOMENTS = 1e-13
@@ -76,7 +76,7 @@ class Found:
 class Search:
     """The search of one part: its cost, and the times of the stages.
 
-    A bound that holds in a region only has the answer ``contains``, if there is one, in its region.
+    If the bound holds only in a region, this region contains the answer ``contains``, if one is given.
     """
 
     part: Part
@@ -145,7 +145,7 @@ class Search:
         return replace(image, cause=Cause.ROUNDING, figures={})
 
     def ended(self, found: Found) -> Searched:
-        """What was found, without the forms where nothing more is searched: in large parts no twin is."""
+        """The result. The forms are dropped where no further search follows: in large parts no twin is searched."""
         keeps = found.is_closed and not found.bound.definite and not self.is_large
         return Searched(self.part, found, self.whole.full.order, self.stages, self if keeps else None)
 
@@ -183,15 +183,15 @@ class Search:
 
     @property
     def is_large(self) -> bool:
-        """Whether small dual and relaxation are too large for all frames at once: then a few frames have theirs."""
+        """Whether small dual and relaxation are too large for all frames at once; then they take a few frames."""
         return self.form.rotations > self.options.max_dense_frames
 
     def tolerance(self, cost: float) -> float:
         """The absolute gap that counts as zero (design fact 10).
 
         With unit weights a cost of 1 has no meaning, and with exact data the cost is zero but for the rounding of the
-        measurements and of the answer, which grows with the distance of the world's origin. Of moments alone, no more
-        than the rounding of the form's entries is known.
+        measurements and of the answer, which grows with the distance of the world's origin. From moments alone, the
+        cost is known only up to the rounding of the form's entries.
         """
         if not self.part.is_relative:
             return self.options.relative_tolerance * max(cost, 1.0)
@@ -203,14 +203,14 @@ class Search:
 
     @property
     def _of_origin(self) -> float:
-        """The part of the form that the gauge took off, sum (|a|^2 + |c|^2) / sigma^2, in which poses are rounded."""
+        """The term that the gauge removed from the form, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded on its scale."""
         gauge = self.part.gauge
         squares = float((gauge.sensor_carrier**2).sum() + (gauge.target_carrier**2).sum())
         return float(self.part.moments.weight.sum()) * squares
 
     @property
     def rounding(self) -> float:
-        """What rounding can change in x'Q'x: smaller differences between descents mean nothing."""
+        """The largest change of x'Q'x by rounding: smaller differences between descents mean nothing."""
         return 1e-15 * self.form.size * self.form.magnitude + 1e-250
 
     def random_starts(self, count: int) -> list[Array]:
@@ -221,11 +221,11 @@ class Search:
 
 #: A search has this bound before it has tried any multipliers.
 NOTHING_YET = Bound()
-#: What a region costs the bound matters from this part of the tolerance on.
+#: A region may lower the bound by this fraction of the tolerance: this does not matter.
 REGION_SHARE = 1e-4
 #: Moments whose rounding may change the cost by more than this part of it prove nothing.
 KNOWN = 1e-3
-#: A large part's local relaxations are as many at most: each has a lower answer than the one before.
+#: At most this many local relaxations of a large part: each one starts from a lower answer than the one before.
 LOCAL_RELAXATIONS = 10
 #: Directions that only the noise of measured rotations determines are known from the raw measurements alone. The answer
 #: takes at most so many steps along them.
@@ -271,7 +271,7 @@ class Attempt:
 
     @property
     def lowest(self) -> float:
-        """What the exact cost of the answer at the best point is at least."""
+        """A lower bound on the exact cost of the answer at the best point."""
         evaluation = self.reached[1]
         return float(np.nextafter(evaluation.cost - evaluation.cost_error * (1.0 + 1e-9), -np.inf))
 
@@ -312,7 +312,7 @@ class Attempt:
         return self.is_closed
 
     def run_locally(self) -> Found:
-        """The search of a large part: the dense methods have a few frames, with all others eliminated."""
+        """The search of a large part: the dense methods are used for a few frames, with all others eliminated."""
         search = self.search
         limit = search.options.max_dense_frames
         if self.certify_by_kkt() or self.is_closed_but_for_rounding:
@@ -336,7 +336,7 @@ class Attempt:
                 return self.found(Cause.ROUNDING)
             if local.needed > limit:
                 break
-            # A solver that lost its digits may say more than there is: then what is proven counts.
+            # A solver with large rounding errors may report more than is possible: then the proven bound counts.
             proven = self.bound.at_most(self.lowest).lower_bound
             bound = max(relaxation.dual, proven) if relaxation.dual < self.cost else proven
             return self.found(
@@ -350,7 +350,7 @@ class Attempt:
         return self.found(Cause.TOO_LARGE, frames=needed, max_dense_frames=limit)
 
     def _add_of_relaxation(self, multipliers: Array) -> None:
-        """Add the bounds from a relaxation's multipliers (n, 20): the nearest that fit the point, and they."""
+        """Add the bounds from a relaxation's multipliers (n, 20), and from the nearest ones with a zero gradient."""
         evaluation = self.reached[1]
         R, gradient = evaluation.point.rotations, _by_rotations(evaluation)
         with self.stages.of("dual certificate"):
@@ -363,7 +363,8 @@ class Attempt:
         self._add(Multipliers.KKT, kkt_multipliers(evaluation.point.rotations, _by_rotations(evaluation)))
 
     def look_elsewhere(self) -> bool:
-        """Look for a lower critical point: along the negative curvature of Z, from Q' as a whole, at random.
+        """Search for a lower critical point: along the negative curvature of Z, from eigenvectors of Q', from random
+        starts.
 
         A large part starts at random last, after its local relaxation: these starts take longest and lead nowhere.
         """
@@ -385,7 +386,7 @@ class Attempt:
 
     @property
     def is_known(self) -> bool:
-        """Whether rounding leaves three digits of the cost, where only moments tell it."""
+        """Where the cost comes from moments only: whether at least three of its digits are correct."""
         return self.search.part.is_relative or self.reached[1].unknown <= KNOWN * max(self.cost, 1.0)
 
     @property
@@ -442,7 +443,7 @@ def _by_rotations(evaluation: Evaluation) -> Array:
     return evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
 
 
-#: A mirror image may cost this part more, and the measurements may still mean it. Above, it is another answer.
+#: A mirror image whose cost is higher by up to this fraction may still be the true answer. Above, it is another answer.
 MIRROR_COST = 0.01
 #: Two answers are different when an entry of their rotations differs by this much.
 TWIN_DISTANCE = 1e-3

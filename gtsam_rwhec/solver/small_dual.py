@@ -132,7 +132,7 @@ def maximise(
         np.linalg.cholesky(P)
     except np.linalg.LinAlgError:  # rounding errors of the reduction made P indefinite
         return multipliers, -np.inf
-    # A term along P x excludes x from the test and changes nothing for all z with z'P x = 0.
+    # A term along P x excludes x from the test. It changes nothing for z with z'P x = 0.
     along_x = P @ x / np.sqrt(float(x @ P @ x))
     try:
         t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
@@ -175,8 +175,8 @@ def maximise(
             break
         decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
         direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * P
-        # The damped step is safe and short; a step four times as long mostly stays inside too. None is longer than
-        # Newton's: longer ones go to and fro about the centre without end.
+        # The damped step is safe and short; a step four times as long mostly stays inside too. No step is longer than
+        # Newton's: longer ones oscillate about the centre without end.
         length = min(1.0, 4.0 / (1.0 + decrement))
         length = _stay_inside(Z - t * P, direction, length)
         y = y + length * step[:-1]

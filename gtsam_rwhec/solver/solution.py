@@ -360,7 +360,7 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
         residuals |= result.residuals
     certificate = Certificate.merged([result.certificate for result in results])
     _warn_of_weights(problem, results)
-    # Only a scale that all share makes one part of what no measurement connects.
+    # Only a shared scale joins components that no measurement connects into one part.
     components = tuple(result.part.names for result in results)
     if problem.scale == "shared":
         components = tuple(tuple(component) for component in connected_components(problem.pairs))
@@ -421,7 +421,7 @@ def _warn_of_images(results: list[PartSolution]) -> None:
     """Warn where images contradict A by more than any arm is off.
 
     B's covariance is that of the corners' noise alone: errors of A and of intrinsics, which every rig has, are not in
-    it, so that a cost above the expected one is no news.
+    it, so a cost above the expected one is normal.
     """
     found = {pair: residual for result in results for pair, residual in result.residuals.items()}
     size = {pair: max(of.rotation_rms_rad / ARM_RAD, of.translation_rms_m / ARM_M) for pair, of in found.items()}

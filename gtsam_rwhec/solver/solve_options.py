@@ -32,8 +32,8 @@ class SolveOptions:
     #: more than ``max_dense_frames`` frames, after the relaxation of a few of them
     random_starts: int = 8
     seed: int = 0  #: Seed of the random starts. The same problem gives the same answer.
-    #: So many frames at once have the multipliers of all constraints (small dual, semidefinite relaxation), which are
-    #: dense. In a part with more free frames these are the frames where the multipliers of R'R = I do not suffice, and
+    #: The dense methods (small dual, semidefinite relaxation: multipliers of all constraints) take at most this many
+    #: frames. In a part with more free frames these are the frames where the multipliers of R'R = I do not suffice, and
     #: those that help them most; all others are eliminated.
     max_dense_frames: int = 120
     relaxation_tolerance: float = 1e-9  #: Relative gap at which the semidefinite solver stops; a descent follows anyway

@@ -1,6 +1,6 @@
 """The cost of a part from its moments: the quadratic form as it is stored, where raw measurements were not kept.
 
-What comes out is about the stored form, and says nothing of the rounding of its entries.
+The results are about the stored form, and do not include the rounding of its entries.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gtsam_rwhec.solver.full_form import PAIRS_AT_ONCE
 Wide = np.longdouble
 #: Its unit roundoff.
 WIDE_UNIT = float(np.finfo(Wide).eps) / 2.0
-#: What rounding takes from a moment, as a part of it: an estimate, as the measurements that would tell are gone.
+#: The relative rounding error of a moment: an estimate, as the measurements are no longer there.
 MOMENTS_UNIT = 2.0**-51
 
 
@@ -46,12 +46,12 @@ class StoredForm:
         )
 
     def action(self, evaluation: Evaluation, V: Array) -> Action:
-        """What the form does to directions."""
+        """The form's products with directions."""
         wide = np.concatenate([V, np.zeros((1, V.shape[1]))]).astype(Wide)
         QV, error = self._times(wide)
         x = np.r_[evaluation.point.numbers.ravel(), evaluation.point.alpha, 1.0].astype(Wide)
         products, of_x = wide.T @ QV, QV.T @ x
-        # V'QV and V'Q x cancel like Q V, whose error counts for more than that of the sums.
+        # V'QV and V'Q x cancel like Q V; the error of Q V is larger than that of these sums.
         size = self._sizes(wide)
         products_error = (np.abs(wide).T @ (error + self._unit * size)).astype(float)
         of_x_error = (np.abs(x) @ (error + self._unit * size)).astype(float)
@@ -67,7 +67,7 @@ class StoredForm:
 
     @property
     def _unit(self) -> float:
-        """At most so many operations make an entry of a product: each block's sums, and the sums over blocks."""
+        """Relative rounding of a product's entry, from its operations: each block's sums, and the sums over blocks."""
         return gamma(13 * len(self.form.frames) + 60, WIDE_UNIT)
 
     def _times(self, x: Array) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ class StoredForm:
 
 
 def _product(form: BlockMatrix, x: Array, *, size: bool) -> Array:
-    """The form, or the sizes of its entries, times x (13 n + 2, D), in the precision of x."""
+    """The form, or the absolute values of its entries, times x (13 n + 2, D), in the precision of x."""
     n, D = len(form.frames), x.shape[1]
     ends = form.ends
     of_frames, of_tail = x[:-2].reshape(n, 13, D), x[-2:]
@@ -100,12 +100,12 @@ def _product(form: BlockMatrix, x: Array, *, size: bool) -> Array:
 
 
 def _as(blocks: Array, x: Array, *, size: bool) -> Array:
-    """Blocks, or their sizes, in the precision of x."""
+    """Blocks, or their absolute values, in the precision of x."""
     result: Array = (np.abs(blocks) if size else blocks).astype(x.dtype, copy=False)
     return result
 
 
 def _rounded(values: Array) -> Array:
-    """What rounding to doubles takes."""
+    """A bound on the error of rounding to doubles."""
     result: Array = 2.0**-52 * np.abs(values).astype(float)
     return result

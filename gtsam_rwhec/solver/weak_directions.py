@@ -1,9 +1,9 @@
-"""The directions that the measurements tell least of, in units of what noise alone would create.
+"""The directions with the least information, in units of the information that noise alone would create.
 
 Up to `DENSE_PARAMETERS` parameters all eigenvalues are computed. Above that the information's Cholesky factor follows
 the graph (``solver/block_matrix.py``). If the information less the highest threshold is positive definite, nothing is
-free (Sylvester's law of inertia), and a few Lanczos steps on its inverse tell the weakest direction to a per cent.
-Else Lanczos on the inverse finds all directions below the threshold, and one above.
+free (Sylvester's law of inertia), and a few Lanczos steps on its inverse give the weakest direction to a per cent. Else
+Lanczos on the inverse finds all directions below the threshold, and one above.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from gtsam_rwhec.solver.noise_bounds import DENSE_PARAMETERS, free_threshold
 
 #: Information below this part of the largest is rounding error.
 ROUNDING = 4.0 * np.finfo(float).eps
-#: Lanczos steps at most where nothing is free, and to what part of itself the weakest direction's information is known
-#: then: enough for what is only reported.
+#: If nothing is free: the most Lanczos steps, and the relative precision of the weakest direction's information, which
+#: is only reported.
 STEPS, NEAR = 40, 0.01
-#: So many directions are searched first where some are free, then four times as many; and their relative precision.
+#: If some directions are free: how many are searched first (then four times as many), and their relative precision.
 FIRST, PRECISION = 6, 1e-8
-#: Up to so many parameters all eigenvalues are computed where Lanczos finds very many free directions: 0.2 GB.
+#: If Lanczos finds very many free directions, all eigenvalues are computed up to this many parameters: 0.2 GB.
 MOST_DENSE = 4000
-#: In larger problems so many free directions are told at most, the weakest ones.
+#: In larger problems at most this many free directions are reported, the weakest ones.
 MOST_FREE = 768
-#: What an unused parameter has in the place of its information.
+#: The value that replaces the information of an unused parameter.
 _FAR = 1e30
 
 
@@ -61,8 +61,8 @@ def unit_of(noise: Array, used: np.ndarray) -> Array:
 def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Array, spare: float, *, few: bool) -> Weak:
     """The directions with the smallest information in units of noise; all free directions are among them.
 
-    ``noise`` and ``used`` (7 n + 1,) say what noise alone would create, and which parameters are tested; ``ends``
-    (n + 1,) how many ends of measurements each frame has, and how many measurements the shared scale.
+    ``noise`` (7 n + 1,): the information that noise alone would create; ``used`` (7 n + 1,): which parameters are
+    tested; ``ends`` (n + 1,): how many ends of measurements each frame has, and how many measurements the shared scale.
     """
     unit = unit_of(noise, used)
     matrix = information.scaled(unit)
@@ -80,7 +80,7 @@ def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Arra
         # Each direction has at least two squares, and the threshold is the highest for the fewest squares.
         values, vectors = _weakest_of_many(matrix, used, float(free_threshold(2.0, 0.0, spare)))
     # By Satterthwaite, the squares that a direction sums follow from its shares of the frames' measurements. A tilt of
-    # the direction at a frame fits two of them away.
+    # the direction at a frame removes two of them.
     of_parameters = vectors**2
     share = np.empty((len(ends), len(values)))
     of_frames = of_parameters[:-1].reshape(len(ends) - 1, 7, len(values))
@@ -129,9 +129,9 @@ def _weakest_of_many(matrix: BlockMatrix, used: np.ndarray, enough: float) -> tu
 
 
 def _told_by_few_steps(factor: BlockFactor, used: np.ndarray, enough: float) -> tuple[Array, Array]:
-    """The smallest eigenvalue above ``enough`` of a matrix, and its vector, from the factor of it less ``enough``.
+    """A matrix's smallest eigenvalue, above ``enough``, and its vector, from the factor of (matrix - ``enough`` I).
 
-    Lanczos with all vectors kept, up to a residual of `NEAR`. What comes out is not below the smallest eigenvalue.
+    Lanczos with all vectors kept, up to a residual of `NEAR`. The result is not below the smallest eigenvalue.
     """
     steps = min(STEPS, int(used.sum()))
     vector = np.random.default_rng(0).standard_normal(len(used)) * used
@@ -146,7 +146,7 @@ def _told_by_few_steps(factor: BlockFactor, used: np.ndarray, enough: float) -> 
             w -= basis[: k + 1].T @ (basis[: k + 1] @ w)
         beside = float(np.linalg.norm(w))
         values, vectors = np.linalg.eigh(triangle[: k + 1, : k + 1])
-        # The residual of the pair: an eigenvalue is as near.
+        # The residual of the eigenpair bounds the distance to an eigenvalue.
         if beside * abs(vectors[-1, -1]) <= NEAR * values[-1]:
             break
         basis[k + 1] = w / beside
