@@ -1,8 +1,8 @@
 """One thread of linear algebra while the library computes: its matrices are small, and threads would only wait.
 
 As installed, NumPy and SciPy each bring a BLAS of their own, which starts a thread on every core for a matrix of a few
-dozen rows. The threads wait for each other actively. Where another program uses a core, a call of microseconds then
-takes milliseconds, and a solve takes a hundred times its time.
+dozen rows. The threads wait for each other in busy loops. If another program uses a core, a call of microseconds then
+takes milliseconds, and a solve becomes a hundred times slower.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def _libraries() -> tuple[LibController, ...]:
 def _set(counts: list[tuple[LibController, int]]) -> None:
     """Set the libraries' numbers of threads.
 
-    threadpoolctl lets only that Python thread change OpenBLAS which changed it last. Here another one may restore, and
-    so may the user's own code.
+    threadpoolctl allows only the Python thread that changed OpenBLAS last to change it again. Here another thread may
+    restore the number, and so may the user's own code.
     """
     for library, count in counts:
         library.set_num_threads(count)
@@ -37,7 +37,7 @@ def _set(counts: list[tuple[LibController, int]]) -> None:
 
 @dataclass
 class _Limit:
-    """How many calls hold the limit now, in all threads, and the numbers of threads before the first of them."""
+    """How many calls hold the limit now, in all Python threads, and the BLAS threads before the first of them."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     holders: int = 0
@@ -52,7 +52,7 @@ class _Limit:
             self.holders += 1
 
     def leave(self) -> None:
-        """Set what was before, if nobody else holds the limit; a number that somebody set meanwhile stays."""
+        """Restore the numbers if no other call holds the limit; a number that other code set meanwhile stays."""
         with self.lock:
             self.holders -= 1
             if self.holders == 0:
@@ -60,7 +60,7 @@ class _Limit:
 
 
 _limit = _Limit()
-# A process that forks while another thread holds the lock would else wait in the child for ever.
+# Otherwise, after a fork while another thread holds the lock, the child process would wait for ever.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(
         before=_limit.lock.acquire, after_in_parent=_limit.lock.release, after_in_child=_limit.lock.release

@@ -1,4 +1,4 @@
-"""What a sensor says of its own motion: its poses over time in a frame of its own, and how its errors grow."""
+"""A sensor's odometry: its poses over time in a frame of its own, and how its errors grow."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class OdometryTrack:
     Raises
     ------
     CountError
-        Stamps and poses are not as many.
+        The numbers of stamps and poses differ.
     StampError
         The stamps do not ascend.
     """

@@ -105,9 +105,9 @@ class CheckedRows(NamedTuple):
 def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> CheckedRows:
     """Check transforms (b, 4, 4), and write them as the rows (12, b) from which moments are computed: vec(R), then t.
 
-    ``first`` is the index of the first one and ``where`` the argument and pair, for messages. The rows are written to
-    ``out`` where it is given. A PoseError names an entry that is NaN, infinite or too large, a last row that is not 0 0
-    0 1, or a block that is not a right-handed rotation.
+    For messages, ``first`` is the index of the first transform, and ``where`` names the argument and the pair. The rows
+    are written to ``out`` where it is given. A PoseError names an entry that is NaN, infinite or too large, a last row
+    that is not 0 0 0 1, or a block that is not a right-handed rotation.
     """
     rows = np.empty((12, len(block))) if out is None else out
     for column in range(4):

@@ -80,14 +80,14 @@ class Doubled(NamedTuple):
 
 
 def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """The rounded sum, and what rounding took from it, exactly."""
+    """The rounded sum, and its exact rounding error."""
     s = a + b
     of_b = s - a
     return s, (a - (s - of_b)) + (b - of_b)
 
 
 def two_product(a: Array, b: Array) -> tuple[Array, Array]:
-    """The rounded product, and what rounding took from it, exactly."""
+    """The rounded product, and its exact rounding error."""
     p = a * b
     a_high, b_high = _high_half(a), _high_half(b)
     a_low, b_low = a - a_high, b - b_high

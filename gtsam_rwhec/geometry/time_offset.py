@@ -22,19 +22,20 @@ from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import SmoothPath, Trajectory
 
-#: Shares of the variance that fade, and time constants (s), which are compared by likelihood. The last ones are random
-#: walks over seconds to minutes.
+#: Shares s of the correlated noise in the variance, with time constants (s); likelihood compares them. The last ones
+#: are random walks over seconds to minutes.
 CHOICES = (
     *product((0.2, 0.5, 0.8, 0.95), (0.15, 0.5, 1.5, 5.0, 20.0)),
     *product((0.9, 0.99, 0.999, 0.9999, 0.99999, 0.9999999), (200.0,)),
 )
-#: White noise is given up for this much of -2 log likelihood: 99 % of chi-square with two degrees of freedom.
+#: Correlated noise replaces white noise if -2 log likelihood falls by this much: 99 % of chi-square with two degrees of
+#: freedom.
 CLEARLY_LIKELIER = 9.2
 
 
 @dataclass(frozen=True)
 class CorrelatedNoise:
-    """The weights Sigma^-1 of n measurements in order of time: a white part, and one that fades with a time constant.
+    """The weights Sigma^-1 of n measurements in order of time: white noise, and noise with decaying correlation.
 
     A detection's error depends on the view, and visual odometry drifts; neighbouring errors are alike. Sigma is
     w I + s K with w + s = 1 and K_ij = exp(-|t_i - t_j| / tau) (Ornstein-Uhlenbeck). K^-1 is tridiagonal (Rue and Held,
@@ -72,7 +73,7 @@ class CorrelatedNoise:
 
 
 def likeliest(tracks: list[tuple[Array, Array]]) -> tuple[CorrelatedNoise, float]:
-    """The noise that makes residuals likeliest, and -2 log of this likelihood but for a constant.
+    """The noise that makes residuals likeliest, and -2 log of this likelihood, up to a constant.
 
     White noise is the answer unless another one is clearly likelier.
 
@@ -99,7 +100,7 @@ def likeliest(tracks: list[tuple[Array, Array]]) -> tuple[CorrelatedNoise, float
 
 #: A detection whose rotation is off by more than this many standard deviations is wrong.
 GROSS = 4.5
-#: With this share of fading noise, residuals drift: a gross error differs from this many neighbours' median.
+#: With this share of correlated noise, residuals drift: a gross error differs from the median of this many neighbours.
 DRIFTS, NEIGHBOURS = 0.8, 9
 #: Blocks of time, with equal shares of the information.
 BLOCKS = 16
@@ -387,9 +388,9 @@ CANDIDATES = 4
 MOST = 3000
 #: A standard deviation above this, s, is no use: the offset is not determined.
 LARGEST_SIGMA_S = 0.05
-#: More of the carrier's turning rate than this may not be noise.
+#: At most this share of the carrier's squared turning rate may be noise.
 LARGEST_NOISE_SHARE = 0.7
-#: Another offset fits as well unless the difference is this many of its standard deviations, over blocks of time.
+#: Another offset fits worse only if the difference is this many of its standard deviations, from blocks of time.
 CLEARLY = 3.0
 
 

@@ -124,7 +124,7 @@ FEWEST_A_SIDE = 3.5
 LACK_OF_FIT = 1.05
 #: Knots are this part of the half window apart.
 KNOT_STEP = 0.25
-#: This many knots tell whether a window is too long.
+#: This many knots are used to test whether a window is too long.
 TRIAL_KNOTS = 200
 #: At most this many poses in a window are used; they are taken evenly.
 MOST_IN_WINDOW = 400
@@ -155,7 +155,7 @@ class SmoothPath:
         period_s = float(np.median(np.diff(path.stamps_ns))) * 1e-9
         half_s = FEWEST_A_SIDE * period_s
         trial = _cubics_at_knots(path, half_s, TRIAL_KNOTS)
-        # The scatter itself is known to sqrt(2 / degrees of freedom); three of these are no lack of fit.
+        # The scatter has a relative error of sqrt(2 / degrees of freedom); up to three times this is no lack of fit.
         most = LACK_OF_FIT**2 * (1.0 + 3.0 * np.sqrt(2.0 / trial.degrees_of_freedom)) * trial.scatter + 1e-24
         while half_s < longest_s:
             longer = min(1.6 * half_s, longest_s)
@@ -232,7 +232,7 @@ def _cubics(
 ) -> _Cubics:
     """Cubics in the tangent spaces of poses (n, 4, 4), each fitted to ``path[low:high:stride]``.
 
-    ``terms`` says of each number of poses (n, 1) which of the four terms are fitted.
+    ``terms`` gives, for each number of poses (n, 1), which of the four terms are fitted.
     """
     stride = np.broadcast_to(stride, low.shape)
     width = int(((high - low - 1) // stride + 1).max())
@@ -372,9 +372,9 @@ def _cubics_at_stamps(
 def _unpredicted(poses: Array, seconds: Array, leverage: Array) -> Array:
     """Mean square error of velocities (6,) from each pose's distance to the cubic through two neighbours a side.
 
-    Where the poses are a smooth path and its noise, the distance is noise and the little that a cubic leaves out. Where
-    the carrier stopped between the stamps, or turned back, it is as large as the steps. Ends of the path, and poses
-    beside a gap, are left out, as those without four neighbours are.
+    For a smooth path with noise, the distance is the noise and the small error of a cubic. If the carrier stopped
+    between the stamps, or turned back, the distance is as large as the steps. Ends of the path, and poses beside a gap,
+    are left out, as those without four neighbours are.
     """
     beside = np.arange(2, len(seconds) - 2)[:, None] + np.array([-2, -1, 1, 2])
     beside = beside[np.diff(seconds[beside], axis=1).max(axis=1) <= LONGEST_GAP_S] if len(beside) else beside
@@ -382,7 +382,7 @@ def _unpredicted(poses: Array, seconds: Array, leverage: Array) -> Array:
         return np.zeros(6)
     middle = beside[:, 1] + 1
     tau = seconds[beside] - seconds[middle, None]
-    # Lagrange's weights at 0; their squares are what noise in the neighbours adds.
+    # Lagrange's weights at 0; the sum of their squares is the variance that noise in the neighbours adds.
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
     weights = np.prod(-tau[:, others] / (tau[:, :, None] - tau[:, others]), axis=2)
     steps = (se3.inverse(poses[middle])[:, None] @ poses[beside]).reshape(-1, 4, 4)

@@ -14,8 +14,8 @@ from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 
-#: Up to this number of measurements the gauge moves and all moments are summed again, as one measurement does not tell
-#: the centre of a trajectory. Later measurements are summed about the gauge as it then is.
+#: Up to this number of measurements the gauge moves and all moments are summed again, as one measurement does not show
+#: the centre of a trajectory. Then the gauge is fixed, and later measurements are summed about it.
 OPENING = 64
 
 
@@ -32,7 +32,7 @@ class Batch:
 
     @property
     def sample(self) -> Array:
-        """At most `BLOCK` poses from all over A: a log begins at rest, and its first poses tell no centre."""
+        """At most `BLOCK` poses spread over all of A: a log begins at rest, so its first poses are not enough."""
         return self.A[:: -(-len(self.A) // BLOCK)]
 
     def moments(self, gauge: Gauge) -> Moments:
@@ -42,7 +42,7 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One pair of moments that were made for many pairs at once."""
+    """The moments of one pair, in a stack that was summed for many pairs at once."""
 
     many: MomentStack
     index: int

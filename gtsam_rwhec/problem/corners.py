@@ -16,9 +16,9 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real, real_array
 
-#: Corners of an image, fewer of which determine no pose.
+#: An image with fewer corners than this determines no pose.
 FEWEST = 4
-#: Two corners are one where they are nearer than this share of the board's size: single precision is enough.
+#: Two corners closer than this share of the board's size are the same corner: single precision is enough.
 SAME = 1e-5
 #: Corners on one line: the board's second largest extent is below this share of its largest.
 LINE = 1e-6
@@ -44,10 +44,10 @@ def seen_corners(
     known_board: Array | None,
     where: str,
 ) -> SeenCorners:
-    """Corners as arrays, in the order of the board that is known already, if there is one.
+    """Corners as arrays, in the order of the known board, if there is one.
 
-    A CountError says that an image has fewer than four corners, one of them twice, or that pixels and corners are not
-    as many; a TargetError that there is no board, or that it is not that of the corners before.
+    A CountError says that an image has fewer than four corners or has one twice, or that the numbers of pixels and
+    corners differ; a TargetError that there is no board, or that it differs from the board of earlier corners.
     """
     views = [_rows(view, 2, f"{where}: image_points of image {i}") for i, view in enumerate(_each(image_points, where))]
     if not views:
@@ -64,7 +64,7 @@ def seen_corners(
 
 
 def check_camera(camera: object, known: Camera | None, sensor: str, where: str) -> Camera:
-    """The sensor's camera; a CameraError where there is none, or another one was given before."""
+    """The sensor's camera; a CameraError if there is none, or if a different one was given before."""
     if camera is None and known is not None:
         return known
     if camera is None:
@@ -119,7 +119,7 @@ def check_in_image(pixels: Array, camera: Camera, where: str) -> None:
 
 
 def check_corner_px(value: object, known: float | None, where: str) -> float:
-    """The deviation of a corner; a NoiseError where it is no positive number, or another one than before."""
+    """A corner's standard deviation; a NoiseError if it is not positive, or differs from the earlier one."""
     if value is None:
         return 0.1 if known is None else known
     if not (is_real(value) and 0.0 < value < np.inf):
@@ -287,15 +287,18 @@ def _scattered(views: list[Array], ids: list[np.ndarray], n: int, where: str) ->
     return pixels
 
 
-#: Corners do not belong to a board where they miss it by this share of its extent in the image, in half of the images.
+#: Corners do not belong to a board if, in half of the images, their error is this share of the board's extent in the
+#: image.
 FARTHEST = 0.2
 SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Poses of N images: T (N, 2, 4, 4), metres, the second nan where there is one; squared_px (N, 2); covariance
-    (N, 2, 6, 6), rotation first, right perturbation."""
+    """Both poses of N images: T (N, 2, 4, 4), metres; the second is nan where there is only one.
+
+    squared_px (N, 2); covariance (N, 2, 6, 6), rotation first, right perturbation.
+    """
 
     T: Array
     squared_px: Array

@@ -136,12 +136,12 @@ def read_pose_rows(path: str | Path) -> NDArray[np.float64]:
     if not content.isascii():
         _raise_for_first_bad_line(path, content, "it has characters that no number has")
     try:
-        # From a stream, one line after another: a list of them takes many times the bytes of the file.
+        # Read line by line from a stream: a list of all lines takes many times the bytes of the file.
         text = io.TextIOWrapper(io.BytesIO(content), "ascii", newline="\n")
         rows = np.loadtxt(text, delimiter=",", comments=None, ndmin=2, dtype=np.float64)
     except ValueError as error:
         _raise_for_first_bad_line(path, content, brief(str(error)))
-    # loadtxt passes over blank lines and accepts nan: A and B would no longer fit, without a message.
+    # loadtxt skips blank lines and accepts nan: lines of A and B would no longer match, without a message.
     if rows.shape != (number_of_lines, len(COLUMNS)) or not np.isfinite(rows).all():
         _raise_for_first_bad_line(path, content, f"read {rows.shape[0]} rows of {rows.shape[1]} numbers")
     with np.errstate(over="ignore"):  # an infinite norm is not 1 either
@@ -241,7 +241,7 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
 
 
 def _is_unicode(name: str) -> bool:
-    """Whether a file's name is text; Python has surrogates for bytes that are none."""
+    """Whether a file's name is valid text; Python replaces other bytes by surrogates."""
     return not any("\ud800" <= sign <= "\udfff" for sign in name)
 
 

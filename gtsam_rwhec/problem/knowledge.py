@@ -51,7 +51,7 @@ def check_name(name: object, what: str) -> None:
 
 
 def checked_scale(scale: object, what: str) -> float:
-    """A scale, measured over true length; a ScaleError for anything but a number whose square is far from rounding."""
+    """A scale (measured over true length); a ScaleError for anything but a number from 1e-15 to 1e15."""
     if not is_between(scale, SMALLEST_SCALE, LARGEST_SCALE):
         raise ScaleError(
             f"{what} is {brief(scale)}; give a positive number from {SMALLEST_SCALE:g} to {LARGEST_SCALE:g} "

@@ -17,11 +17,11 @@ from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pa
 from gtsam_rwhec.problem.moment_stack import BACK_ENTRIES, FRONT, FRONT_ENTRIES, MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, Gauge, Moments
 
-#: So many measurements are summed at once, some megabytes.
+#: This many measurements are summed at once: some megabytes.
 SUMMED_AT_ONCE = 4096
 #: Pairs that are summed together have at least this part of the longest one's measurements, so that little is padding.
 FULL = 0.6
-#: Where the features without B's rotation have the entries of their triangle.
+#: Positions, in the features without B's rotation, of the entries of their triangle.
 _OF_FRONT = np.searchsorted(FRONT, FRONT_ENTRIES[0]), np.searchsorted(FRONT, FRONT_ENTRIES[1])
 
 
@@ -74,7 +74,7 @@ class Sorted:
         return self.first[group][:, None] + np.minimum(step, counts - 1), step < counts
 
     def groups(self, pairs: np.ndarray) -> Iterator[np.ndarray]:
-        """Some pairs, those with about as many measurements, `SUMMED_AT_ONCE` together; a pair with more is alone."""
+        """Groups of pairs of similar size, up to `SUMMED_AT_ONCE` measurements each; a larger pair is alone."""
         counts = self.counts[pairs]
         order = np.argsort(-counts, kind="stable")
         descending, order = counts[order], pairs[order]
@@ -143,7 +143,7 @@ class Sorted:
             result.front[group] = products[:, _OF_FRONT[0], _OF_FRONT[1]]
             diagonal = np.zeros((p, 25))
             diagonal[:, FRONT] = np.einsum("eii->ei", products)
-            # Each column of a rotation has length 1, up to what was projected.
+            # Each column of a rotation has length 1, up to rounding: other rotations were projected.
             diagonal[:, R_B] = ((f[R_B] ** 2) * weight).sum(axis=2).T
         else:
             result.front[group] = products[:, FRONT_ENTRIES[0], FRONT_ENTRIES[1]]
@@ -157,7 +157,7 @@ class Sorted:
         result.error_as_summed[group] = (centring * np.sqrt(total)).T
         # The weight and its products take up to six operations; then a pair's measurements are summed.
         result.operations_as_summed[group] = self.counts[group] + 7
-        # What the test of R'R itself rounds comes on top.
+        # The rounding of the test of R'R itself is added.
         result.deviation[group] = max(of_A.deviation, of_B.deviation) + 8.0 * UNIT
 
     def _name(self, places: np.ndarray) -> None:
@@ -188,7 +188,7 @@ class Section:
 
     @property
     def measurements(self) -> Measurements:
-        """They themselves, without a copy."""
+        """The measurements themselves, without a copy."""
         at, many = self.many.section(self.index), self.many
         sigma, kappa = (
             np.broadcast_to(value, at.stop - at.start) if value.ndim == 0 else value[at]

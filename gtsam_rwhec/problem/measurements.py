@@ -189,8 +189,8 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
 def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.ndarray | None:
     """Stamps as (count,) integer nanoseconds that do not decrease.
 
-    A CountError says that their number or type is another one, a StampError which stamp goes back. Measurements of one
-    pair may have one stamp.
+    A CountError says that their number or type is wrong, a StampError which stamp goes back. Measurements of one pair
+    may have equal stamps.
     """
     stamps = whole_stamps(stamps_ns, count, where)
     back = np.flatnonzero(np.diff(stamps) < 0) if stamps is not None else np.zeros(0, dtype=int)
@@ -251,7 +251,7 @@ def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -
 
 #: Translations with a median size beyond this, in metres, look like millimetres: no camera sees a tag at 100 m.
 MILLIMETRES_M = 100.0
-#: A warning names so many pairs; it counts the others.
+#: A warning names this many pairs, and counts the others.
 MOST_NAMED = 3
 
 
@@ -259,7 +259,7 @@ MOST_NAMED = 3
 class LongTranslations:
     """The median sizes of A's and B's translations in a batch (m) that are too long, by "A" and "B", and where.
 
-    ``from_corners``: B is made of corners, in the unit of their board.
+    ``from_corners``: B was computed from corners, in the unit of their board.
     """
 
     where: str

@@ -18,7 +18,7 @@ from gtsam_rwhec.problem.moments import ONE, R_A, R_B, SHIFT_OPERATIONS, T_A, T_
 
 #: The features without B's rotation.
 FRONT = np.r_[R_A, T_A, T_B, ONE]
-#: So many pairs have their matrices at once: some megabytes.
+#: The matrices of this many pairs are computed at once: some megabytes.
 PAIRS_AT_ONCE = 256
 _IS_BACK = np.isin(np.arange(25), np.arange(25)[R_B])
 _ROWS, _COLUMNS = np.triu_indices(25)
@@ -26,7 +26,7 @@ _BACK = _IS_BACK[_ROWS] | _IS_BACK[_COLUMNS]
 #: Rows and columns of the entries that are kept always, and of those with B's rotation.
 FRONT_ENTRIES = _ROWS[~_BACK], _COLUMNS[~_BACK]
 BACK_ENTRIES = _ROWS[_BACK], _COLUMNS[_BACK]
-#: Where each of 16 x 16 entries is in a row of 136.
+#: The position of each entry of a 16 x 16 matrix in a row of 136.
 _UPPER = np.zeros((16, 16), dtype=int)
 _UPPER[np.triu_indices(16)] = np.arange(136)
 _FULL: np.ndarray = np.maximum(_UPPER, _UPPER.T).ravel()
@@ -37,8 +37,8 @@ _I3 = np.eye(3)
 class MomentStack:
     """Moments of E pairs, as in `Moments`, in the order of the pairs.
 
-    They were summed about one gauge, and are read about a gauge that is moved from it by ``a`` and ``c``. Matrices of
-    some pairs are made where they are asked for.
+    They were summed about one gauge, and are read about a gauge moved from it by ``a`` and ``c``. Matrices are computed
+    on request, for some pairs.
     """
 
     motion: np.ndarray  #: (E,): whether both ends of a pair are the sensor's carrier
@@ -57,7 +57,7 @@ class MomentStack:
 
     @staticmethod
     def empty(motion: np.ndarray, count: np.ndarray, *, with_R_B: bool) -> MomentStack:
-        """Room for the sums of pairs with so many measurements."""
+        """An empty stack for the sums of pairs with ``count`` measurements."""
         E = len(count)
         return MomentStack(
             motion=motion,
@@ -75,7 +75,7 @@ class MomentStack:
 
     @staticmethod
     def of(moments: Sequence[Moments], motion: Sequence[bool]) -> MomentStack:
-        """The moments of several pairs; all of their matrices are kept."""
+        """The moments of several pairs; their whole matrices are kept."""
         stack = MomentStack.empty(np.array(motion, dtype=bool), np.zeros(len(moments), dtype=int), with_R_B=True)
         for e, of_pair in enumerate(moments):
             stack.fill(e, of_pair)
@@ -222,7 +222,7 @@ class MomentStack:
             yield slice(first, min(first + PAIRS_AT_ONCE, len(self)))
 
     def is_finite(self) -> np.ndarray:
-        """(E,): whether the sums of a pair are numbers that did not overflow."""
+        """(E,): whether the sums of a pair are finite."""
         return np.asarray(np.isfinite(self.front).all(axis=1))
 
     def squares(self, features: slice) -> Array:

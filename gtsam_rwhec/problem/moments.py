@@ -26,9 +26,10 @@ R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24
 SWAPPED = np.r_[12:24, 0:12, 24]
 #: This many measurements are summed at once; a block of this size stays in the processor's cache.
 BLOCK = 2048
-#: Rows of a block have this many more places than a power of two, so that they do not share places of the cache.
+#: Rows of a block are longer than a power of two by this many numbers, so that they do not compete for the same cache
+#: lines.
 UNEVEN = 8
-#: A congruence with a 25 x 25 matrix rounds each entry at most so many times.
+#: A congruence with a 25 x 25 matrix rounds each entry at most this many times.
 SHIFT_OPERATIONS = 54
 I3 = np.eye(3)
 
@@ -120,7 +121,7 @@ class Moments:
             np.maximum(reach, np.maximum(f[T_A].max(axis=1), -f[T_A].min(axis=1)), out=reach)
             f[T_A] += c[0] * f[0:3] + c[1] * f[3:6] + c[2] * f[6:9] - a
             f[ONE] = 1.0
-            # Without the last column, which is known from the last row: the product of a matrix with itself is slower.
+            # The last column is left out, as it equals the last row: the product of a matrix with itself is slower.
             if weight.ndim == 0:
                 translation[:, :ONE] += weight * (f @ f[:ONE].T)
                 translation[ONE, ONE] += weight * f.shape[1]
@@ -146,7 +147,7 @@ class Moments:
             feature_error,
             # The weight and its products take up to six operations; then a block is summed, and the blocks.
             min(BLOCK, len(A)) + -(-len(A) // BLOCK) + 6,
-            # What the test of R'R itself rounds comes on top.
+            # The rounding of the test of R'R itself is added.
             deviation + 8.0 * UNIT,
             projected,
         )

@@ -34,7 +34,7 @@ from gtsam_rwhec.problem.measurements import (
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 
-#: What the names of a pair are.
+#: The roles of a pair's two names.
 SIDES: tuple[Literal["target"], Literal["sensor"]] = ("target", "sensor")
 
 
@@ -49,7 +49,7 @@ def warn_of_projected(where: str, projected: int, stacklevel: int) -> None:
 
 
 def seen_pair(target: str, sensor: str) -> Pair:
-    """A target and the sensor that saw it; a FrameError where their names are none, or one."""
+    """A target and the sensor that saw it; a FrameError if a name is not valid, or both are the same."""
     check_name(target, "the target's name")
     check_name(sensor, "the sensor's name")
     if target == sensor:
@@ -231,7 +231,7 @@ class Problem(Knowledge):
         stamps_ns: ArrayLike | None = None,
         source: str | None = None,
     ) -> None:
-        """Add images of a target: its corners in pixels, from which a refinement may start again.
+        """Add images of a target: its corners in pixels, which a refinement may use directly.
 
         Each image is a measurement too: B is the target's pose by its corners alone, with its covariance. Of the two
         poses that a flat board nearly has in an image, all images of a call choose those that agree with A: give all
@@ -260,14 +260,14 @@ class Problem(Knowledge):
         Raises
         ------
         CameraError
-            There is no camera, the sensor has another one, or images of another size; a corner is outside the image, or
-            where the lens model has no ray; an image has no pose.
+            There is no camera, or the sensor has a different one, or images of another size; a corner is outside the
+            image, or the lens model has no ray for it; an image has no pose.
         CountError
-            An image has fewer than four corners, or poses, images and corners are not as many.
+            An image has fewer than four corners, or the numbers of poses, images and corners differ.
         MeasurementsNotKeptError
             The problem keeps moments only.
         TargetError
-            There is no board, the target has another one, or the corners do not belong to it.
+            There is no board, the target has a different one, or the corners do not belong to it.
         PoseError, NoiseError, FrameError, StampError
             As in ``add``; nothing of the images is added then.
         """
@@ -315,7 +315,8 @@ class Problem(Knowledge):
     def add_batch(self, pair: Pair, given: GivenMeasurements, long: list[LongTranslations] | None = None) -> None:
         """Add a batch of measurements or motions; ``add`` and ``add_motion`` say which, and have the errors.
 
-        Where ``long`` is given, translations that look like millimetres go there, and the caller warns of all at once.
+        If ``long`` is given, translations that look like millimetres are appended to it, and the caller warns once of
+        all.
         """
         if given.source is not None and not isinstance(given.source, str):
             raise OptionError(f"source is a {type(given.source).__name__}; give text: the name of a file or topic")
@@ -441,7 +442,7 @@ class Problem(Knowledge):
         return self._accumulator.moments(self._pair(target, sensor))
 
     def moment_stack(self, pairs: Sequence[Pair]) -> MomentStack:
-        """Moments of some pairs in their order, about ``gauge``, without a copy of what is long."""
+        """Moments of some pairs in their order, about ``gauge``, without a copy of large arrays."""
         return self._accumulator.stack(pairs)
 
     def measurements(self, target: str, sensor: str) -> Measurements:

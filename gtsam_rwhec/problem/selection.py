@@ -46,7 +46,7 @@ def problem_of_moments(
 ) -> Problem:
     """The problem of moments about ``gauge``, without raw measurements; the other arguments are as for ``Problem``.
 
-    A FrameError says which name is that of a target and of a sensor.
+    A FrameError says which name is used for both a target and a sensor.
     """
     problem = Problem(scale, keep_measurements=False, sensor_carrier=sensor_carrier, target_carrier=target_carrier)
     for pair in moments:
@@ -121,7 +121,7 @@ def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Meas
     )
 
 
-#: Entries of two rotations that are one pose of an image.
+#: Two rotations belong to the same pose of an image if their entries differ by less than this.
 SAME_POSE = 1e-3
 
 

@@ -1,5 +1,4 @@
-"""Points at which a cost is evaluated, and the results: enclosed costs, gradients, and the form's products with
-directions.
+"""Points at which a cost is evaluated, and the results: enclosed costs, gradients, products with directions.
 
 A direction and a gradient are vectors over the form's variables without h, about the part's gauge: 13 numbers for each
 leaf, 13 for each center, [t (3), own scale, vec R (9)], then alpha; (13 n + 1,) in all.

@@ -113,8 +113,7 @@ class Elimination:
         return result[: self.n]
 
     def spread(self, m: int, q: int) -> tuple[Array, float]:
-        """Rounding of a factorisation with blocks of m and a tail of q, as a fraction of the diagonal: (n,), one
-        number.
+        """Rounding of a factorisation with blocks of m and a tail of q, as a fraction of the diagonal: (n,), ().
 
         Higham 2002, theorem 10.3, for any order of summation: dA_ij is at most g_ij sqrt(a_ii a_jj), g = gamma_(k+1) /
         (1 - gamma_(k+1)) for k terms in the sum, and zero outside the fill. A symmetric matrix of numbers that are not

@@ -166,8 +166,7 @@ def sparse_basis(basis: Array, length_m: float) -> Array:
 def free_directions_of(
     names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
 ) -> tuple[FreeDirection, ...]:
-    """One record for each column of a ``sparse_basis`` of the frames ``names``, with the frames and scales that take
-    part.
+    """One record for each column of a ``sparse_basis`` of the frames ``names``, with what takes part in it.
 
     ``reasons``: the reason of each frame, from ``reason_for``.
     """

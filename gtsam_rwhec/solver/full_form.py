@@ -69,8 +69,7 @@ class Slots:
         return S
 
     def alike(self, at: slice) -> list[tuple[np.ndarray, np.ndarray | None]]:
-        """Sets of pairs of a slice with the same layout, and for each of the 28 numbers the index of its variable (of
-        25).
+        """Sets of pairs of a slice with the same layout, and the index (of 25) of each number's variable.
 
         -1 stands for none. Pairs with a fixed frame, and motions, are one set without such a table.
         """

@@ -25,8 +25,7 @@ LARGER = (1e4, 1e3, 1e2, 1e1)
 
 @dataclass(frozen=True)
 class Region:
-    """The answers that a lower bound is about: all rotations, and translations and scales as below; ``str()`` is a
-    text.
+    """The answers that a lower bound is about: all rotations, and translations and scales as below.
 
     The translation of each frame differs from that of the returned pose by at most ``radius_m``, and each unknown scale
     from the returned one by at most a ``scale_factor``, either way.

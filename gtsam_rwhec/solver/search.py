@@ -203,7 +203,7 @@ class Search:
 
     @property
     def _of_origin(self) -> float:
-        """The term that the gauge removed from the form, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded on its scale."""
+        """The term that the gauge removed, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded relative to its size."""
         gauge = self.part.gauge
         squares = float((gauge.sensor_carrier**2).sum() + (gauge.target_carrier**2).sum())
         return float(self.part.moments.weight.sum()) * squares
@@ -363,8 +363,7 @@ class Attempt:
         self._add(Multipliers.KKT, kkt_multipliers(evaluation.point.rotations, _by_rotations(evaluation)))
 
     def look_elsewhere(self) -> bool:
-        """Search for a lower critical point: along the negative curvature of Z, from eigenvectors of Q', from random
-        starts.
+        """Search for a lower critical point: along the negative curvature of Z, from eigenvectors of Q', at random.
 
         A large part starts at random last, after its local relaxation: these starts take longest and lead nowhere.
         """
