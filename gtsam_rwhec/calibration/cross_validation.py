@@ -143,7 +143,7 @@ class CrossValidation:
     #: The time of measurements: their stamps, or, for pairs without stamps, the order in which they were added
     ordered_by: Literal["stamps", "order"]
     overall: HoldOutError
-    #: A sensor's error includes its own motions
+    #: The error of a sensor includes that of its own motions
     sensors: dict[str, HoldOutError]
     targets: dict[str, HoldOutError]
     pairs: dict[Pair, HoldOutError]

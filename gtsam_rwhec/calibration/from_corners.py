@@ -279,8 +279,7 @@ def _against_poses(corners: CornersRefined) -> Iterator[Finding]:
 
 
 def _against_exact(observations: Observations, corners: CornersRefined, options: CornerOptions) -> Iterator[Finding]:
-    """Findings where exact intrinsics are contradicted: with a calibration's standard deviations they would move
-    far."""
+    """Findings where exact intrinsics would move far if they had a calibration's standard deviations."""
     exact = [name for name in corners.Y if options.stated_of(options.camera_of(name)) == "exact"]
     if not exact:
         return

@@ -1,12 +1,12 @@
 """Misreadings: mistakes in reading A and B, found because another reading of the same numbers fits far better.
 
 A certificate proves that no other poses fit better; it says nothing about numbers that were misread. So, where
-residuals are not plainly those of a sensor, each likely mistake is undone on a sample, and fitted again. A reading is
-named only if it explains the measurements, and explains them better than the given one by a factor and by more than
-chance allows; and not where one frame that moved once explains them far better still. Exchanged carriers, the most
-common mistake in a rig file, are compared by likelihoods, since few stations hide them: of 40 draws of n stations from
-two real cells they were named in 16 for n = 4, 34 for n = 5, 39 for n = 6 and all for n = 8 and more; where there was
-none, never (280 draws).
+residuals are not plainly those of a sensor, each likely mistake is undone on a sample of the measurements, and the
+sample is fitted again. A reading is named only if it explains the measurements, and explains them better than the given
+one by a factor and by more than chance allows; and only if a frame that moved once does not explain them far better
+still. Exchanged carriers, the most common mistake in a rig file, are compared by likelihoods, since few stations hide
+them: of 40 draws of n stations from two real cells they were named in 16 for n = 4, 34 for n = 5, 39 for n = 6 and all
+for n = 8 and more; where there was none, never (280 draws).
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ from gtsam_rwhec.solver.solution import Solution, solve
 
 @dataclass(frozen=True)
 class Reading:
-    """The likely misreadings of a problem's poses; without any, residuals that no sensor has."""
+    """The likely misreadings of a problem's poses; if there are none, residuals that no sensor has."""
 
     misreadings: tuple[Misreading, ...] = ()
     implausible: Implausible | None = None
 
     @property
     def finding(self) -> Finding | None:
-        """The ground against the poses, in words; None where nothing is wrong."""
+        """The finding against the poses; None where nothing is wrong."""
         found = self.misreadings
         if found:
             return Finding(Ground.MISREAD, " (or: ".join(map(str, found)) + ")" * (len(found) - 1))
@@ -70,28 +70,28 @@ class Reading:
 
 
 def reading_of(problem: Problem, solution: Solution | None, progress: Progress | None = None) -> Reading:
-    """How a problem's poses were read, by its certified solution; None where it has none with a positive scale."""
+    """Test how a problem's poses were read. ``solution``: certified, or None if there is none with a positive scale."""
     found = misreadings(problem, solution, progress=progress or silent)
     return Reading(found, None if found else implausible(problem, solution))
 
 
-#: Residuals whose shares of what B varies by are below this, in the geometric mean, are plainly those of a sensor.
+#: Residuals are plainly those of a sensor if, as shares of the variation of B, their geometric mean is below this.
 PLAIN_SHARE = 0.025
 #: And neither share may be above this.
 LARGEST_PLAIN_SHARE = 0.04
-#: With a share above this the calibration explains so little that no mistake is too strange to be tried.
+#: With a share above this the calibration explains so little that unusual mistakes are tried too.
 UNEXPLAINED_SHARE = 0.3
 #: Readings are first tried on so many pairs, measurements and rounds.
 SCREENING_PAIRS, SCREENING_MEASUREMENTS, SCREENING_ROUNDS = 6, 200, 2
-#: A reading is worth a closer look if its product of residuals there is below this share of the given one's.
+#: There, a reading is promising if its product of residuals is below this share of that of the poses as read.
 PROMISING = 0.85
 #: The product of both residuals' ratios must be at least this: "fits far better".
 FAR_BETTER = 1.8
-#: And it must be above what chance does by this many of its standard deviations.
+#: And its gain must be above this many of its own standard deviations.
 BEYOND_CHANCE = 4.0
-#: A residual that became smaller must be below this share of what B varies by: the reading then explains it.
+#: A reading explains a residual that became smaller only if it is below this share of the variation of B.
 EXPLAINED_SHARE = 0.3
-#: A residual may be larger by this factor, if the other one gains more.
+#: One of the two residuals may grow by this factor, if the other one falls by more.
 NOT_WORSE = 1.5
 #: The variance of the logarithm of a median's ratio, over that of a root mean square's.
 INEFFICIENCY_OF_MEDIANS = 2.7
@@ -99,15 +99,15 @@ INEFFICIENCY_OF_MEDIANS = 2.7
 FEWEST_DEGREES_OF_FREEDOM = 9
 #: Two readings fit alike when their products of residuals differ by less than this factor.
 ALIKE_FACTOR = 1.5
-#: Smaller rotation residuals (rad) are the same to this test: no sensor is better.
+#: Smaller rotation residuals (rad) count as this: no sensor is better.
 SMALLEST_RAD = 2e-4
-#: Smaller translation residuals, as a share of what B varies by, are the same too.
+#: Smaller translation residuals, as a share of the variation of B, count as this.
 SMALLEST_SHARE = 2e-4
-#: Rows are shifted by up to so many.
+#: The largest shift of rows that is tried.
 MOST_SHIFTED = 5
-#: Residuals that follow the motion by this many rows may come from a shift.
+#: Residuals that are like a delay of this many rows may come from a shift.
 LATE_ROWS = 0.5
-#: Pairs with fewer rows tell no shift.
+#: Pairs with fewer rows are not tested for a shift.
 FEWEST_ROWS = 8
 
 
@@ -137,8 +137,9 @@ class Misreading:
 def misread_as_recorded(run: Run) -> Reading:
     """How a log's poses were misread in a way that neither sizes nor clocks explain; empty where they were not.
 
-    What cleaning removed counts: a misreading makes it contradict the motion. B that this library found in images was
-    not misread; and where A is the inverse of poses as they were written, these may have been.
+    Measurements that cleaning removed are included: a misreading may make them contradict the motion. B that this
+    library found in images was not misread. Where A is the inverse of the poses in the log, those may have been
+    misread.
     """
     recording = run.recording
     if recording is None or recording.uncleaned is None or run.times > 1 or not run.options.misreadings:
@@ -173,12 +174,12 @@ def inverted(problem: Problem) -> Problem:
 
 
 def _is_left(found: tuple[Misreading, ...]) -> float:
-    """The product of the residuals that the first reading leaves."""
+    """The product of both residuals under the first reading."""
     return found[0].rotation_deg[1] * found[0].translation_mm[1]
 
 
 def are_too_few_to_tell(problem: Problem) -> bool:
-    """Whether the measurements, if they were kept, are too few to show that they were misread."""
+    """Whether the raw measurements are too few to show a misreading; False if the problem did not keep them."""
     sampled = Sampled.of(problem)
     return sampled is not None and _degrees_of_freedom(sampled) < FEWEST_DEGREES_OF_FREEDOM
 
@@ -218,7 +219,7 @@ def misreadings(
     if trial is None or (is_plain(trial.base.residual, signal) and not is_late):
         return ()
     angles = list(readings_of_angles(*sampled.all_poses))
-    # Rotations that are all small come first: any reading of them fits them.
+    # Readings that say all rotations are small come first: such rotations fit any other reading too.
     found = trial.found([each for each in angles if each.of_small_angles]) or trial.found(SINGLE)
     found = found or trial.found(trial.shifts())
     if not found and problem.scale == "known":
@@ -232,10 +233,10 @@ def misreadings(
 
 
 def _rows_are_late(sampled: Sampled, solution: Solution) -> bool:
-    """Whether residuals follow the motion from row to row: where carriers move slowly, late rows cost little.
+    """Whether residuals look like a shift of rows: where carriers move slowly, a shift makes small residuals.
 
-    A regression of the residual's rotation on that motion tells how many rows B is late; small rotations of X and Y
-    are free in it, since the solution took up what they could.
+    A regression of the residual's rotation on the motion from row to row estimates how many rows B is late. Small
+    rotations of X and Y are unknowns too, since the solution absorbed a part of the shift.
     """
     if sampled.has_clock:
         return False
@@ -257,13 +258,13 @@ def _rows_are_late(sampled: Sampled, solution: Solution) -> bool:
 
 
 def is_plain(residual: Spread, signal: Spread) -> bool:
-    """Whether residuals are plainly those of a sensor: small beside what B varies by."""
+    """Whether residuals are plainly those of a sensor: small compared with the variation of B."""
     shares = shares_of(residual, signal)
     return math.sqrt(shares[0] * shares[1]) < PLAIN_SHARE and max(shares) < LARGEST_PLAIN_SHARE
 
 
 def shares_of(residual: Spread, signal: Spread) -> tuple[float, float]:
-    """The residuals as shares of what B varies by."""
+    """The residuals as shares of the variation of B."""
     return (
         residual.rotation_rad / max(signal.rotation_rad, SMALLEST_RAD),
         residual.translation_m / max(signal.translation_m, 1e-12),
@@ -316,11 +317,11 @@ class _Trial:
 
     @property
     def is_strange(self) -> bool:
-        """Whether the poses as read explain next to nothing."""
+        """Whether the fit of the poses as read explains next to nothing."""
         return max(shares_of(self.base.residual, self.signal)) > UNEXPLAINED_SHARE
 
     def shifts(self) -> list[OtherReading]:
-        """Shifts of rows worth a look: rows that change slowly fit better by one row where they fit better by more."""
+        """The shifts of rows to try: larger ones only if a shift by one row already fits better, or nothing fits."""
         if self.sampled.has_clock:
             return []
         fewest = [shifted(1), shifted(-1)]
@@ -329,16 +330,16 @@ class _Trial:
         return fewest + [shifted(sign * n) for n in range(2, MOST_SHIFTED + 1) for sign in (1, -1)]
 
     def is_promising(self, reading: OtherReading, mode: ScaleMode | None) -> bool:
-        """Whether a reading does better on few measurements in few rounds."""
+        """Whether a reading fits better in a quick test: few measurements, few rounds."""
         self.tell(f"trying other readings of the poses: {reading.likely or 'another unit'}")
         fit = fitted(self.problem, self.screen.by(reading), mode, rounds=SCREENING_ROUNDS)
         return fit is not None and self._log_product(fit) < self._log_product(self.on_screen) + math.log(PROMISING)
 
     def gain(self, reading: OtherReading, fit: TrialFit) -> float:
-        """The logarithm of the product of both residuals' ratios; 0 where it is small, unexplained or chance."""
+        """The logarithm of the product of both residuals' ratios; 0 if small, by chance, or residuals stay large."""
         before, after = self._floored(self.base.residual), self._floored(fit.residual)
         ratios = (before.rotation_rad / after.rotation_rad, before.translation_m / after.translation_m)
-        # Angles in another unit change what B varies by.
+        # Another unit of angles changes the variation of B.
         signal = signal_of(self.sampled.by(reading)) if reading.mistake is Mistake.ANGLE_UNIT else self.signal
         for ratio, share in zip(ratios, shares_of(after, signal), strict=True):
             if ratio < 1.0 / NOT_WORSE or (ratio > NOT_WORSE and share > EXPLAINED_SHARE):
@@ -388,13 +389,13 @@ class _Trial:
         return self.named(reading, fit, unit) if unit else None
 
 
-#: Logarithm of the ratio of likelihoods from which on the exchange is named.
+#: The exchange is reported from this logarithm of the likelihood ratio on.
 EXCHANGE_SURELY = 15.0
 #: And its mean over blocks of neighbouring measurements must be above this many of its standard deviations.
 EXCHANGE_SIGMAS = 1.0
-#: A residual of the exchange must be below this share of what B varies by; else something else is wrong.
+#: With the exchange, residuals must be below this share of the variation of B; else something else is wrong.
 EXCHANGE_EXPLAINED = 0.15
-#: Below this the measurements do not tell the two apart.
+#: Below this log likelihood ratio the measurements do not tell the two readings apart.
 EXCHANGE_OPEN = 3.0
 
 
@@ -402,16 +403,16 @@ EXCHANGE_OPEN = 3.0
 class Exchange:
     """What the measurements say of exchanged carriers."""
 
-    #: The exchange, where it fits far better, and where a frame that moved once does not fit far better still
+    #: The exchange, if it fits far better than A as read, and a frame that moved once does not fit far better still
     misreading: Misreading | None = None
-    #: Whether measurements that are too few for any other test do not tell the two apart, or leave residuals that are
-    #: not small
+    #: Whether the question stays open: too few measurements for any other test, which do not tell the two apart or
+    #: leave residuals that are not small
     is_open: bool = False
 
 
 @one_blas_thread()
 def exchange_of(problem: Problem) -> Exchange:
-    """Compare A as it was read with its inverse; nothing is said where either has no fit."""
+    """Compare A as it was read with its inverse; no result if either has no fit."""
     sampled = Sampled.of(problem)
     if sampled is None:
         return Exchange()

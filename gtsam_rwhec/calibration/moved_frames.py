@@ -60,7 +60,7 @@ class TwoPoses:
 def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndarray]) -> TwoPoses | None:
     """The frame of an answer that was at two poses, the one whose groups are farthest apart; None where none was.
 
-    What moved makes two groups of whatever it is seen with, so no other frame is named beside it.
+    A frame that moved also splits the residuals of the frames measured with it, so only one frame is named.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[A
 
 
 def by_station(A: Array) -> tuple[np.ndarray, Array]:
-    """The station (N,) of each pose, and a pose (S, 12) of each station: many visits of one are one error of an arm."""
+    """The station (N,) of each pose, and a pose (S, 12) of each station: an arm has one error at a station."""
     rows = A[:, :3].reshape(-1, 12)
     station = stations(rows) if len(rows) else np.zeros(0, dtype=np.int64)
     return station, rows[np.unique(station, return_index=True)[1]]
@@ -299,13 +299,14 @@ FEWEST, MOST_OF_THEM = 4, 0.75
 OUTLIERS_APART = 8.0
 #: Those within so many times the spread of the measurements that were kept agree.
 NEAR = 6.0
-#: The step of the frame that moved is told better than that of any other frame of its pairs by this factor (the product
-#: of the spreads in rotation and in translation): else it is open which of both moved.
+#: The step of the frame that moved has a smaller spread (rotation times translation) than that of any other frame of
+#: its pairs, by this factor: else it is open which of the two moved.
 OUTLIERS_BETTER = 3.0
 #: Smallest spreads: 0.003 degrees and 10 micrometres.
 LEAST = np.array([5e-5, 1e-5])
-#: What moved stays moved: of those that were left out (or kept, if they are fewer) this share may be on the wrong side
-#: of the moment. Outliers of one step that come and go are of another cause: another board was taken for this one.
+#: A frame that moved does not move back: at most this share of the outliers (or of the inliers, if they are fewer) may
+#: be on the wrong side of the moment. Outliers that come and go have another cause: another board was taken for this
+#: one.
 MISPLACED = 0.2
 
 
@@ -406,9 +407,9 @@ def _sizes(twists: Array) -> Array:
 
 
 def _moment(kept: np.ndarray) -> tuple[int | None, int]:
-    """The row, counted from one, from which most are left out (or kept) that were kept (left out) before.
+    """The row, counted from one, where most measurements change from kept to left out, or the reverse.
 
-    And how many are on its wrong side. Where all are kept, or all left out, there is no such row.
+    Also the number on the wrong side of this row. There is no such row where all are kept, or all left out.
     """
     number = len(kept)
     if kept.all() or not kept.any():

@@ -1,4 +1,4 @@
-"""The stage of the noise: by which model it is found, the refined answer under it, and what is said of it."""
+"""The noise stage: which model estimates the noise, the refined answer under it, and the findings about it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """The noise that a calibration counts with, one standard deviation an axis; ``str()`` is a sentence."""
+    """The noise that a calibration assumes, one standard deviation per axis; ``str()`` is a sentence."""
 
     source: str  #: Where it comes from: "estimated from the residuals", "as given"
     #: Of B, by pair: of the pair's median measurement, root mean square over axes
@@ -212,7 +212,7 @@ def refined_under_its_noise(
 
 
 def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Noise that was stated, and is larger: then the standard deviations are too small by as much."""
+    """Record a finding if the noise is larger than stated: standard deviations are too small by this factor."""
     if refined.options.robust not in ("none", "gnc"):
         return  # the cost of another loss is no chi-square
     kept = selected(run.problem, inliers) if inliers else run.problem
@@ -223,7 +223,7 @@ def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
 
 
 def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers) -> None:
-    """How large the noise is, in one line; ``model`` says the rest."""
+    """Record the size of the noise in one line; the notes of ``model`` have the rest."""
     number = sum(int(mask.sum()) for mask in inliers.values()) or run.problem.number_of_measurements
     shown = f"that is what the residuals of {number} measurements show"
     stated = run.options.carrier_noise
@@ -237,7 +237,7 @@ def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers)
 
 
 def _doubt_noise_of_A(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Noise that was stated for A, and is far larger than the residuals: then the standard deviations are too large."""
+    """Record a finding if the noise stated for A is far larger than the residuals: deviations are then too large."""
     kept = selected(run.problem, inliers) if inliers else run.problem
     ratio = overstated_by(refined.cost, spare_equations(kept))
     if ratio is not None:
@@ -247,7 +247,7 @@ def _doubt_noise_of_A(run: Run, refined: Refined, inliers: Inliers) -> None:
 
 
 def _say_drift(run: Run, model: NoiseInData) -> None:
-    """Whether errors of neighbours in time are alike."""
+    """Record whether errors of neighbours in time are alike."""
     what, record = "drift", run.record
     if model.is_drift_untried:
         evidence = "more pairs are measured at the same instants than its model can hold"
@@ -277,7 +277,7 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
 
 
 def _say_systematic(run: Run, model: NoiseInData) -> None:
-    """Whether errors depend on the configuration, which is a finding too."""
+    """Record whether errors depend on the configuration; if they do, add a finding."""
     what, record = "systematic errors", run.record
     if not model.arms_assumed:
         record.choose(what, "none", run.says_so)

@@ -1,7 +1,8 @@
-"""Outliers: the measurements that agree, those that were left out, and which frames these contradict.
+"""Outliers: which measurements agree, which were left out, and which frames the outliers contradict.
 
-Where every measurement counts, those that look wrong are found beside a robust fit of a sample. Where what was left out
-agrees with itself far better than what was kept (a planar target that is seen flipped), it is the other way round.
+Where every measurement counts, a robust fit of a sample finds those that look wrong. Where the measurements that were
+left out agree with one another far better than those that were kept (a planar target that is seen flipped), the choice
+is reversed.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from gtsam_rwhec.solver.solution import Solution, solve
 HALF = 0.5
 #: Outliers that agree with each other (a planar target's other pose) may be nearly half, and then win by chance.
 NEARLY_HALF = 0.42
-#: From so many measurements on, nearly half is no accident.
+#: From so many measurements on, nearly half of them are not outliers by chance.
 MANY_OF_A_FRAME = 10
 
 
@@ -49,7 +50,8 @@ class LeftOut:
     def is_beyond(self, share: float) -> bool:
         """Whether more than this share of the measurements are outliers.
 
-        Of few measurements, more than half; where nearly half is asked, half: which half is right was then chance.
+        Of few measurements, more than half must be outliers; if ``share`` is below a half, exactly half is enough,
+        because chance decided which half was kept.
         """
         if self.measurements >= MANY_OF_A_FRAME:
             return self.left_out > share * self.measurements
@@ -60,7 +62,7 @@ class LeftOut:
 def contradicted_frames(
     counts: Mapping[Pair, tuple[int, int]], nearly_half: float = NEARLY_HALF
 ) -> tuple[LeftOut, ...]:
-    """The sensors and targets of which most measurements were left out: more than half, of few half, of many near it.
+    """The sensors and targets with mostly outliers: more than half, half of few measurements, or nearly half of many.
 
     ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
     likely to be wrong as they are: a clock, a size or a mounting may have changed. The frame with most outliers comes
@@ -75,7 +77,7 @@ def contradicted_frames(
         while beyond := [frame for frame in _by_frame(rest).values() if frame.is_beyond(share)]:
             names.append(max(beyond, key=lambda frame: frame.left_out).frame)
             rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
-    # A frame that was seen only together with contradicted frames rests on them.
+    # A frame that has measurements only with contradicted frames depends on these.
     known = {*names, *_by_frame(rest)}
     names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(nearly_half)]
     return tuple(everything[name] for name in names)
@@ -93,7 +95,7 @@ def _by_frame(counts: Mapping[Pair, tuple[int, int]]) -> dict[str, LeftOut]:
 
 #: A sentence about outliers names at most this many pairs.
 NAMED = 5
-#: Of fewer measurements of one frame, a wrong one cannot be told.
+#: With fewer measurements of a frame, a wrong one cannot be recognized.
 FEWEST_OF_A_FRAME = 3
 
 
@@ -118,7 +120,7 @@ class Outliers:
 
     @property
     def resting_on_few(self) -> dict[str, int]:
-        """The sensors and targets that rest on fewer than three measurements in all, and on how many."""
+        """The sensors and targets with fewer than three measurements in all, and how many they have."""
         kept = Counter[str]()
         for pair, (number, _) in self.counts.items():
             for name in pair.frames:
@@ -140,7 +142,7 @@ class Outliers:
 
     @property
     def by_pair(self) -> str:
-        """How many of which pair were left out, the most first."""
+        """How many measurements of each pair were left out, as words; the largest number first."""
         out = {pair: (number - kept, number) for pair, (kept, number) in self.counts.items() if kept < number}
         most = sorted(out.items(), key=lambda item: -item[1][0])[:NAMED]
         named = [f"{number} of {of} of {pair}" for pair, (number, of) in most]
@@ -148,7 +150,7 @@ class Outliers:
         return f"{', '.join(named)}{more}"
 
     def choice(self, evidence: str) -> Choice:
-        """What was chosen where outliers were looked for; ``evidence`` is why some were left out."""
+        """The choice of inliers for the record; ``evidence`` is why some measurements were left out."""
         if not self.number:
             return Choice(OUTLIERS, "none", "every measurement agrees with the others")
         total = sum(number for _, number in self.counts.values())
@@ -156,7 +158,7 @@ class Outliers:
 
 
 def few_words(frame: str, number: int) -> str:
-    """What is said of a frame that rests on so few measurements."""
+    """The words for a frame with so few measurements."""
     if number == 1:
         return f"{frame} rests on 1 measurement: a wrong one would not show"
     return f"{frame} rests on {number} measurements: a wrong one could not be told from the other"
@@ -167,9 +169,9 @@ def few_words(frame: str, number: int) -> str:
 GROSS = 8.0
 #: A pair with fewer rows has no median of its own; that of all pairs counts.
 FEWEST_ROWS_OF_MEDIAN = 10
-#: At most so many pairs and measurements are looked at.
+#: At most so many pairs and measurements are tested.
 MOST_PAIRS_ASKED, MOST_ASKED = 200, 10_000
-#: With fewer measurements in all, one cannot be told from the others.
+#: With fewer measurements in all, a wrong one cannot be told from the others.
 FEWEST_ASKED = 8
 
 
@@ -177,8 +179,8 @@ FEWEST_ASKED = 8
 class GrossErrors:
     """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part."""
 
-    #: Measurements that look wrong, those that were looked at, and those of the problem: of large problems a sample is
-    #: looked at, and pairs with a few measurements are left out
+    #: The numbers of measurements that look wrong, that were tested, and of the problem: of a large problem only a
+    #: sample is tested, without pairs with few measurements
     number: int
     looked_at: int
     in_all: int
@@ -222,7 +224,7 @@ def _in_medians(errors: Array, medians: Array) -> Array:
     return np.asarray((errors / np.maximum(np.maximum(own, medians), 1e-12)).max(axis=0))
 
 
-#: What was left out is looked at from this share of all measurements on, and from so many.
+#: The measurements that were left out are tested if they are at least this share of all, and so many.
 SHARE_LEFT_OUT, FEWEST_LEFT_OUT = 0.25, 8
 #: The medians of its residuals, rotation times translation, are this many times smaller than those of what was kept.
 FAR_SMALLER = 25.0
@@ -260,24 +262,24 @@ def _product(fit: TrialFit) -> float:
     return fit.residual.rotation_rad * fit.residual.translation_m
 
 
-#: Without at least so many equations more than unknowns a wrong measurement cannot be told from the others: it has six
-#: of its own, and the rest must tell noise from it.
+#: Outliers are looked for only with so many more equations than unknowns: six belong to a wrong measurement, and the
+#: rest must show the noise.
 SPARE_EQUATIONS = 24
-#: The share of the measurements that agree where the noise is about right.
+#: If the noise is about right, more than this share of the measurements agree.
 MOST_AGREE = 0.5
-#: Of so large a share of outliers the verdict says something.
+#: From this share of outliers on, the verdict reports them.
 MANY = 0.3
-#: Of fewer measurements than this, more than this share of outliers under the stated noise may be a noise stated too
-#: small: so it is where under the noise that the residuals show none is left out.
+#: With fewer measurements than `FEW`, a share of outliers above `MANY_OF_FEW` may mean that the stated noise is too
+#: small. It is, if the noise that the residuals show leaves no outlier.
 FEW, MANY_OF_FEW = 20, 0.25
-#: So many that agree, with residuals of a sensor, are right, and the others are outliers.
+#: If at least this share agrees, with residuals that a sensor may have, the others are outliers.
 MAJORITY = 0.6
 
 
 def without_outliers(
     run: Run, first: Solution | None, clearly_off: tuple[str, ...] = ()
 ) -> tuple[Solution | None, Inliers]:
-    """The certified solution of the measurements that agree, and which these are: empty where every one counts.
+    """The certified solution of the measurements that agree, and which these are: empty if all count.
 
     Parameters
     ----------
@@ -285,7 +287,7 @@ def without_outliers(
     first : Solution or None
         The certified solution of all measurements; None where it has no positive scale.
     clearly_off : tuple of str
-        Sensors whose clocks are clearly off. That makes some of what moves an outlier, so they are taken along.
+        Sensors whose clocks are clearly off. Their offsets are estimated here too, since a late clock makes outliers.
     """
     problem, options, record = run.problem, run.options, run.record
     spare = spare_equations(problem)
@@ -365,7 +367,7 @@ def _agreeing_under(
 def refined_with_outliers(
     run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
 ) -> Refined:
-    """Inliers where sigma and kappa do not hold the whole noise: ``refine`` chooses them again under it."""
+    """The refinement with inliers chosen again by ``refine``, under noise that sigma and kappa cannot express."""
     options = run.options
     how = RefineOptions(
         noise=noise,
@@ -382,8 +384,8 @@ def refined_with_outliers(
     except NoiseError:
         if options.carrier_noise is None:
             raise
-        # More noise is stated for A than the residuals hold. They are judged by what they show, and again under
-        # the noise that is found.
+        # The noise stated for A is larger than the residuals show. Inliers are judged by the residuals' own noise, and
+        # again under the noise that is found.
         return refine(run.problem, first, replace(how, carrier_noise=None), progress=run.tell)
 
 
@@ -407,7 +409,7 @@ def say_outliers(run: Run, inliers: Inliers) -> None:
 
 
 def outliers_of(run: Run, inliers: Inliers, *, is_answered: bool) -> Outliers:
-    """The outliers as a record; what they say against frames is found, and what they leave too little of."""
+    """The outliers; findings are recorded for frames that they contradict or leave with too few measurements."""
     outliers = Outliers.of(run.problem, inliers)
     sensors = run.problem.sensors
     contradicted = contradicted_frames(outliers.counts)

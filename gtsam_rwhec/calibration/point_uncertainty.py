@@ -3,8 +3,9 @@
 A point p in the frame f, seen from a carrier or from another frame g on the same carrier, is q = T_g_f p. To first
 order an error xi = [omega, v] of T_g_f Expmap(xi) moves it by R_g_f (omega x p + v), so its covariance is J Sigma J'
 with J = R_g_f [-[p]x, I]. With one scale for all lengths, the point is taken as measured (true = measured / scale), and
-an error of the scale moves it by -p d(scale) / scale. On the other carrier, T_g_f has the pose A of the moment.
-The noise of one new measurement is told apart: it averages out over measurements, and the calibration's error does not.
+an error of the scale moves it by -p d(scale) / scale. On the other carrier, T_g_f has the pose A of the moment. The
+noise of one new measurement is reported separately: it averages out over measurements, and the calibration's error does
+not.
 """
 
 from __future__ import annotations
@@ -159,7 +160,7 @@ CARRIER_WORDS = {
     "sensor": ("sensorcarrier", "hand", "base", "rig"),
     "target": ("targetcarrier", "base", "hand", "world"),
 }
-#: Of these words, the one that is more often the other carrier. Without A it says too little.
+#: For each side, the word that usually means the other carrier. Without A it is ambiguous.
 MORE_OFTEN_THE_OTHER = {"sensor": "base", "target": "hand"}
 
 

@@ -1,4 +1,4 @@
-"""Measurements settled before the answer: A at the clocks' offsets, and sizes in place of stated ones that do not fit.
+"""Corrections before the answer: A at the clock offsets, and estimated sizes in place of stated ones that do not fit.
 
 Where A lies on a path of the carriers, it is known at any instant: A is taken again at the offsets that were found,
 until these stay the same. A wrong size makes outliers, and a late clock too: both are found before outliers count.
@@ -36,17 +36,17 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution, solve
 
-#: At most so often A is taken again at new offsets.
+#: A is taken again at new offsets at most so many times.
 ROUNDS = 6
-#: Offsets that change by less, s, stay: the answer estimates what is left.
+#: Offsets that change by less (s) have converged: the answer estimates the rest.
 SAME_S = 1e-4
-#: A lies on a path where its entries are those of the path to this.
+#: A lies on a path if its entries equal those of the path within this.
 ON_PATH = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class _Settled:
-    """A problem with A at the offsets, how much later A is taken, s, and the refinement of the inliers that says so."""
+    """A problem with A at the offsets, these offsets (s), and the refinement of the inliers that estimated them."""
 
     problem: Problem
     moved_s: dict[str, float]
@@ -57,7 +57,7 @@ class _Settled:
 def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorners | None]:
     """The run with A at the clocks' offsets and with sizes that are estimated; sizes; what a log's corners give.
 
-    As it was where options leave clocks to the data, where A lies on no path, and where nothing agrees.
+    A stays as it was if options leave clocks to the data, A lies on no path, or no measurements agree.
     """
     problem, options = run.problem, run.options
     if not problem.has_measurements or options.time_offsets == "auto":
@@ -100,7 +100,7 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorne
 
 
 def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
-    """What the measurements that agree say of sizes that count as known; empty where they do not tell."""
+    """Sizes that count as known, estimated from the measurements that agree; empty if none is determined."""
     kept = selected(run.problem, inliers) if inliers else run.problem
     free = with_free_sizes(kept, kept.targets)
     asked = _asked(kept, run)
@@ -127,7 +127,7 @@ def _agreed(run: Run, inliers: Inliers) -> tuple[Solution, Inliers] | None:
 
 
 def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled | None:
-    """A at offsets that stay the same beside outliers that are left out; None where no answer tells."""
+    """A at offsets that have converged, without outliers; None if no answer determines the offsets."""
     path, asked = run.options.carrier_path, _asked(problem, run)
     total = dict(moved_s)
     noise: Literal["given", "estimate"] = "given" if run.options.noise == "given" else "estimate"
@@ -144,7 +144,8 @@ def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled 
             for _ in range(ROUNDS):
                 solution, inliers = _first(run, problem), Inliers()
                 if run.options.robust != "none":
-                    # Cleaning found a log's offsets nearly; those of others may be large, and make outliers.
+                    # The offsets of a log are nearly known from cleaning; those of other problems may be large, and
+                    # make outliers.
                     beside = () if run.recording is not None else asked
                     agree = refined_with_outliers(replace(run, problem=problem), solution, beside, noise)
                     solution, inliers = agree.solution, agree.inliers

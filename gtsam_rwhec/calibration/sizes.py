@@ -1,4 +1,4 @@
-"""Sizes of targets that were said to be known, and lengths that no rig has: what the motion says about them.
+"""Tests of the sizes of targets that were stated as known, and of lengths that no rig has.
 
 Sizes are estimated with everything else, and compared with 1. Standard deviations of a refinement are too small
 where errors of neighbouring measurements are alike, or depend on the arm's pose. So, where one would doubt a size, it
@@ -33,13 +33,13 @@ from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
 SIZE_SIGMAS = 5.0
-#: By so many it is uncertain: the poses are to be used with care.
+#: From so many on, the size is uncertain: the poses are to be used with care.
 UNCERTAIN_SIGMAS = 3.5
-#: By so many it speaks for a factor that others share.
+#: From so many on, a size counts as evidence for a factor that all sizes share.
 SPEAKING_SIGMAS = 2.0
 #: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
-#: A size that is off by more than this factor is none that the motion tells.
+#: A size that is wrong by more than this factor is not determined by the motion.
 LARGEST = 1e4
 #: So many blocks of each pair's rows are left out in turn.
 BLOCKS = 10
@@ -113,7 +113,7 @@ class CommonFactor:
 
 
 def common_factor(found: Sequence[TargetSize]) -> CommonFactor | None:
-    """The factor that all sizes which the motion tells are wrong by; None where they are right, or differ."""
+    """The factor by which all sizes are wrong that the motion determines; None if they are right, or factors differ."""
     told = [(size.scale, size.sigma) for size in found if size.sigma is not None]
     if len(told) < 2:
         return None

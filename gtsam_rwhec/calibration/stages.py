@@ -1,7 +1,7 @@
 """``calibrate``: one call from a problem to the best answer that its measurements hold, with a verdict.
 
-It solves, leaves outliers out, certifies what is kept, refines with the noise that the residuals show, and judges. Each
-step that cannot be taken is a choice that says so; only input that cannot be used raises an error.
+It solves, leaves outliers out, certifies what is kept, refines with the noise that the residuals show, and judges. A
+step that is not possible is recorded as a choice; only input that cannot be used raises an error.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def turning_of(A: Array) -> Turning:
 def of_turning(
     problem: Problem, inliers: Mapping[Pair, np.ndarray], free: Iterable[FreeDirection], *, is_answered: bool
 ) -> list[Finding]:
-    """What the carriers' turning says: why a direction is free, or that they turned too little.
+    """Whether the carriers turned too little, or why their motion leaves a direction free.
 
     The sensor whose carrier turned most counts: where sensors see the same targets, it determines the others too.
     """
@@ -161,7 +161,7 @@ def calibrate(
     options : CalibrateOptions, optional
         Each overrules one choice that is otherwise made from the data.
     recording : Recording, optional
-        What a log knows beside these measurements.
+        What `calibrate` uses of a log besides these measurements.
     progress : callable, optional
         Is called with the name of each stage as it begins.
 
@@ -292,13 +292,13 @@ def _calibrated(run: Run) -> Calibration:
 
 
 def _as_stamped(refined: Refined, moved_s: Mapping[str, float]) -> Refined:
-    """The answer with time offsets over the stamps as they were given: A was taken later on the way."""
+    """The answer with time offsets from the given stamps, including those that A was already corrected by."""
     offsets = {name: moved_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
     return replace(refined, time_offsets_s=offsets)
 
 
 def _nothing_else(run: Run, first: Solution | None, findings: list[Finding]) -> Answer:
-    """The answer that is no more than the first solution, since measurements were misread or are of another time."""
+    """The first solution as the answer, since measurements were misread or a stated clock is wrong."""
     run.record.choose(READING, "nothing else is computed", "the poses were misread, or are of another time")
     run.record.findings += findings
     return Answer(first)
@@ -320,9 +320,9 @@ def _why_as_given(problem: Problem) -> str:
 
 
 def _read_and_answered(run: Run, first: Solution | None) -> tuple[Reading, Answer]:
-    """How the poses were read, and the answer. Of poses that were misread it is the first solution, and no more.
+    """How the poses were read, and the answer. If they were misread, the answer is only the first solution.
 
-    Residuals of no sensor in the fit of all measurements may come from outliers alone: then those that agree decide.
+    Outliers alone may cause residuals that no sensor has: then the measurements that agree decide.
     """
     what, tries = READING, run.options.misreadings
     problem, agreeing = run.problem, first

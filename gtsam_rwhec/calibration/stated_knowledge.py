@@ -1,7 +1,7 @@
-"""What the user stated, asked of the measurements: poses, sizes, and that each frame has one pose.
+"""Tests of what the user stated against the measurements: poses, sizes, and that each frame has one pose.
 
-The answer with a wrong stated pose is a compromise, whose residuals are taken for noise. So the measurements are asked
-without what was stated; what they say is compared with it under both covariances.
+With a wrong stated pose the answer is a compromise, whose residuals are taken for noise. So the pose is estimated
+without the statement, and compared with it under both covariances.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import solve
 
-#: Chance that a true stated pose is contradicted.
+#: The probability that a correct stated pose is contradicted.
 CHANCE = 1e-6
-#: From this chance on it is doubted: that of 3.5 standard deviations of one number, as for sizes.
+#: Below this probability a stated pose is doubted: 3.5 standard deviations of one number, as for sizes.
 DOUBTFUL_CHANCE = 4.65e-4
-#: A stated pose that is off by less is no mistake, but its standard deviation was too small: degrees, m.
+#: A stated pose with a smaller error (degrees, m) is not wrong, but its standard deviation is too small.
 SMALL_DEG, SMALL_M = 0.5, 0.005
 #: Standard deviations of the prior that holds what the motion leaves free, m and rad.
 LOOSE_M, LOOSE_RAD = 10.0, 1.0
@@ -59,7 +59,7 @@ class StatedPose:
     """A stated pose that the measurements contradict; ``str()`` is one sentence."""
 
     frame: str
-    #: How far the pose that the measurements give is from it; 0 for a part that was not stated
+    #: The distance of the measured pose from the stated one; 0 for a part that was not stated
     rotation_deg: float
     translation_m: float
     sigmas: float  #: The same in standard deviations of their difference
@@ -148,7 +148,7 @@ def _compared(name: str, prior: Prior, refined: Refined) -> StatedPose | None:
 
 
 def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Priors and fixed poses that the measurements contradict are found."""
+    """Record findings for priors and fixed poses that the measurements contradict."""
     if not stated_poses(run.problem):
         return
     run.tell("comparing the stated poses with the measurements")
@@ -172,7 +172,7 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
 
 
 def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Frames that were at two poses are found."""
+    """Record a finding for a frame that was at two poses."""
     if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
         return  # a late clock makes such groups
     found = two_poses(run.problem, refined, inliers) or _moved(run, refined, inliers)
@@ -209,7 +209,7 @@ def _moved(run: Run, refined: Refined, inliers: Inliers) -> TwoPoses | None:
 def doubt_stated_sizes(
     run: Run, refined: Refined, inliers: Inliers, like: NoiseInData | None
 ) -> tuple[TargetSize, ...]:
-    """What the motion says about sizes that were said to be known; those that it contradicts are found."""
+    """Estimate the sizes that were stated as known; record findings for those that the motion contradicts."""
     problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
     if problem.scale != "known" or options.sizes in ("correct", "estimate"):
         return ()
@@ -225,7 +225,7 @@ def doubt_stated_sizes(
         time_offsets=late,
         carrier_path=options.carrier_path if late else None,
     )
-    # A target of a wrong size contradicts the others: then all of its measurements are asked, not those that agree.
+    # The measurements of a target with a wrong size may be outliers: then all of them are used, not only inliers.
     kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
     found = sizes(selected(problem, kept) if kept else problem, how, like=like, progress=run.tell)
     doubted = [size for size in found if size.is_doubted]

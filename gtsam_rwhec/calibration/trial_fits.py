@@ -1,4 +1,4 @@
-"""Robust fits of a sample of the measurements: what a reading leaves unexplained, and whether that may be noise.
+"""Robust fits of a sample of the measurements: the residuals of a reading, and whether these may be noise.
 
 A fit iterates re-weighted certified-form least squares: its weights come from its own residuals, so neither stated
 weights nor outliers decide, and the same measure serves a good reading and a wrong one. Only the search of the solver
@@ -212,7 +212,7 @@ def median_distance(sample: Sample) -> float:
 
 
 def signal_of(sample: Sample) -> Spread:
-    """How much B varies within its pairs: medians of what is left by the best constant pose of each pair."""
+    """The variation of B within its pairs: medians of the residuals from the best constant pose of each pair."""
     rotation, translation = [], []
     for _, B in sample.values():
         R, t = B[:, :3, :3], B[:, :3, 3]
@@ -393,7 +393,7 @@ class Implausible:
 def implausible(problem: Problem, solution: Solution | None) -> Implausible | None:
     """Find residuals that are no measurement noise, with weights or without.
 
-    ``calibrate`` asks again of the measurements that agree: wrong ones may pull the fit of all of them to these.
+    ``calibrate`` tests the measurements that agree again, since wrong ones may spoil the fit of all of them.
 
     Medians decide, of the solution or of a robust fit of a sample, whichever are smaller: outliers change nothing as
     long as they are fewer than half. Without raw measurements the solution's root mean squares decide.

@@ -1,4 +1,4 @@
-"""The verdict on a calibration: may its poses be used? Reports, files, exports and the exit status share this rule."""
+"""The verdict: may the poses of a calibration be used? Reports, files, exports and the exit status use this rule."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ _MADE_BY_A_MISREADING = frozenset({
 _MISTAKES = frozenset({
     Ground.POSE_DOUBTED, Ground.MOVED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED
 })  # fmt: skip
-#: What moved makes outliers of all that was measured after it.
+#: If a frame moved, all its later measurements are outliers.
 _MADE_BY_A_MOVE = frozenset({Ground.CONTRADICTED, Ground.TARGET_CONTRADICTED, Ground.MANY_OUTLIERS})
 _MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
 #: Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
@@ -334,7 +334,7 @@ class Judgement:
         grounds = tuple(by_ground)
         worst = max((ground.verdict for ground in grounds), key=list(Verdict).index)
         facts = "; ".join(words for group in by_ground.values() for words in group)
-        # What makes poses useless comes first, and the rest may go with it.
+        # The ground that makes poses useless comes first; the others may disappear with it.
         what_to_do = [(advice_on or {}).get(ground, ground.advice) for ground in grounds]
         advice = what_to_do[:1] if worst is Verdict.DO_NOT_USE else list(dict.fromkeys(what_to_do))
         numbered = advice if len(advice) == 1 else [f"({i}) {each}" for i, each in enumerate(advice, start=1)]
@@ -386,11 +386,11 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
     return found
 
 
-#: What is chosen where the choice says why there is no refined calibration.
+#: The name of the choice that says why there is no refined calibration.
 REFINEMENT = "covariances"
-#: What is chosen of the frames and units of A and B.
+#: The name of the choice about the frames and units of A and B.
 READING = "reading of A and B"
-#: What is chosen of outliers.
+#: The name of the choice about outliers.
 OUTLIERS = "outliers"
 
 
