@@ -25,12 +25,12 @@ from gtsam_rwhec.cli.report_command import report
 from gtsam_rwhec.cli.stage_commands import clean, detect, export, solve
 from gtsam_rwhec.files.terminal_text import printable, say
 
-#: Typer has a click of its own, whose classes have no public names: this is the base of all usage errors.
+#: The base class of all usage errors. Typer contains its own copy of click, without public names for the classes.
 _UsageError: Any = typer.BadParameter.__base__
 
 
 class PrintableUsage(TyperGroup):
-    """Subcommands whose usage errors cannot steer the terminal: they repeat arguments, and a shell may write those."""
+    """Subcommands whose usage errors cannot control the terminal. They repeat arguments, which may be hostile."""
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
         """The context of the command itself."""

@@ -17,7 +17,7 @@ from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
-#: As ``rw.results.LEVEL``, which help must not bring in.
+#: A copy of ``rw.results.LEVEL``, as ``--help`` must not import that.
 LEVEL = 0.01
 RESULT_HELP = "result.json, or the folder that calibrate wrote."
 LevelOption = Annotated[
@@ -80,7 +80,7 @@ def have_same_inputs(old: Path, new: Path) -> bool:
 
 
 def old_checksums(result: Path) -> set[str]:
-    """Of the input files of a calibration; empty where nothing readable beside its result says them."""
+    """The checksums of a calibration's input files; empty if no readable file beside its result has them."""
     evidence = rw.results.evidence_path(rw.results.result_path(result))
     if not evidence.exists():
         return set()
@@ -91,9 +91,9 @@ def old_checksums(result: Path) -> set[str]:
     return set() if inputs is None else {file.sha256 for file in inputs.files}
 
 
-#: The files of a folder by which it is known again; images are not read for it.
+#: The files by which a folder is recognised; images are not read for this.
 LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".csv")
-#: What is said of a log that the old calibration was made from.
+#: The message for a log that the old calibration was made from.
 SAME_LOG = "The old calibration was made from this very log, so that it agrees says nothing: give a log recorded later."
 
 
@@ -156,7 +156,7 @@ def is_of_old_log(result: Path, source: Path) -> bool:
 
 
 def _problem(source: Path, scale: rw.ScaleMode, targets: str, sensors: str) -> rw.Problem:
-    """The new measurements of a calibration that is of no log."""
+    """The new measurements, for a calibration that was not made from a log."""
     if is_log(source):
         raise typer.BadParameter("the old calibration is of CSV files, not of a log: give a folder of CSV files")
     if rw.logs.is_samples_file(source):

@@ -73,7 +73,7 @@ def failures_in_words() -> Iterator[None]:
 
 
 def _indented(message: str) -> str:
-    """A message whose later lines are indented, so that no name with a line break begins a message of its own."""
+    """A message with indented later lines, so that a name with a line break cannot look like a new message."""
     return printable(message).replace("\n", "\n  ")
 
 
@@ -87,7 +87,7 @@ def said_in_the_report() -> Iterator[None]:
 
 
 def check_output(output: Path | None, *inputs: Path) -> None:
-    """Check before a long calculation that its result can be written, and not onto an input; else FileFormatError."""
+    """Check before a long calculation that its output can be written and is not an input; else FileFormatError."""
     if output is None:
         return
     why = why_not_writable(output)

@@ -91,12 +91,12 @@ VerboseOption = Annotated[
         "--verbose", "-v", help="Print everything, and not one screen: choices, corners, residuals, the proof."
     ),
 ]
-#: How the commands' reports say where everything is.
+#: The option for the whole report, as reports name it.
 WHOLE = "--verbose"
 
 
 def exported(solved: rw.runs.Solved | rw.odometry.OdometrySolved, *, anyway: bool) -> list[str]:
-    """The message that files of poses that are not to be used were written, or that they were not; or none."""
+    """A message if poses must not be used: whether their files were written anyway; else no message."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
         return []
     names = ", ".join([*rw.rig.FILES, *(f"{folder}/" for folder in rw.rig.FOLDERS)])
@@ -134,10 +134,10 @@ def show_odometries(solved: rw.odometry.OdometrySolved, output: Path, *, anyway:
 
 
 def refuse(context: typer.Context, options: Mapping[str, Collection[str]]) -> None:
-    """Refuse those of these options that the user wrote, even with the default value.
+    """Refuse the named options if the user wrote them, even with the default value.
 
-    `options` has names of parameters without effect, by the reason and what to do. Raises `typer.BadParameter` if the
-    user wrote some of them; its message has the options and the reasons.
+    `options` has the names of parameters without effect, by the reason and what to do. Raises `typer.BadParameter`
+    if the user wrote some of them; its message has the options and the reasons.
     """
     lines = []
     for why, names in options.items():
@@ -159,7 +159,7 @@ def is_given(context: typer.Context, name: str) -> bool:
 
 
 def command_of(context: typer.Context) -> str:
-    """The command as it was given: its arguments, and the options that are not left to their defaults."""
+    """The command as the user gave it: its arguments, and the options without their default value."""
     words = ["gtsam-rwhec", context.info_name or ""]
     for parameter in context.command.params:
         name, value = str(parameter.name), context.params.get(str(parameter.name))

@@ -1,4 +1,4 @@
-"""The progress of a long calculation on standard error: its stage, how much of it is done, the time, the time left."""
+"""Shows the progress of a long calculation on standard error: stage, share done, time so far, time left."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from gtsam_rwhec.files.terminal_text import shown
 
 #: Seconds before anything is shown, and between lines in a log.
 INTERVAL_S = 1.0
-#: Seconds after which a log says that a stage goes on.
+#: Seconds between lines in a log while a stage continues.
 SILENCE_S = 10.0
 #: A stage is shown with at most this many characters.
 LONGEST_STAGE = 200
-#: Characters of the bar of a stage that counts.
+#: The length of the progress bar, characters.
 BAR = 24
 
 
 class StageDisplay:
     """A context that shows stages: on a terminal with a spinner, and a bar where a stage counts; in a log with lines.
 
-    A log has a line for each stage that lasts, and one every ten seconds while it goes on, with what is done and about
-    how long it takes yet.
+    A log has a line for each longer stage, and one every ten seconds while the stage continues, with the share done and
+    about how long it still takes.
 
     Examples
     --------
@@ -69,7 +69,7 @@ class StageDisplay:
             self._progress.stop()
 
     def __call__(self, stage: str) -> None:
-        """Show the stage that begins now, or how far a stage with a count has come; a remark gets a line that stays."""
+        """Show a stage that begins, or the count of the current stage; a remark gets a line that stays."""
         if isinstance(stage, Remark):
             self._console.print(shown(stage, LONGEST_STAGE), markup=False, soft_wrap=True)
             return

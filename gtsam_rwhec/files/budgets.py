@@ -1,8 +1,8 @@
-"""Budgets: the memory, the parts and the pixels that reading a file may cost, by the file's own size.
+"""Budgets: how much memory, how many parts and how many pixels a file of a given size may cost to read.
 
-Nothing that is read is trusted. A few bytes can state, or be opened to, many gigabytes; so every reader of logs and
-images asks here before it opens, decodes or counts. Each budget is a part that any file has, however small, plus a part
-that grows with the file. Together they keep a crafted file below 200 MB of memory beyond its own size, and a small one
+No input is trusted. A few bytes can claim, or decompress to, many gigabytes; so every reader of logs and images checks
+its budget before it decompresses, decodes or counts. Each budget is a constant part, for any file, plus a part that
+grows with the file. Together they keep a crafted file below 200 MB of memory beyond its own size, and a small one
 below two seconds.
 
 The figures of honest files were measured on 2026-11-22 (tests/logs/test_hostile_logs.py has logs of each kind):
@@ -40,15 +40,15 @@ MESSAGE = 24 * MIB
 #: A message may have this share of the file's size more, as the bytes of real images are in the file itself.
 MESSAGE_SHARE = 0.25
 #: Parts of a log: records, messages, metadata entries, numbers and strings that are read one by one. Each takes one or
-#: two microseconds; what takes more or less counts by these shares.
+#: two microseconds; slower and faster ones count as more or less, see below.
 PARTS = 300_000
 #: Parts for each byte of the file. Poses that never move, in JSON, reach 5.
 PARTS_FOR_A_BYTE = 6
-#: A number, string or list of a CDR message that has to be walked over counts as this many parts.
+#: A number, string or list of a CDR message counts as this many parts if the reader has to step over it.
 PARTS_OF_A_WALK = 2
 #: This many numbers, strings and lists in JSON count as one part.
 JSON_OF_A_PART = 4
-#: A pose in JSON or protobuf counts as this many parts, besides what its text counts.
+#: A pose in JSON or protobuf counts as this many parts, in addition to those of its text.
 PARTS_OF_A_POSE = 3
 #: Parts of one message. A board of 100 x 100 squares has 20,000 numbers for its corners, and as many again in JSON.
 PARTS_OF_A_MESSAGE = 100_000
@@ -74,8 +74,8 @@ PIXELS_FOR_A_BYTE = 256
 #: Bytes that decoding a compressed image may take; each byte of the image allows `DECODED_FOR_A_BYTE` more.
 DECODED = 160_000_000
 DECODED_FOR_A_BYTE = 4
-#: Pixels of the images that one thread decodes before it looks for targets: five images of two megapixels. What is
-#: found in them is kept together, so that a run that is killed loses no more.
+#: Pixels of the images that one thread decodes before it looks for targets: five images of two megapixels. Their
+#: detections are saved together, so a killed run loses at most these.
 PIXELS_TOGETHER = 1 << 23
 #: Scans of a JPEG. Encoders write up to 12; each takes a pass over all pixels, and needs 20 bytes of the file.
 SCANS = 64
@@ -94,7 +94,7 @@ class LogBudget:
 
 
 class Spending:
-    """What one pass over a log has cost, held against the log's budget.
+    """The cost of one pass over a log, compared with the log's budget.
 
     Every method raises a BudgetError, which names the file, once the pass costs more than the budget has.
     """
@@ -105,7 +105,7 @@ class Spending:
         self._parts = self._opened = self._schemas = 0
 
     def begin_pass(self) -> None:
-        """Count anew: the log is read once more. What its schemas cost is not counted anew, as they are kept."""
+        """Start counting again, as the log is read once more. Schemas are kept, so their cost is not counted again."""
         self._parts = self._opened = 0
 
     def take_parts(self, count: int) -> None:
@@ -123,7 +123,7 @@ class Spending:
         self.check_opened(self._opened)
 
     def check_opened(self, total: int) -> None:
-        """Refuse the bytes that all chunks together yield."""
+        """Check the number of bytes that all chunks together yield."""
         if total > self.budget.opened:
             raise BudgetError(
                 f"{self.path}: its chunks yield {total} bytes or more, and those of a log of {self.budget.size} bytes "

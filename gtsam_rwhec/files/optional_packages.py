@@ -1,4 +1,4 @@
-"""Packages that a light installation does not have. Where one is missing, the error says which extra has it."""
+"""Packages that a minimal installation does not have. If one is missing, the error names the extra that has it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ EXTRAS = {
 def extra_named() -> Iterator[None]:
     """Around an import: a missing package of an extra raises a `MissingPackageError` that names the extra.
 
-    For imports inside functions, ``with extra_named(): import jinja2``. Modules import at their top as always: whoever
-    takes a name from a package passes through `lazy_names`.
+    For imports inside functions, ``with extra_named(): import jinja2``. Modules import at their top as
+    usual: names taken from a package pass through `lazy_names`.
     """
     try:
         yield

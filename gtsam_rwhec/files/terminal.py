@@ -1,4 +1,4 @@
-"""The console for rich text. It looks at what rich renders, so that no name in a table steers the terminal."""
+"""The console for rich text. It checks what rich renders, so that no name in a table controls the terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gtsam_rwhec.files.terminal_text import printable
 
 
 class SafeConsole(Console):
-    """A console on which no text is a command to the terminal, and none is markup: "[red]" is printed as it is."""
+    """A console that prints no text as a terminal command or as markup: "[red]" is printed as it is."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(highlight=False, markup=False, emoji=False, **options)

@@ -19,7 +19,7 @@ from gtsam_rwhec.files.terminal_text import brief
 
 #: The descriptors that a shell's ``<`` and ``<( )`` give; these may be pipes.
 _DESCRIPTORS = re.compile(r"/dev/stdin|/dev/fd/\d+|/proc/self/fd/\d+")
-#: What a file can be in place of a file, in words.
+#: What a path can be instead of an ordinary file, in words.
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
@@ -89,7 +89,7 @@ def write_atomically(path: str | Path, content: bytes) -> None:
 def why_not_writable(path: str | Path) -> str:
     """Why `write_atomically` could not write a file now, in words; empty where it could. Nothing is left behind.
 
-    For checks before a long calculation: rights, read-only disks and names that folders have show only by trying.
+    For checks before a long calculation: only a trial shows missing rights, a read-only disk or a folder of this name.
     """
     path = Path(path).absolute()
     try:
@@ -167,7 +167,7 @@ def checked_path(path: object) -> Path:
 
 
 def is_one_of(path: Path, files: Iterable[Path]) -> bool:
-    """Whether a path is one of these ordinary files, by whatever name; what cannot be looked at is not."""
+    """Whether a path is one of these ordinary files, under any name; False if the path cannot be examined."""
     return any(_is_same(path, file) for file in files)
 
 

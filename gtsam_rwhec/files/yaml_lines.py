@@ -1,4 +1,4 @@
-"""YAML files with the line of every value, for messages that say where. The files are not trusted.
+"""YAML files with the line of every value, for error messages. The files are not trusted.
 
 A file is one document of mappings, lists and scalars, as people write it by hand. Refused are aliases (a small file
 could grow without limit), tags (they can stand for any object), keys given twice, and keys that are not text. A scalar
@@ -68,7 +68,7 @@ class YamlFile:
         return f"{self.place(path)}: {words}"
 
     def sections(self, key: str) -> dict[str, YamlFile]:
-        """The values of a mapping at the top, each as a file of its own, with the lines that it has in this one."""
+        """The values of a top-level mapping, each as a file of its own that keeps its lines in this file."""
         lines: dict[str, dict[KeyPath, int]] = {name: {} for name in self.data[key]}
         for path, line in self.lines.items():
             if len(path) > 1 and path[0] == key:
@@ -334,7 +334,7 @@ class _Xml:
             above[str(path[-1])] = value
 
     def _value(self, text: str, is_list: bool) -> Any:
-        """A string, a number, or numbers that blanks part, as OpenCV writes lists."""
+        """A string, a number, or numbers separated by blanks, as OpenCV writes lists."""
         if text.startswith('"') and text.endswith('"') and len(text) > 1 and not is_list:
             return text[1:-1]
         words = text.split()

@@ -1,7 +1,7 @@
 """Simulated calibration problems whose truth is known.
 
 :func:`sphere` and :func:`cameras` are the RWHEC paper's Sections 8.1 and 8.2. They place the noise as the paper does,
-so there the camera is the ``target`` (their modules say more). :func:`general` makes problems of any size, graph,
+so there the camera is the ``target`` (see their module). :func:`general` makes problems of any size, graph,
 motion and scale, with the noise on the sensors' measurements. Each returns a :class:`Simulation`.
 """
 

@@ -15,17 +15,17 @@ from gtsam_rwhec.simulate.simulated_noise import Seed
 
 DriveShape = Literal["3d", "planar", "straight"]
 
-#: The paths of turns and speed are sums of so many sines.
+#: Turn rates and speed are sums of this number of sines.
 SINES = 6
 #: Their frequencies, Hz: a vehicle's steering.
 SLOWEST_HZ, FASTEST_HZ = 0.02, 0.25
-#: Root mean square of the yaw rate, and in 3 D of roll and pitch rates, rad/s.
+#: Root mean square of the yaw rate, and of the roll and pitch rates in 3D, rad/s.
 YAW_RAD_PER_S, TILT_RAD_PER_S = 0.4, 0.15
 #: Mean speed, m/s, and the root mean square of its changes.
 SPEED_M_PER_S, SPEED_CHANGE_M_PER_S = 4.0, 1.2
-#: In 3 D the vehicle moves sideways and up too, root mean square in m/s.
+#: Root mean square of the sideways and upward speed in 3D, m/s.
 DRIFT_M_PER_S = 0.4
-#: An outlier step is off by so much along and about each axis (standard deviations).
+#: Standard deviations of an outlier step's error about and along each axis.
 OUTLIER_RAD, OUTLIER_M = 0.2, 1.0
 
 
@@ -34,8 +34,8 @@ class SimulatedOdometry:
     """One sensor of a drive."""
 
     T_vehicle_sensor: Array  #: (4, 4)
-    #: rotation_rad_per_sqrt_s, translation_m_per_sqrt_s: standard deviations of what a second adds to its error, about
-    #: and along each axis. The translation's is of true lengths, before the scale.
+    #: rotation_rad_per_sqrt_s, translation_m_per_sqrt_s: standard deviations of the error that each second adds,
+    #: about and along each axis. The translation's is in true metres, before the scale.
     rotation_rad_per_sqrt_s: float = 0.002
     translation_m_per_sqrt_s: float = 0.02
     scale: float = 1.0  #: Measured over true length
@@ -50,8 +50,8 @@ class Drive:
 
     stamps_ns: np.ndarray  #: (N,): Of the truth, nanoseconds, on the vehicle's clock
     T_world_vehicle: Array  #: (N, 4, 4): The truth
-    #: dict of sensor to (stamps_ns (M,), T_start_sensor (M, 4, 4)): What each sensor says, on its own clock; it begins
-    #: at the identity
+    #: dict of sensor to (stamps_ns (M,), T_start_sensor (M, 4, 4)): the sensor's odometry on its own clock, from
+    #: the identity
     tracks: dict[str, tuple[np.ndarray, Array]] = field(hash=False)
     sensors: dict[str, SimulatedOdometry] = field(hash=False)
 
@@ -72,7 +72,7 @@ def drive(
 ) -> Drive:
     """Drive with turns about all axes ("3d"), on a plane with curves ("planar"), or straight ahead ("straight").
 
-    Errors of steps are independent twists in the sensor's own frame after the step, as odometry makes them.
+    Each step's error is an independent twist in the sensor's frame after the step, as in odometry.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def drive(
 
 
 def _wave(times: Array, size: float, generator: np.random.Generator) -> Array:
-    """A smooth random path of the given root mean square."""
+    """A smooth random function of time with the given root mean square."""
     frequency = np.exp(generator.uniform(np.log(SLOWEST_HZ), np.log(FASTEST_HZ), SINES))
     phase = generator.uniform(0.0, 2.0 * np.pi, SINES)
     wave: Array = np.sqrt(2.0 / SINES) * size * np.sin(2.0 * np.pi * np.outer(times, frequency) + phase).sum(axis=1)

@@ -5,7 +5,7 @@ Every noise acts on the right of a pose T_a_b = (R_a_b, t_a_b), as in the RWHEC 
     R_noisy = R_a_b R_eps          R_eps close to the identity, axes of frame b
     t_noisy = t_a_b + eps          eps in metres, axes of frame a
 
-There are two models, because the paper's published experiments were run with other noise than its text states:
+There are two models, because the paper's experiments used other noise than its text states:
 
 ``stated``
     As the text says: R_eps ~ Langevin(I, kappa), eps ~ N(0, sigma^2 I). Use it for honest statistics: the library's
@@ -80,8 +80,8 @@ def langevin_rotations(count: int, kappa: float, seed: Seed) -> Array:
     """
     generator = np.random.default_rng(seed)
     bingham = np.array([0.0, 4.0 * kappa, 4.0 * kappa, 4.0 * kappa])
-    # The envelope with the most acceptances has 1/b + 3/(b + 8 kappa) = 1. Its positive root can be written in two
-    # ways. The one without cancellation is used.
+    # The envelope with the most acceptances has 1/b + 3/(b + 8 kappa) = 1. The form of its positive root without
+    # cancellation is used.
     linear = 8.0 * kappa - 4.0
     root = math.hypot(linear, math.sqrt(32.0 * kappa))
     b = 16.0 * kappa / (linear + root) if linear > 0.0 else (root - linear) / 2.0
