@@ -23,7 +23,7 @@ BACKWARDS_S = 1.0
 SAME_POSE = 1e-6
 #: Nanoseconds. Stamps must be below this (the year 2116), so that differences and time offsets fit into 64 bits.
 LATEST_NS = 1 << 62
-#: A velocity needs so many poses in all, and so many within half a second.
+#: A velocity needs at least this many poses in all, and this many within half a second.
 FEWEST_POSES, FEWEST_NEAR = 8, 4
 
 
@@ -31,7 +31,7 @@ FEWEST_POSES, FEWEST_NEAR = 8, 4
 class CarrierMotion:
     """The carriers' motion: A = T_sensorcarrier_targetcarrier over time, and its noise if the rig file states it.
 
-    `about` is the carrier that the source says where it is: in its axes, and about its origin, A is noisy.
+    `about` is the carrier whose pose the source gives. A is noisy about this carrier's origin, in its axes.
     """
 
     trajectory: Trajectory
@@ -46,8 +46,8 @@ class CarrierMotion:
     def velocities(self, stamps_ns: np.ndarray) -> Array | None:
         """Velocities (N, 6) at stamps (N,), [omega rad/s, v m/s] in the target carrier's axes, from the poses nearby.
 
-        They are zero where the carriers stand still in all of them, as far as the poses' scatter tells. None where a
-        stamp has fewer than four poses within half a second: between stations nothing is known of the path.
+        All are zero if none of them exceeds the scatter of the poses: the carriers stood still. None if a stamp has
+        fewer than four poses within half a second: between stations the path is unknown.
         """
         path, window_ns = self.trajectory, round(WINDOW_S * 1e9)
         near = np.searchsorted(path.stamps_ns, stamps_ns + window_ns, side="right")
@@ -70,8 +70,8 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
 
     Raises `LogError` if the topic is missing or has no poses of these frames, or if the log has no transforms;
     `TransformError` if no chain of transforms joins the frames, or if they never move relative to each other;
-    `StampError` if all stamps are the same, or if a clock was set back during the recording. Of several files, none may
-    have other poses at a stamp than another one: that is a `LogError` with both.
+    `StampError` if all stamps are the same, or if a clock was set back during the recording. Raises `LogError`, which
+    names both files, if two files have different poses at one stamp.
     """
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.parent_and_child
@@ -97,9 +97,10 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
 
 
 def poses_of_tf(log: Log, parent: str, child: str, of_sensors: str) -> tuple[str, str, np.ndarray, Array]:
-    """The frames, the upper one in tf first, whatever the order in which they were named; stamps and poses.
+    """Read poses from tf. Return the parent and the child frame, stamps and T_parent_child.
 
-    Of frames on two branches of the tree, the carrier of the sensors is the child.
+    The parent is the frame that is higher in the tf tree, whichever the rig file names first. If the frames are on two
+    branches of the tree, the child is the carrier of the sensors.
     """
     where = f"{log.files[0].path}, tf {parent} to {child}"
     topics = [topic for topic in log.topics() if topic.is_tf]
@@ -139,7 +140,7 @@ def _no_transforms(log: Log, topics: list[Topic]) -> str:
 
 
 def poses_of_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
-    """Stamps and poses of a topic; `StampError` as `check_order`."""
+    """Stamps and poses of a topic. Raises `StampError` as `check_order`."""
     in_order = [r.stamp_ns for r in log.records([topic]) if isinstance(r, PoseRecord)]
     check_order(np.array(in_order, dtype=np.int64), f"topic {topic}")
     series = log.poses(topic)
@@ -149,7 +150,7 @@ def poses_of_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
 
 
 def _check_one_pose_a_stamp(log: Log, topic: str | None) -> None:
-    """Refuse files with different poses of one frame at one stamp: folders that were converted apart, most often."""
+    """Raise `LogError` if files have different poses of a frame at one stamp, often of folders converted separately."""
     before: list[tuple[Path, dict[str, tuple[np.ndarray, Array]]]] = []
     for file in log.files:
         alone = Log([file])

@@ -39,7 +39,7 @@ def changes(made_with: Rig, rig: Rig) -> Changes:
 def rig_for_cleaning(log: Log, rig: Rig | None) -> Rig:
     """The rig file for cleaning a log of detections: `rig`, or by default the log's own.
 
-    Raises `LogError` if `rig` has targets or cameras that differ from the detected ones.
+    Raises `LogError` if targets or cameras of `rig` differ from those that detection used.
     """
     made_with = read_embedded_rig(log)
     if rig is None:
@@ -56,8 +56,8 @@ def rig_for_cleaning(log: Log, rig: Rig | None) -> Rig:
 def rig_for_solving(log: Log, rig: Rig | None) -> Rig:
     """The rig file for solving a cleaned log: `rig`, or by default the log's own.
 
-    Raises `LogError` if `rig` has targets or cameras that differ from the detected ones, or other carriers or settings
-    for cleaning.
+    Raises `LogError` if targets or cameras of `rig` differ from those that detection used, or if its carriers or its
+    settings for cleaning differ from those that cleaning used.
     """
     chosen = rig_for_cleaning(log, rig)
     keys = changes(read_embedded_rig(log), chosen).cleaning
@@ -85,7 +85,7 @@ def _of_detection(made_with: Rig, rig: Rig) -> Iterator[str]:
 
 
 def _for_detection(sensor: Sensor) -> Sensor:
-    """The section without what only refinement asks: where the intrinsics come from."""
+    """The sensor's section without `intrinsics.stated`, which only refinement uses."""
     if sensor.intrinsics is None:
         return sensor
     return sensor.model_copy(update={"intrinsics": sensor.intrinsics.model_copy(update={"stated": None})})

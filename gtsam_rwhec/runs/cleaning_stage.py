@@ -55,7 +55,7 @@ def clean_log(
     out_path
         The MCAP file to write; may be `detected_path`.
     rig : Rig, optional
-        By default the rig file embedded in the log.
+        The default is the rig file embedded in the log.
     images : "copy" or "leave_out"
         Whether the written log has the images of the detected log.
     progress : callable, optional
@@ -215,11 +215,11 @@ def synchronise(
     where: str = "the sensor",
     needs_overlap: bool = True,
 ) -> tuple[Array, Kept]:
-    """The carrier's pose at each of a sensor's stamps.
+    """Interpolate the carrier's pose at each stamp of a sensor.
 
     The sensor's stamp t is the carrier's t + `time_offset_s` (Kalibr's convention). Poses further apart in time than
-    `max_gap_s` are not interpolated. `where` is the sensor, for messages. Returns A (M, 4, 4), metres, and what removes
-    stamps outside the trajectory and in its gaps.
+    `max_gap_s` are not interpolated. `where` is the sensor, for messages. Returns A (M, 4, 4), metres, of the stamps
+    that are kept, and which stamps were removed: those outside the trajectory or in its gaps.
 
     Raises
     ------
@@ -255,8 +255,8 @@ def thin(
 ) -> Kept:
     """Keep a measurement if the carrier has turned or moved since the last measurement that was kept.
 
-    A hundred images at one pose weigh a hundred times, and they share the error of that pose (A). A covariance that
-    takes the images for independent is then too small. A (N, 4, 4) has the carrier's poses, in order of time.
+    A hundred images at one pose have a hundred times the weight of one, but all share the error of that pose (A). A
+    covariance that assumes independent images is then too small. A (N, 4, 4) has the carrier's poses, in order of time.
     """
     bad = np.zeros(len(A), dtype=bool)
     moved = np.zeros(len(A))

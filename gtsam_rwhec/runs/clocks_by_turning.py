@@ -1,8 +1,9 @@
-"""Clocks of sensors from whole rotations: those to be estimated, and those that the rig file states.
+"""Time offsets of sensors from rotations alone: estimates, and a check of those that the rig file states.
 
-Rotations tell an offset before anything is calibrated, however large it is. So they find offsets first, and contradict
-stated ones that a calibration with large residuals would hide. Poses of the carriers that are exchanged turn the other
-way, and agree at no offset; their offset is found along the inverse path, so that the next stage can name the exchange.
+Rotations determine an offset of any size before anything is calibrated. So offsets are estimated from them first. They
+also show a wrong stated offset, which large residuals of a calibration would hide. If the rig file exchanges the
+carriers, their poses turn the other way, and the rotations agree at no offset. The offset is then found along the
+inverse path, so that the next stage can report the exchange.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 
 #: Rotations of one target by one sensor: stamps (M,), B (M, 4, 4).
 Detections = tuple[np.ndarray, Array]
-#: Rotations that agree to this, rad, about each axis are those of a sensor: another direction need not be tried.
+#: Radians about each axis. If rotations agree within this, the direction of the path is right, and the inverse is not
+#: tried.
 PLAIN_RAD = np.radians(2.0)
-#: From this offset on, s, and from so many standard deviations on, rotations contradict a stated one. Smaller ones are
-#: the calibration's to find, which knows the noise better.
+#: Rotations contradict a stated offset if theirs differs by more than this, in seconds and in standard deviations.
+#: Smaller differences are left to the calibration, which knows the noise better.
 LATE_S, SURELY = 0.03, 8.0
 #: The other direction of the carriers' path must fit better by this factor.
 FAR_BETTER = 2.0
@@ -55,12 +57,12 @@ def offset_of_either_direction(
 def late_clocks(
     pairs: Mapping[Pair, MeasuredPairs], path: Trajectory, rig: Rig, stated_s: Mapping[str, float]
 ) -> list[Finding]:
-    """The clocks whose offsets the rig file states, and whose rotations agree with the carriers' at another offset.
+    """Findings about sensors whose rotations agree with the carriers' at another time offset than the stated one.
 
     Parameters
     ----------
     pairs : dict of (target, sensor) to MeasuredPairs
-        Without marks of outliers.
+        Measurements, none of them marked as an outlier yet.
     path : Trajectory
         T_sensorcarrier_targetcarrier over time.
     rig : Rig

@@ -1,8 +1,8 @@
-"""Noise of targets and of odometries on one footing, before outliers are looked for in all measurements together.
+"""Comparable noise of targets and odometries, for the search for outliers in all measurements together.
 
-One variance factor is estimated for all measurements, so that their covariances must be right beside one another. Those
-of motions are found from what two motions have in common (`odometry_windows`); those of targets are found here, from
-the residuals of the targets alone.
+One variance factor is estimated for all measurements, so the ratios of their covariances must be right.
+`odometry_windows` finds the covariances of motions, from what two motions have in common. This module finds those of
+targets, from a calibration with the targets alone.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from gtsam_rwhec.solver.solution import solve
 def with_comparable_noise(
     pairs: Pairs, rig: Rig, motion: CarrierMotion, offsets_s: Mapping[str, float], tell: Progress
 ) -> Pairs:
-    """The pairs with covariances of the targets' poses as their own residuals have them.
+    """The pairs, with covariances of the targets' poses that fit their residuals.
 
-    They stay as they are where the rig file states the noise, where there is no odometry or no target, and where the
-    targets alone have no answer.
+    The pairs are unchanged if the rig file states the noise, if there is no odometry or no target, or if a calibration
+    with the targets alone fails.
     """
     targets = {pair: one for pair, one in pairs.items() if not pair.is_motion and one.used.any()}
     if rig.noise != "estimate" or not targets or not any(pair.is_motion for pair in pairs):
@@ -51,7 +51,7 @@ def with_comparable_noise(
 
 
 def _with_noise(measured: MeasuredPairs, noise: PairNoise) -> MeasuredPairs:
-    """Covariances of the same shape whose median is that of the noise; of none, equal ones about and along all axes."""
+    """Scale the covariances so that their median is `noise`; without any, all are that of `noise`, equal in all axes."""
     variances = np.array([noise.rotation_rad**2] * 3 + [noise.translation_m**2] * 3)
     if measured.covariance is None:
         covariance: Array = np.tile(np.diag(variances), (len(measured.B), 1, 1))

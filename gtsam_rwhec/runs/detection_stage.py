@@ -28,9 +28,9 @@ from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_de
 
 
 def check_image_options(log: Log, rig: Rig | None, *, images: Images, workers: int | None) -> None:
-    """Raise `OptionError` for workers that would search no image, or for images to copy from a log that has none.
+    """Raise `OptionError` for `workers` without images to search, and for images to copy from a log without any.
 
-    `rig` is the rig file that detection will work with; None if the detections are already in the log.
+    `rig` is the rig file for detection; None if the log already has detections.
     """
     path = log.files[0].path
     if workers is not None and rig is None:
@@ -115,7 +115,7 @@ def detected(
 ) -> RunLog:
     """The log with the detections, as `detect_log` writes it.
 
-    `keep` gives the file of the detections so far, for the cameras, before anything is written.
+    `keep` is called with the cameras before anything is written. It returns the file that keeps the detections so far.
     """
     tell = progress or silent
     check_topics(log, rig)
@@ -172,8 +172,8 @@ def detect_source(
     """As `detect_log`, for a log or for a folder of images, with a contact sheet beside the written log.
 
     `source` may also be a folder of images, for a rig file with poses in files (``frames``), whose paths then start
-    from this folder. The sheet (`sheet_beside`) is written where images are, also if no target was detected. Raises as
-    `detect_log` and `write_folder_log` do.
+    from this folder. The sheet (`sheet_beside`) is written if there are images, also if no target was detected. Raises
+    as `detect_log` and `write_folder_log` do.
     """
     sheet = sheet_beside(out_path)
     check_writable(out_path)

@@ -1,4 +1,4 @@
-"""Stated intrinsics that the corners of a log's boards contradict: named before a size, an arm or a clock is blamed."""
+"""Find stated intrinsics that the corners of boards contradict, before a size, an arm or a clock is blamed."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import seen_corners
 
-#: Fitted numbers over the stated ones are a half or two within this share: of an image of another resolution.
+#: If the ratios of fitted to stated numbers are all 0.5 or all 2 within this share, the stated ones are of another
+#: resolution.
 RESOLUTION_SHARE = 0.1
 
 
 def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> dict[str, IntrinsicsEvidence]:
-    """What the corners of the detections in a log say against the intrinsics of its sensors, by sensor.
+    """Evidence of a log's corners against stated intrinsics, by sensor, for those that the corners contradict.
 
     Sensors that state no intrinsics, and those whose targets have few corners (single tags), are not judged.
     """
@@ -39,7 +40,7 @@ def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> dic
 
 
 def finding_against(sensor: str, found: IntrinsicsEvidence, rig: Rig, estimated: Camera | None = None) -> Finding:
-    """The finding about stated intrinsics that the corners contradict; `estimated` ones are used in their place."""
+    """The finding that corners contradict the stated intrinsics. `estimated` are those used in their place, if any."""
 
     def numbers(camera: Camera) -> str:
         K = np.rint(camera.K).astype(int)
@@ -63,7 +64,7 @@ def finding_against(sensor: str, found: IntrinsicsEvidence, rig: Rig, estimated:
 
 
 def _of_another_resolution(stated: Camera, right: Camera) -> str:
-    """Words for intrinsics that are those of images of half or double the size."""
+    """A clause of the message if the stated intrinsics are of images of half or double the resolution; else empty."""
     at = ([0, 1, 0, 1], [0, 1, 2, 2])
     ratio = right.K[at] / stated.K[at]
     for times, words in ((2.0, "half"), (0.5, "double")):

@@ -1,4 +1,4 @@
-"""Boards whose tags are not where the rig file has them, or of which a part is never seen, by the corners of a log."""
+"""Find boards whose tags are not where the rig file has them, or of which a part is never seen."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gtsam_rwhec.runs.run_log import seen_corners
 
 
 def doubted_shapes(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[Finding, ...]:
-    """What the corners of the detections in a log say against the shape of the rig file's boards of tags."""
+    """Findings where the corners in a log contradict the shape of a board of tags in the rig file."""
     boards = {
         target.name: target for target in rig.target_list if isinstance(target, Bundle | AprilGrid | TagGrid | Charuco)
     }
@@ -43,7 +43,7 @@ def doubted_shapes(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[F
 def continued_boards(strangers: Mapping[str, int], rig: Rig) -> tuple[Finding, ...]:
     """ChArUco boards whose ids go on in tags that the rig file does not name: the printed board may have more rows.
 
-    `strangers` has how often each was seen, by its family and id ("aruco_5x5_100 14").
+    `strangers` has how often each such tag was seen, by family and id ("aruco_5x5_100 14").
     """
     findings = []
     for board in rig.target_list:
@@ -68,7 +68,7 @@ def continued_boards(strangers: Mapping[str, int], rig: Rig) -> tuple[Finding, .
 
 
 def hypotheses_of(board: Target) -> dict[Key, Array]:
-    """How corners (n, 3) move with each number of a hypothesis: arrays (n, 3, q), in metres, radians and shares.
+    """Derivatives (n, 3, q) of a board's corners (n, 3) by each hypothesis' q numbers (metres, radians, shares).
 
     A hypothesis is the "gap" of a grid, or "place", "turn" or "size" of a bundle's tag, with the tag's number.
     """
@@ -121,7 +121,7 @@ def _of_board(board: Target, sensor: str, camera: Camera, views: Sequence[BoardV
 
 
 def _off(board: Target, found: ShapeEvidence) -> str:
-    """What is off, and by how much, as seen."""
+    """The message about what is wrong with the board, and by how much."""
     what, k = found.key
     value, sigma = float(found.theta[0]), float(found.sigma[0])
     if isinstance(board, TagGrid):

@@ -1,4 +1,4 @@
-"""Pictures of a run's images: a contact sheet of some, with what was found, rejected or not seen; and each drawn."""
+"""A contact sheet of some images of a run, and a picture of each image, with what was found and rejected."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST, LEAST = 60, 4
 LARGE = 4
 #: Small pictures are decoded by this many threads.
 THREADS = 2
-#: The file is a third smaller by this than by OpenCV's own choice, which looks for runs of equal bytes only.
+#: With these the file is a third smaller than with OpenCV's defaults, which look for runs of equal bytes only.
 COMPRESSED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
 #: Reasons are counted in a sensor's header up to this number.
 MOST_REASONS = 4
@@ -40,8 +40,8 @@ def write_contact_sheet(
 ) -> bool:
     """Write the sheet of all sensors with images as a PNG file; return whether there is one.
 
-    Rejected images, those that nothing was seen in, those that could not be used and those with a target are all there,
-    the rejected and failed ones first, each kind spread over time. Only what is shown is read and decoded.
+    The sheet has images of all kinds: rejected, failed, without a detection, and with a target. Rejected and failed
+    images are chosen first; those of each kind are spread over time. Only the images shown are read and decoded.
     """
     sensors = [sensor for sensor, of_sensor in found.items() if of_sensor.images]
     if not sensors:
@@ -86,10 +86,10 @@ def outcome_of(records: Sequence[DetectionRecord], fault: str) -> tuple[Outcome,
 
 
 def sample(outcomes: Mapping[int, tuple[Outcome, str]], most: int) -> list[int]:
-    """Stamps of at most so many images, in order of time.
+    """Choose at most `most` images; return their stamps in order of time.
 
-    Up to half of them were rejected or failed, each reason in turn; of the others, up to half show nothing. Whatever is
-    left is for the kinds that have more.
+    Up to half are rejected or failed images, the reasons in turn. Of the rest, up to half are images without a
+    detection. If a kind has fewer, other kinds fill its places.
     """
     of_kind: dict[tuple[Outcome, str], list[int]] = defaultdict(list)
     for stamp, (outcome, words) in sorted(outcomes.items()):
@@ -108,7 +108,7 @@ def sample(outcomes: Mapping[int, tuple[Outcome, str]], most: int) -> list[int]:
 
 
 def _in_turn(counts: list[int], most: int) -> list[int]:
-    """How many of each kind, one of each in turn until there are `most`."""
+    """How many to take of each kind: one of each in turn, until there are `most`."""
     given = [0] * len(counts)
     while sum(given) < min(most, sum(counts)):
         for i, count in enumerate(counts):
@@ -118,7 +118,7 @@ def _in_turn(counts: list[int], most: int) -> list[int]:
 
 
 def _spread(members: Sequence[int], count: int) -> list[int]:
-    """So many of the members, spread evenly; the first and the last are among them."""
+    """Choose `count` members, spread evenly, with the first and the last."""
     if count == 1:
         return [members[len(members) // 2]]
     return [members[i] for i in np.linspace(0, len(members) - 1, count).round().astype(int).tolist()] if count else []
@@ -134,7 +134,7 @@ def _by_stamp(records: Sequence[DetectionRecord]) -> dict[int, list[DetectionRec
 def _small_pictures(
     log: Log, topic: str, logged_ns: Mapping[int, int], outlines: Mapping[int, tuple[Outline, ...]]
 ) -> dict[int, tuple[Gray, Detail | None]]:
-    """Small pictures by stamp, with the first target larger where it is small; what cannot be decoded is missing."""
+    """Small pictures by stamp, with a larger detail of a small first target. Undecodable images are missing."""
     images = [
         record
         for record in log.records_logged_at([topic], logged_ns.values())
@@ -203,9 +203,9 @@ def draw_images(
     folder: str | Path,
     tell: Progress,
 ) -> int:
-    """Draw the detections in every image that can be decoded, without any too; return how many pictures there are.
+    """Draw every image that can be decoded, with its detections if it has any; return the number of pictures.
 
-    They are ``<sensor>_<name>.png``, where the name is that of the image's file, or its stamp.
+    Files are ``<sensor>_<name>.png``, where the name is that of the image's file, or its stamp.
     """
     check_drawable(rig, folder)
     folder = made_folder(folder)

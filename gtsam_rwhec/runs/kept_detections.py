@@ -1,8 +1,8 @@
-"""What was detected so far, on disk: an interrupted run goes on from there.
+"""The detections so far, on disk, from which an interrupted run goes on.
 
 The file has one line for each batch of images, appended when the batch is done: a checksum and JSON. The first line has
-the inputs that the detections depend on, the last one says that no image is missing. A line that a killed run left torn
-has no right checksum: it is dropped, and its images are detected again. Arrays keep every bit.
+the inputs that the detections depend on, the last one says that no image is missing. A killed run may leave an
+incomplete line. Its checksum is wrong, so it is dropped, and its images are searched again. Arrays keep every bit.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def inputs_of(log: Log, rig: Rig, cameras: Mapping[str, Camera], folder: Path | 
 
 
 def differences(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """In words: what was other before, and what it is now; empty if nothing is."""
+    """A message with the inputs that changed, their values before and now; empty if none changed."""
     other = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     said = [_difference(name, before.get(name), now.get(name)) for name in other[:MOST_SAID]]
     if len(other) > MOST_SAID:
@@ -104,7 +104,7 @@ _DTYPES = ("<f8", "<f4", "<i8", "<i4")
 
 
 class KeptDetections:
-    """The detections that a file keeps, and to which others are added; the file is made with the first batch."""
+    """A file of detections to which batches are appended. The file is made with the first batch."""
 
     def __init__(self, path: Path, inputs: Mapping[str, str], total: int) -> None:
         self.path = path
@@ -121,7 +121,7 @@ class KeptDetections:
         return sum(count for _, _, count in self._places.values())
 
     def go_on(self) -> None:
-        """Find what the file keeps; what is behind its last whole line is cut off."""
+        """Find which batches the file has; cut off an incomplete last line."""
         with self.path.open("r+b") as stream:
             end = len(stream.readline())
             while line := stream.readline():
@@ -136,7 +136,7 @@ class KeptDetections:
             stream.truncate(end)
 
     def known(self, number: int, batch: Sequence[ImageRecord]) -> list[DetectedImage] | None:
-        """What was found in the batch of this number; None if it is not kept, or is of other images."""
+        """The detections of the batch with this number; None if the file lacks it, or its images differ."""
         if number not in self._places:
             return None
         found = self._read(number)
@@ -154,7 +154,7 @@ class KeptDetections:
         self._places[number] = *place, len(found)
 
     def finish(self) -> None:
-        """Say that no image is missing."""
+        """Write the last line, which says that no image is missing."""
         if self.done and not self.is_whole:
             self._append({"whole": self.done})
             self.is_whole = True
@@ -208,7 +208,7 @@ def _line(content: Mapping[str, Any]) -> bytes:
 
 
 def _content(line: bytes) -> dict[str, Any] | None:
-    """The content of a line; None if it is torn."""
+    """The content of a line; None if the line is incomplete."""
     sum_, _, text = line.removesuffix(b"\n").partition(b" ")
     if not line.endswith(b"\n") or sum_ != b"%08x" % zlib.crc32(text):
         return None
@@ -236,7 +236,7 @@ def _plain(value: Any) -> Any:
 
 
 def _object(plain: Any) -> Any:
-    """The object that `_plain` made this of."""
+    """Reverse `_plain`."""
     if isinstance(plain, list):
         return [_object(each) for each in plain]
     if not isinstance(plain, dict):

@@ -69,9 +69,9 @@ class LogCorners:
     def in_problem(
         self, problem: Problem, pairs: Mapping[Pair, MeasuredPairs], cameras: Mapping[str, Camera]
     ) -> Problem:
-        """The problem of the used measurements with their corners, of sensors with intrinsics.
+        """The problem with corners added to the used measurements of sensors with intrinsics.
 
-        Raises CameraError where a corner is outside its image, as a driver's may be.
+        Raises CameraError if a corner is outside its image, as those of a driver may be.
         """
         every = {pair: problem.measurements(*pair) for pair in problem.pairs}
         boards, sensors = {}, {}
@@ -99,7 +99,7 @@ class LogCorners:
         motion: CarrierMotion,
         offsets_s: Mapping[str, float],
     ) -> Observations | None:
-        """The used measurements with corners, with A at time offsets in seconds; None where there is none."""
+        """The used measurements that have corners, with A at `offsets_s`; None if there are none."""
         views: dict[tuple[str, str], tuple[Array, Array, Array | None]] = {}
         for pair, measured in pairs.items():
             seen, pixels = self.seen(measured)
@@ -111,14 +111,14 @@ class LogCorners:
     def of_views(
         self, views: Mapping[tuple[str, str], tuple[Array, Array, Array | None]], cameras: Mapping[str, Camera]
     ) -> Observations:
-        """Views as `Observations.of` takes them, with the targets' corners."""
+        """Observations of some views (as `Observations.of` takes them), with the cameras and the targets' corners."""
         return Observations.of(
             {sensor: cameras[sensor] for _, sensor in views}, {name: self.targets[name] for name, _ in views}, views
         )
 
 
 def read_corners(path: str | Path) -> Observations:
-    """The corners of the measurements that are used, of every sensor whose intrinsics and corners the log has.
+    """Read the corners of the used measurements, for every sensor with intrinsics and corners in the log.
 
     Parameters
     ----------
