@@ -51,7 +51,7 @@ def with_comparable_noise(
 
 
 def _with_noise(measured: MeasuredPairs, noise: PairNoise) -> MeasuredPairs:
-    """Scale the covariances so that their median is `noise`; without any, all are that of `noise`, equal in all axes."""
+    """Scale the covariances so that their median is `noise`; without any, use `noise` for all measurements."""
     variances = np.array([noise.rotation_rad**2] * 3 + [noise.translation_m**2] * 3)
     if measured.covariance is None:
         covariance: Array = np.tile(np.diag(variances), (len(measured.B), 1, 1))
