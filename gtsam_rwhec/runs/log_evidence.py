@@ -1,4 +1,4 @@
-"""What the report of a log shows beside the result: frames, corners and images that were seen, inputs; and the page."""
+"""What the report of a log shows beside the result (frames, corners, images, inputs), and the page itself."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ from gtsam_rwhec.runs.run_log import (
 )
 from gtsam_rwhec.runs.solving_stage import Calibrated, Solved
 
-#: Of intrinsics that were estimated before detection, and that no refinement from corners made better.
+#: The origin of intrinsics that were estimated before detection and not refined from corners.
 BOARDS_ALONE = "estimated from views of boards alone, before the poses; standard deviations are not known"
 
 
 def frames_of(solved: Solved) -> RigFrames:
-    """The calibrated frames; a sensor has the name of its frame, and estimated intrinsics if there are any."""
+    """The calibrated frames, with each sensor's frame name, and its estimated intrinsics if there are any."""
     rig, refined = solved.rig, solved.refined
     missing = [name for name in (*rig.calibrated, *rig.targets) if name not in refined.X and name not in refined.Y]
     frame = {name: rig.frame_of(name) for name in refined.Y}
@@ -104,12 +104,12 @@ def frames_of(solved: Solved) -> RigFrames:
 
 
 def origins_before_corners(rig: Rig, sensors: Iterable[str]) -> dict[str, str]:
-    """Where the intrinsics of sensors are from that state none, as detection used them; the others' are as stated."""
+    """The origin of intrinsics that detection estimated, by sensor; sensors with stated intrinsics are missing."""
     return {name: BOARDS_ALONE for name in sensors if rig.sensors[name].stated == "unknown"}
 
 
 def warnings_of(solved: Solved) -> tuple[str, ...]:
-    """Why the frames, or some of them, are not to be used; empty where they are."""
+    """Why some or all frames are not to be used; empty if all may be used."""
     if solved.judgement.verdict is Verdict.USE:
         return ()
     free = sorted({name for each in solved.refined.free_directions for name in each.frames}, key=natural_key)
@@ -117,7 +117,7 @@ def warnings_of(solved: Solved) -> tuple[str, ...]:
 
 
 def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
-    """The corners of detections that are used, or that robust estimation left out, with where the calibration has them.
+    """Corners of detections that are used or left out by robust estimation, with the calibration's predictions.
 
     By camera; those that were left out are marked as not used.
     """
@@ -159,9 +159,9 @@ def camera_of(solved: Solved, sensor: str) -> Camera:
     return solved.cameras[sensor] if found is None else found.camera
 
 
-#: A contact sheet of the page is so wide, pixels; it, and each picture of an image, has at most so many bytes.
+#: Width in pixels of the page's contact sheet, and the most bytes of the sheet and of each picture of an image.
 SHEET_WIDTH, SHEET_BYTES, PICTURE_BYTES = 1200, 500_000, 90_000
-#: Where images are not found by their stamps, logs up to this size are gone through for them, bytes.
+#: Bytes. If images are not found by their stamps, a log of at most this size is read through for them.
 MOST_SEARCHED = 300_000_000
 WITHOUT = "the report was made without images."
 #: The stages that remove measurements.
@@ -173,7 +173,7 @@ _BY_DETECTION = {str(reason) for reason in Rejection}
 class Pictures:
     """Where images are: the log with them, and the contact sheet's file, which may be missing.
 
-    With `may_show` False only the images' names are read.
+    If `may_show` is False, only the images' names are read.
     """
 
     log: Log
@@ -182,7 +182,7 @@ class Pictures:
 
 
 def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvidence:
-    """What was seen, of a cleaned log; without `pictures` there are neither images nor their names."""
+    """The evidence of what a cleaned log's sensors saw; without `pictures` it has neither images nor their names."""
     views = seen_views(solved, log)
     found = solved.refined.reprojection
     cameras = {sensor: camera_of(solved, sensor) for sensor in views}
@@ -219,7 +219,7 @@ def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvid
 
 
 def stage_of(reason: str) -> str:
-    """The stage that removes measurements for a reason."""
+    """The stage that removes measurements for this reason."""
     if reason in _BY_DETECTION:
         return DETECTION
     return ROBUST if reason == RemovalReason.OUTLIER else CLEANING
@@ -244,7 +244,7 @@ def images_of(
         return {}, {}, "the recorded log is not known any more."
     names = image_names(pictures.log)
     try:
-        # What is damaged in the log was said when it was read for its detections.
+        # The warnings about damaged parts of the log were given when its detections were read.
         with warnings.catch_warnings(action="ignore", category=LogWarning):
             found, why_not = _wanted_images(pictures.log, rig, wanted) if pictures.may_show else ({}, WITHOUT)
     except LogError as error:
@@ -269,7 +269,7 @@ def _wanted_images(log: Log, rig: Rig, wanted: Sequence[RatedView]) -> tuple[dic
 
 
 def _found(log: Log, stamps: Mapping[str, set[int]]) -> dict[tuple[str, int], ImageRecord]:
-    """Images by topic and stamp: where they were logged at their stamps, else by going through a log that is small."""
+    """Images by topic and stamp, found at log times equal to their stamps; else a small log is read through."""
     found: dict[tuple[str, int], ImageRecord] = {}
     if not stamps:
         return found
@@ -306,7 +306,7 @@ def _sheet(pictures: Pictures | None) -> bytes | None:
 
 
 def small_sheet(path: Path) -> bytes | None:
-    """The contact sheet for a page, as JPEG; None where there is no sheet."""
+    """The contact sheet for a page, as JPEG; None if there is no sheet."""
     if not path.is_file():
         return None
     sheet = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -373,7 +373,8 @@ def write_report(
 ) -> None:
     """Write ``evidence.json`` and ``report.html`` of a calibration from a log, whose ``result.json`` is `result`.
 
-    Page and evidence have images if `pictures` may be shown. Raises `FileFormatError` if a file cannot be written.
+    The page and the evidence have images if `pictures` may be shown. Raises `FileFormatError` if a file cannot be
+    written.
     """
     (progress or silent)("writing the report")
     evidence = evidence_of_log(calibrated, log, sources, pictures)
@@ -384,7 +385,7 @@ def write_report(
 
 
 def by_estimated_intrinsics(solved: Solved, log: Log) -> Solved:
-    """The same with poses of targets by the estimated intrinsics, if there are any; the log has those by the stated."""
+    """The same, with targets' poses computed again by the estimated intrinsics, if there are any."""
     refined = solved.refined
     if refined.reprojection is None:
         return solved
@@ -398,7 +399,7 @@ def by_estimated_intrinsics(solved: Solved, log: Log) -> Solved:
 
 
 def _command(sources: Sequence[Path]) -> str:
-    """The command that makes the calibration again, with the rig file of this record as rig.yaml."""
+    """The command that repeats the calibration, with the rig file of this record as rig.yaml."""
     if not sources:
         return ""
     source = sources[0] if len(sources) == 1 else Path(commonpath([path.parent for path in sources]))

@@ -1,4 +1,4 @@
-"""What is found against a log beside what ``calibrate`` finds, and the lines of the rig file to change."""
+"""Findings about a log besides those of ``calibrate``, and the lines of the rig file to change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.rig import Rig
 
-#: A point that is known to this share of its distance only (with 95 %) is known to nothing.
+#: A point whose 95 % radius exceeds this share of its distance counts as unknown.
 LARGEST_SHARE = 0.25
 #: What to do about it.
 OTHER_ANGLES = (
@@ -24,10 +24,10 @@ OTHER_ANGLES = (
 
 
 def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading, ...]:
-    """The misreadings with the cure for a log: the line of the rig file to change, or the messages that are wrong.
+    """The misreadings with what to do for a log: which line of the rig file to change, or which messages are wrong.
 
-    Carriers that are exchanged in the rig file make A the inverse of what it says. For one target in one sensor that is
-    the same as B inverted, so this is not said beside it.
+    If the rig file exchanges the carriers, A is the inverse of what the rig file says. For one target and one sensor
+    this is the same as B inverted, so only one of the two is reported.
     """
     exchanged = [one for one in misreadings if _is_exchange(one, rig)]
     said = [replace(one, likely=_exchange(rig), cure=_unless_carried(rig)) for one in exchanged[:1]]
@@ -40,7 +40,7 @@ def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading
 
 
 def _is_exchange(misreading: Misreading, rig: Rig) -> bool:
-    """Whether exchanged carriers explain it. What this library detects in images is never inverted."""
+    """Whether exchanged carriers explain the misreading. Poses that this library detects are never inverted."""
     if misreading.mistake is Mistake.INVERTED and misreading.inverts_A:
         return True
     from_images = all(sensor.images is not None for sensor in rig.sensors.values())
@@ -58,7 +58,7 @@ def _other_angles(rig: Rig) -> str:
 
 
 def _unless_carried(rig: Rig) -> str:
-    """The other cure, where the carriers are as the rig file says, and their poses are the inverse of what it says."""
+    """The other cure: the carriers are as the rig file says, but their poses are the inverse of what it says."""
     carriers, place = rig.carriers, rig.source.place
     parent, child = carriers.poses.parent_and_child
     if carriers.poses.frames is not None:
@@ -73,7 +73,7 @@ def _unless_carried(rig: Rig) -> str:
 
 
 def may_be_exchanged(rig: Rig, measurements: int) -> Finding:
-    """So few measurements that exchanged carriers, or another reading of the poses, would not show."""
+    """The finding for too few measurements to notice exchanged carriers or misread poses."""
     place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
     return Finding(
         Ground.NO_COVARIANCE,
@@ -106,7 +106,7 @@ def _cure(misreading: Misreading, rig: Rig) -> str:
 
 
 def _cure_of_files(mistake: Mistake, rig: Rig) -> str:
-    """The cure where the carriers' poses are in files beside images; empty where it is the same as for a log."""
+    """The cure if the carriers' poses are in files beside images; empty if it is the same as for a log."""
     poses, key = rig.carriers.poses, rig.source.place(("carriers", "poses"))
     if mistake is Mistake.QUATERNION_ORDER:
         other = "xyzw" if poses.quaternion == "wxyz" else "wxyz"
@@ -121,10 +121,10 @@ def _cure_of_files(mistake: Mistake, rig: Rig) -> str:
 
 
 def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig, *, with_intrinsics: bool) -> list[Finding]:
-    """Stated sizes that were to be checked, that the motion contradicts, and that were estimated in their place.
+    """Findings about stated sizes that the motion contradicts, and that were estimated instead (``sizes: check``).
 
-    Where another stated size fits the motion, the carriers' unit and the focal lengths are right, and the poses rest
-    on it. Where none does, any of the three may be wrong; the focal lengths only where they were not estimated too.
+    If another stated size fits the motion, the carriers' unit and the focal lengths are right. If none fits, the sizes,
+    the unit or the focal lengths may be wrong; the focal lengths only if they were not estimated too.
     """
     if rig.sizes != "check":
         return []
@@ -146,9 +146,9 @@ def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig, *, with_intrinsics: b
 
 
 def known_to_nothing(points: Iterable[PointUncertainty], rig: Rig) -> list[Finding]:
-    """Points that are known no better than by a part of their distance: what was stated does not fit together.
+    """Findings about points whose uncertainty is a large share of their distance: stated values are wrong.
 
-    Noise that is as large as this is no camera's. Wrong intrinsics of all cameras look like it.
+    No camera has so much noise. A possible cause is that the intrinsics of all cameras are wrong.
     """
     findings = []
     for point in points:

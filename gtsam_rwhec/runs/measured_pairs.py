@@ -27,7 +27,7 @@ BEFORE_ESTIMATE = {"sigma": 0.005, "kappa": 1.0 / (2.0 * np.radians(0.5) ** 2)}
 class MeasuredPairs(Track):
     """A track with the carriers' pose at each stamp: A (N, 4, 4), T_sensorcarrier_targetcarrier, metres.
 
-    Of a sensor with odometry, whose name is also the target's, A and B are motions over windows that end at the stamps.
+    For a sensor with odometry, A and B are motions over windows that end at the stamps; `target` is the sensor's name.
     """
 
     A: Array
@@ -43,7 +43,7 @@ Pairs = dict[Pair, MeasuredPairs]
 
 
 def without_marks(pairs: Mapping[Pair, MeasuredPairs], reasons: Collection[str]) -> Pairs:
-    """The pairs with the measurements that these reasons removed."""
+    """The pairs, in which measurements that were removed for these reasons count as used again."""
     return {
         pair: replace(measured, reasons=tuple("" if why in reasons else why for why in measured.reasons))
         for pair, measured in pairs.items()
@@ -53,7 +53,7 @@ def without_marks(pairs: Mapping[Pair, MeasuredPairs], reasons: Collection[str])
 def at_offsets(
     pairs: Mapping[Pair, MeasuredPairs], path: Trajectory, offsets_s: Mapping[str, float], sensors: Collection[str]
 ) -> Pairs:
-    """The pairs with A along a path at the time offsets of some sensors; the others stay as they are."""
+    """The pairs with A taken from a path at the time offsets of some sensors; pairs of other sensors do not change."""
     return {
         pair: measured.at(path, offsets_s[pair.sensor]) if pair.sensor in sensors else measured
         for pair, measured in pairs.items()
@@ -112,7 +112,7 @@ def _stacked(pair: Pair, records: list[PairRecord]) -> MeasuredPairs:
 
 
 def poses_used(pairs: Iterable[MeasuredPairs]) -> dict[str, int]:
-    """At how many poses of the carriers, which are stamps, each sensor and each target is used."""
+    """The number of carrier poses (different stamps) at which each sensor and each target is used."""
     stamps: dict[str, set[int]] = defaultdict(set)
     for measured in pairs:
         used = measured.stamps_ns[measured.used].tolist()
@@ -126,9 +126,9 @@ def problem_of(
 ) -> Problem:
     """The problem that the used pairs state, with stamps on the carriers' clock.
 
-    `rig` states the noise, `offsets_s` the time offset of each sensor at which A was taken, seconds; sizes of the
-    targets `free_sizes` are estimated. Raises `NoiseError` if the rig file says ``noise: {corner_px: ...}`` and a
-    measurement has no covariance, or a covariance is not positive definite.
+    `rig` states the noise. `offsets_s` has the time offset of each sensor at which A was taken, seconds. The sizes of
+    the targets in `free_sizes` are estimated. Raises `NoiseError` if the rig file says ``noise: {corner_px: ...}`` and
+    a measurement has no covariance, or a covariance is not positive definite.
     """
     free = {*free_sizes, *(name for name, one in rig.odometries.items() if one.odometry.scale == "estimate")}
     problem = Problem("per_target" if free else "known")

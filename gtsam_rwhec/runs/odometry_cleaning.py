@@ -1,8 +1,8 @@
 """Cleaning of odometries: steps that are too fast, jumps of tracking, and gaps are not used, with the reason.
 
-The DQ paper (Appendix D.1) limits the step between two frames, 0.10 m and 11.5 degrees, which has its frame rate in it.
-Here the limits are speeds; and a step must be like those before and after it: a jump of tracking is one step that its
-neighbours do not lead to.
+The DQ paper (Appendix D.1) limits the step between two frames to 0.10 m and 11.5 degrees, which depends on its frame
+rate. Here the limits are speeds. A step must also be like the steps before and after it: a step that is not is a jump
+of tracking.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
 
-#: A step whose velocity is so many robust deviations away from the mean of its neighbours' is a jump.
+#: A step is a jump if its velocity differs from the mean of its neighbours' by this many robust standard deviations.
 JUMP = 12.0
 #: A jump is larger than this, whatever the deviation: rad/s and m/s.
 LEAST_RAD_PER_S, LEAST_M_PER_S = 0.2, 0.5
@@ -29,7 +29,7 @@ LEAST_RAD_PER_S, LEAST_M_PER_S = 0.2, 0.5
 
 @dataclass(frozen=True)
 class Gates:
-    """Steps of a track that are faster than this (m/s, rad/s) are not used, nor jumps, where `reject_jumps` says so."""
+    """Limits of a track's speed (m/s, rad/s): faster steps are not used, and, with `reject_jumps`, nor are jumps."""
 
     max_speed_m_per_s: float
     max_turn_rad_per_s: float
@@ -48,10 +48,10 @@ def gates_of(rig: Rig) -> Gates:
 
 @dataclass(frozen=True)
 class Gated:
-    """The steps (N - 1,) of a track that are good, why the others are not, and the track with these made smooth.
+    """Which steps (N - 1,) of a track are good, why the others are not, and the track with the bad steps replaced.
 
-    Poses after a step that is not good go on as if it had been like its neighbours, so that what is interpolated or
-    compared nearby is not torn. Motions over such a step are not used.
+    A bad step is replaced by one like its neighbours, and all later poses move with it. So the track has no jump that
+    would spoil interpolation and comparisons nearby. Motions over a bad step are not used.
     """
 
     good: np.ndarray
@@ -60,7 +60,7 @@ class Gated:
 
 
 def gated(track: OdometryTrack, gates: Gates) -> Gated:
-    """Speeds within the limits, and no jumps."""
+    """Find the steps with speeds within the limits, and without jumps."""
     stamps, T = np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor)
     dt = np.diff(stamps) * 1e-9
     velocity = se3.logmap(se3.inverse(T[:-1]) @ T[1:]) / dt[:, None]
@@ -80,7 +80,8 @@ def gated(track: OdometryTrack, gates: Gates) -> Gated:
             off = _off_neighbours(part)
             limit = max(least, JUMP * float(np.median(off)) / 0.6745)
             worst = off > limit
-            # The neighbours of a jump are off by half of it: of steps in a row only the largest is one.
+            # Steps beside a jump differ from their neighbours by half of it. So of several steps in a row only the
+            # largest counts.
             peak = worst & (off >= np.r_[0.0, off[:-1]]) & (off >= np.r_[off[1:], 0.0])
             values = np.where(peak, off * np.r_[dt], 0.0)
             _add(removed, reason, values, limit * float(np.median(dt)), stamps)
@@ -90,7 +91,7 @@ def gated(track: OdometryTrack, gates: Gates) -> Gated:
 
 
 def _smoothed(track: OdometryTrack, velocity: Array, dt: Array, good: np.ndarray) -> OdometryTrack:
-    """Each bad step replaced by one with the mean velocity of the good steps about it."""
+    """Replace each bad step by one with the mean velocity of the nearest good steps before and after it."""
     bad = np.flatnonzero(~good)
     known = np.flatnonzero(good)
     if not len(bad) or not len(known):
@@ -101,7 +102,7 @@ def _smoothed(track: OdometryTrack, velocity: Array, dt: Array, good: np.ndarray
     steps = se3.expmap(0.5 * (velocity[after] + velocity[before]) * dt[bad, None])
     repaired, moved = T.copy(), np.eye(4)
     for i, step, end in zip(bad, steps, np.r_[bad[1:], len(T) - 1], strict=True):
-        # What was at T[i + 1] is at the repaired pose i, one step on; all poses up to the next bad step move with it.
+        # Pose i + 1 becomes repaired pose i and one step; all poses up to the next bad step move with it.
         moved = repaired[i] @ step @ se3.inverse(T[i + 1][None])[0]
         repaired[i + 1 : end + 1] = moved @ T[i + 1 : end + 1]
     return replace(track, T_start_sensor=repaired)
@@ -115,16 +116,16 @@ def _off_neighbours(velocity: Array) -> Array:
 
 
 def _add(removed: dict[int, Removed], reason: RemovalReason, values: Array, limit: float, stamps: np.ndarray) -> None:
-    """The pose at the end of each step whose value is over the limit, if it is not there already."""
+    """Add the pose at the end of each step whose value exceeds the limit; one that is there keeps its first reason."""
     for i in np.flatnonzero(values > limit).tolist():
         removed.setdefault(i + 1, Removed(reason, i + 1, int(stamps[i + 1]), float(values[i]), float(limit)))
 
 
 def odometry_steps(log: Log, rig: Rig, reference: OdometryTrack, sensor: str) -> MeasuredPairs:
-    """The motions of a sensor from each of its poses to the next, with the gates' reasons, beside the reference's.
+    """The motions of a sensor and of the reference between successive poses of the sensor, with reasons for bad steps.
 
-    A and B are the motions T_before_after of the reference and of the sensor; the stamps are those after each step.
-    The answer compares longer windows of them, all sensors at once.
+    A and B are the motions T_before_after of the reference and of the sensor; the stamps are those after each step. The
+    calibration itself compares motions over longer windows, of all sensors together.
     """
     track = reference if sensor == reference.sensor else read_odometry(log, rig, sensor)
     stamps, T = np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor)

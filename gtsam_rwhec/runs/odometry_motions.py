@@ -21,9 +21,9 @@ from gtsam_rwhec.runs.odometry_tracks import read_odometry
 
 #: Seconds. Windows have one of these lengths.
 LENGTHS_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-#: Fewer windows than this make no calibration, whatever each of them tells.
+#: A length of windows is tried only if it gives at least this many of them; the shortest is always tried.
 FEWEST_WINDOWS = 12
-#: No odometry is better than this, after a second: rad and m.
+#: The least noise that is estimated for an odometry, after one second: rad and m.
 QUIETEST = OdometryNoise(1e-6, 1e-6)
 #: A robust standard deviation is this many times the median of the absolute values.
 OF_MEDIAN = 1.4826
@@ -31,7 +31,7 @@ OF_MEDIAN = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class OdometryWindows:
-    """Motions over windows that follow one another."""
+    """Motions over successive windows of time."""
 
     window_s: float
     end_ns: np.ndarray  #: (N,): the ends of the windows, on the sensor's clock
@@ -53,9 +53,9 @@ def odometry_windows(
 ) -> OdometryWindows:
     """Windows of an odometry against the carriers' path (T_sensorcarrier_targetcarrier over time).
 
-    The length is that with the most information on the rotation: the sum over windows of |R - I|_F^2 / T, as the
-    variance of a random walk grows with the window's length T. `offset_s` leads from the sensor's clock to the
-    carriers', `max_gap_s` is that of the carriers' poses.
+    The chosen length has the most information on the rotation: the sum over windows of |R - I|_F^2 / T, since the
+    variance of a random walk grows with the window's length T. `offset_s` is added to the sensor's stamps to get the
+    carriers' stamps. `max_gap_s` limits gaps between the carriers' poses.
     """
     own = Trajectory(np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor), track.sensor)
     step = float(np.median(np.diff(own.stamps_ns))) * 1e-9
@@ -83,7 +83,7 @@ def odometry_windows(
 
 
 def covariances(B: Array, window_s: float, noise: OdometryNoise) -> Array:
-    """Covariances (N, 6, 6) of B after a random walk; its turning moves the end of a straight way by T^2 d / 3."""
+    """Covariances (N, 6, 6) of B as a random walk; rotation variance q adds q |t|^2 / 3 to translation t's axes."""
     rotation, translation = (
         rate**2 * window_s for rate in (noise.rotation_rad_per_sqrt_s, noise.translation_m_per_sqrt_s)
     )
@@ -95,9 +95,9 @@ def covariances(B: Array, window_s: float, noise: OdometryNoise) -> Array:
 
 
 def found_noise(A: Array, B: Array, window_s: float, *, has_unknown_scale: bool) -> OdometryNoise:
-    """The noise by which the invariants of A Y = Y B differ: the angles of both, and their ways along the axis.
+    """Estimate the noise from what must be equal in A Y = Y B: the angles, and the translations along the axis.
 
-    Where nothing turned there is no axis, and the lengths of both ways are compared.
+    If nothing turned there is no axis, and the lengths of the translations are compared.
     """
     if len(A) < 3:
         return OdometryNoise(np.radians(0.1), 0.01)
@@ -126,7 +126,7 @@ def found_noise(A: Array, B: Array, window_s: float, *, has_unknown_scale: bool)
 def _motions(
     own: Trajectory, path: Trajectory, offset_s: float, length_s: float
 ) -> tuple[np.ndarray, np.ndarray, Array, Array]:
-    """Ends of windows (N, 2) on both clocks, A and B; windows in the time that both have."""
+    """Starts and ends of windows (N, 2) on both clocks, A and B; windows lie in the time that both tracks have."""
     shift_ns, length_ns = round(1e9 * offset_s), round(1e9 * length_s)
     first = max(int(own.stamps_ns[0]), int(path.stamps_ns[0]) - shift_ns)
     last = min(int(own.stamps_ns[-1]), int(path.stamps_ns[-1]) - shift_ns)
@@ -147,7 +147,7 @@ def _reasons(
     cleaning: Cleaning,
     max_gap_s: float,
 ) -> tuple[str, ...]:
-    """Why windows are not used: the first of what is wrong."""
+    """Why each window is not used: the first check that it fails; empty if it is used."""
     turned, moved = np.linalg.norm(se3.so3_logmap(A[:, :3, :3]), axis=1), np.linalg.norm(A[:, :3, 3], axis=1)
     none = np.zeros(len(A), dtype=bool)
     still = (turned < np.radians(cleaning.min_rotation_deg)) & (moved < 1e-3 * cleaning.min_translation_mm)
@@ -181,12 +181,12 @@ def _gap(own: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
 
 
 def _unknown(path: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
-    """Windows (N,) at an end of which the carriers' pose is not known."""
+    """Windows (N,) for which the carriers' pose at the start or the end is not known."""
     return np.asarray((path.gaps(edges_ns.reshape(-1)) > max_gap_s).reshape(-1, 2).any(axis=1))
 
 
 def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: np.ndarray) -> np.ndarray:
-    """Windows (N,) that have a part of a wrong step (M - 1,)."""
+    """Windows (N,) that overlap with a wrong step (M - 1,)."""
     count = np.r_[0, np.cumsum(wrong)]
     first = np.clip(np.searchsorted(stamps_ns, edges_ns[:, 0], side="right") - 1, 0, len(wrong))
     last = np.clip(np.searchsorted(stamps_ns, edges_ns[:, 1], side="left"), 0, len(wrong))
@@ -194,14 +194,14 @@ def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: np.ndarray) ->
     return has
 
 
-#: Seconds. Clocks are compared over pieces of this length, within which an odometry has hardly drifted.
+#: Seconds. Clocks are compared over pieces of this length, in which an odometry drifts little.
 PIECE_S = 30.0
-#: With fewer windows a sensor has no answer.
+#: A sensor with fewer used windows than this has no answer.
 FEWEST_USED = 3
 
 
 def odometry_pairs(log: Log, rig: Rig, sensor: str, motion: CarrierMotion) -> tuple[MeasuredPairs, float, float | None]:
-    """The motions of an odometry against the carriers', A Y = Y B; its time offset, and its deviation if estimated.
+    """The motions of an odometry and the carriers (A Y = Y B), the time offset, and its deviation if estimated.
 
     Raises
     ------

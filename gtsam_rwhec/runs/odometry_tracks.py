@@ -1,4 +1,4 @@
-"""Reading odometries: the poses of each sensor that knows only its own motion, from a log or from files."""
+"""Read odometries, from a log or from files: the poses of each sensor that measures only its own motion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FEWEST = 3
 def read_odometry(log: Log, rig: Rig, sensor: str) -> OdometryTrack:
     """The track of a sensor with odometry, on its own clock.
 
-    Raises `LogError` where it has too few poses, or where the line of the rig file names what is not there;
+    Raises `LogError` if it has too few poses, or if the rig file names a topic or file that does not exist;
     `TransformError`, `StampError` as for the carriers' poses.
     """
     source = rig.odometries[sensor].odometry

@@ -25,7 +25,7 @@ class OldCalibration:
 
     @staticmethod
     def read(path: str | Path) -> OldCalibration:
-        """From an output folder, its ``calibration.mcap``, or a result file, beside which the solved log may be.
+        """Read it from an output folder, its ``calibration.mcap``, or a result file (the solved log may be beside it).
 
         Raises
         ------

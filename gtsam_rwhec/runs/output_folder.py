@@ -4,10 +4,10 @@ The folder has a list of the files that were written into it, with a checksum of
 ``demo`` and Python:
 
 - A file that is not on the list, or was changed since, is never replaced.
-- A finished calibration is replaced only on request. An unfinished run is gone on with; one that ended with an error is
-  too, or begun anew where its inputs are other ones: they were mended.
-- Other files beside ours are refused, since the folder may be meant for something else; with a request to replace a
-  calibration that is there, they stay as they are.
+- A finished calibration is replaced only on request. An unfinished run is continued. So is a run that ended with an
+  error; if its inputs were changed, it begins anew.
+- A folder with other files is refused, since it may be meant for something else. If it also has a calibration, and the
+  request is to replace it, the other files do not change.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def made_folder(path: str | Path) -> Path:
 
 
 def made_output_folder(path: str | Path) -> Path:
-    """As `made_folder`, for all files of a calibration: whatever could not be replaced at its end is told before it."""
+    """As `made_folder`, for all files of a calibration; it raises now if one could not be replaced at the end."""
     path = made_folder(path)
     for name in WRITTEN:
         if "/" not in name:
@@ -86,14 +86,14 @@ except ImportError:  # Windows
 LIST_FILE = ".written.json"
 #: The detections so far, in the output folder. It is removed at the end.
 DETECTIONS = "detections.jsonl"
-#: A file that was half written when the run was killed: the name that it would have had.
+#: The temporary name of a file that was half written when the run was killed; the group is the final name.
 _PART = re.compile(r"\.(.+)\.\d+\.(?:part|trial)")
-#: Files that desktops leave in folders that were looked at.
+#: Files that desktop programs leave in folders that they show.
 _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
 #: A message names at most this many files.
 MOST_NAMED = 5
 
-#: "failed" is a run that ended with an error: who mended its inputs need not ask for a new start.
+#: "failed" is a run that ended with an error. After a change of its inputs a new run may start without ``replace``.
 State: TypeAlias = Literal["unfinished", "failed", "finished"]
 
 
@@ -121,7 +121,7 @@ class OutputFolder:
         self._kept: KeptDetections | None = None
 
     def begin(self) -> None:
-        """Say in the folder's list that a run is at work, before its first file is written."""
+        """Write into the folder's list that a run is at work, before its first file is written."""
         if not self._has_begun:
             earlier = self._before
             if earlier is not None and earlier.state != "finished" and earlier.log.endswith(RECORDED_LOG):
@@ -184,7 +184,7 @@ class OutputFolder:
 
 @contextmanager
 def output_folder(path: str | Path, log: str, *, replace: bool, sources: Sequence[Path] = ()) -> Iterator[OutputFolder]:
-    """Calibrate in the block: into a folder that is free for it, whose list is brought up to date at the end.
+    """A context for a calibration into a folder that is free for it; at the end the folder's list is updated.
 
     The folder is made if it does not exist, and removed if an error ends the block before anything was written. `log`
     is the name of what is calibrated, `sources` are its files: one that is in the folder is not foreign. With `replace`
@@ -237,10 +237,10 @@ def list_written(folder: Path, sources: Sequence[str], files: Iterable[Path]) ->
 
 
 def remove_unchanged(folder: Path, inside: Collection[str], keep: Iterable[Path] = ()) -> None:
-    """Remove what a calibration wrote into some folders of a folder, where it is as it was written, but for `keep`.
+    """Remove the unchanged files that a calibration wrote into some subfolders, except `keep`.
 
-    A camera that has another name now has another file, and a picture of what is no more would be taken for one of now.
-    No file of others is removed.
+    Otherwise files of renamed cameras, and old pictures, would be taken for those of this run. Files that no
+    calibration wrote are never removed.
     """
     written = _read_list(folder)
     kept = {file.relative_to(folder).as_posix() for file in keep}
@@ -298,7 +298,7 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
 
 
 def _names_in(folder: Path) -> list[str]:
-    """The names of all that is in a folder, and in its folders of ours."""
+    """The names of all files in a folder, and in those of its subfolders that a calibration writes."""
     names = []
     try:
         for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -312,7 +312,7 @@ def _names_in(folder: Path) -> list[str]:
 
 
 def _is_part(name: str, log: str) -> bool:
-    """Whether a file is what a killed run of ours left half written."""
+    """Whether a file is one that a killed run left half written."""
     folder, _, file = name.rpartition("/")
     part = _PART.fullmatch(file)
     whole = "" if part is None else f"{folder}/{part[1]}".lstrip("/")
@@ -332,7 +332,7 @@ def _is_as_written(path: Path, sha256: str | None) -> bool:
 
 
 def _named_log(log: str) -> str:
-    """A log's name for messages: that of the folder, if it is of one."""
+    """A log's name for messages; that of the folder if the log was made of a folder."""
     return log.removesuffix(RECORDED_LOG)
 
 
@@ -359,7 +359,7 @@ def _sha256(path: Path) -> str:
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold a folder against other runs; the system gives it back when the process ends, however it ends."""
+    """Lock a folder against other runs; the system releases the lock when the process ends, however it ends."""
     if fcntl is None:
         yield
         return

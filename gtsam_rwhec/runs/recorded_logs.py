@@ -43,7 +43,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA, image_key
 from gtsam_rwhec.solver.solution import solve
 
-#: Images that were taken at rest have stamps this far apart, nanoseconds: further than poses are interpolated.
+#: Nanoseconds between the stamps of images that were taken at rest: too far apart for poses to be interpolated.
 APART_NS = 10**9
 #: The first stamp of images that were taken at rest.
 FIRST_NS = 10**9
@@ -135,7 +135,7 @@ def write_folder_log(
 
 
 def _content(file: Path) -> bytes:
-    """The bytes of an image; none of a file that cannot be read, which costs this image and no other."""
+    """The bytes of an image; empty if the file cannot be read, so that only this image is lost."""
     try:
         return read_whole(file, LARGEST_IMAGE, "An image was")
     except FileFormatError as error:
@@ -242,7 +242,8 @@ def is_file_of_samples(path: object, rig: Rig | None) -> bool:
 def samples_problem(path: str | Path) -> SamplesProblem:
     """The problem of a file of samples, without a rig file.
 
-    Whether the camera is on the hand or fixed is what the file says, else what fits: both are solved.
+    The file may say whether the camera is on the hand or fixed. If it does not, both are solved, and the one that fits
+    is taken.
 
     Raises
     ------

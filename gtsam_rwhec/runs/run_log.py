@@ -1,9 +1,9 @@
-"""The log of a run: what the stages agree on, and a log that holds in memory what they found.
+"""The log of a run: names that all stages share, and a log that holds in memory what the stages found.
 
 Detection adds `detections_topic`, `annotations_topic` and `poses_topic` of each sensor, and odometries in files;
 cleaning adds `pairs_topic`; solving replaces the pairs by those of the answer and adds `SOLUTION_TOPIC`. Each stage
-takes a log and gives a `RunLog`, which the next one takes. It becomes a file once, at the end, with all of it; or after
-each stage that is run alone, and the next one reads that file.
+takes a log and returns a `RunLog`, which the next stage takes. A whole run writes it to a file once, at the end. A
+stage that is run alone writes its own file, which the next stage reads.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ CERTIFICATE_METADATA = "gtsam_rwhec.certificate"
 RECORDED_LOG = ".images.mcap"
 #: This metadata has the names of the files that a folder's images were, by topic and stamp (`image_key`).
 IMAGES_METADATA = "gtsam_rwhec.images"
-#: A log of detections on the way to one that is calibrated. It is removed at the end.
+#: The log of detections while a calibration is at work. It is removed at the end.
 DETECTED_LOG = "detected.mcap"
 #: The log of a run in the output folder: what was recorded, detected, cleaned and solved.
 CALIBRATION_LOG = "calibration.mcap"
@@ -134,7 +134,7 @@ def image_name(names: Mapping[str, str], topic: str, stamp_ns: int) -> str:
 
 
 def picture_file(sensor: str, name: str) -> str:
-    """The file name of an image's picture: its sensor and its own name, whatever characters strangers gave them."""
+    """The file name of an image's picture: its sensor and its own name, in characters that file names can have."""
     stem = PurePosixPath(name).stem or name
     return f"{_plain(sensor)}_{_plain(stem)}.png"
 
@@ -145,7 +145,7 @@ def _plain(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class LogMetadata:
-    """What the stages of a log say of themselves."""
+    """What the stages wrote about themselves into a log."""
 
     rig: Rig  #: that the last stage worked with
     cameras: Mapping[str, Camera]  #: the intrinsics that detection used, by sensor
@@ -179,11 +179,11 @@ class LogMetadata:
 
 
 class RunLog(Log):
-    """A log with what the stages found, in memory: it reads as the file that is written of it.
+    """A log with what the stages found, in memory. Reading it gives the same as reading the file written from it.
 
-    `recorded` stays open, and is read for all that no stage of this run found; only its topics `kept` count, not those
-    of a stage that is run again. `found` has what was found by topic, in the order of time, and `detections` the
-    detections by sensor as they are written.
+    `recorded` stays open; everything that no stage of this run found is read from it. Only its topics in `kept` are
+    read: those of a stage that is run again are not. `found` has the new records by topic, in the order of time.
+    `detections` has the detections by sensor as they are written.
     """
 
     def __init__(
@@ -281,9 +281,9 @@ def write_run_log(log: RunLog, path: str | Path, images: Images) -> None:
 
 
 def _as_read(topic: str, records: Sequence[DetectionRecord]) -> list[DetectionRecord]:
-    """Detections as they are read of a file: in the order of time, with poses that went by way of quaternions.
+    """Detections as a file would give them: in the order of time, with poses converted to quaternions and back.
 
-    So a run in one go finds the same, to the last bit, as one stage at a time.
+    So a whole run and single stages give the same results to the last bit.
     """
     posed = [record for record in records if record.T_camera_tag is not None]
     T = np.array([record.T_camera_tag for record in posed]).reshape(-1, 4, 4)
@@ -296,7 +296,7 @@ def _as_read(topic: str, records: Sequence[DetectionRecord]) -> list[DetectionRe
 
 
 def read_metadata(log: Log) -> LogMetadata:
-    """The metadata that the stages so far wrote; `LogError` if there is none, or it is damaged."""
+    """The metadata that the stages wrote so far. Raises `LogError` if there is none, or it is damaged."""
     if isinstance(log, RunLog):
         return log.stages
     rig = read_embedded_rig(log)

@@ -1,6 +1,6 @@
-"""What each sensor detected: in its images, or as its driver says; and the report on the detections of all sensors.
+"""The detections of each sensor, from its images or from its driver, and the report on those of all sensors.
 
-A detection in an image gets the one of its two poses that its whole track supports.
+Each detection in an image has two possible poses. It gets the one that its whole track supports.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ def _counts(sensor: str, records: list[DetectionRecord]) -> Iterator[TrackCount]
         yield TrackCount(target=target, sensor=sensor, used=removed.pop("", 0), removed=dict(removed))
 
 
-#: Images have the size that most of the first so many have.
+#: The size of a sensor's images is the most frequent one among this many first images.
 FOR_SIZE = 20
-#: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
+#: A camera's stamps are checked after these numbers of images, so that wrong stamps are reported early.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
 
 
@@ -173,7 +173,7 @@ def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections], came
 
 
 def of_size(rig: Rig, sensor: str, size: Size | None, camera: Camera) -> str:
-    """What to do where images have another size (width, height) than the intrinsics are for, else empty."""
+    """What to do if the size (width, height) of images differs from that of the intrinsics; empty if it does not."""
     if size is None or size == (camera.width, camera.height):
         return ""
     place = rig.source.place(("sensors", sensor, "intrinsics"))
@@ -339,7 +339,7 @@ def _turned(
     factor: float,
     upright: dict[str, Turns],
 ) -> tuple[list[Detection], Array]:
-    """Detections of a board that looks the same turned, each the same way up in its frame, and how sure that is (n,).
+    """Detections of a board that looks the same when turned, all made the same way up, and how sure that is (n,).
 
     The first sensor's first image says which way is up.
     """
@@ -412,7 +412,7 @@ def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | Non
 
 
 def _as_told(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
-    """The driver's record with the rig file's names and sizes, and corners in our order if poses come from them."""
+    """The driver's record with the rig file's names and sizes; corners in this library's order if poses need them."""
     driver_m = record.size_m
     record = replace(record, id=target.name, family=target.family, size_m=target.length_m)
     if _has_corners(record, camera):

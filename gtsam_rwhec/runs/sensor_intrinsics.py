@@ -1,9 +1,9 @@
 """The intrinsics of each sensor: from the topic, file or numbers that the rig file names, or from its images of boards.
 
-Where none are stated (``intrinsics: estimate``) some of a sensor's images, spread over all of them, are searched with a
-pinhole: what detection tests in a board's plane holds for any focal length. A lens bends boards, and many are rejected
-then; a first camera from those that were read, or from the rejected ones if there are few, reads them in a second look,
-and searches the other images. The same images give the same camera, so an interrupted run goes on.
+For ``intrinsics: estimate``, some of a sensor's images, spread over all of them, are searched with a pinhole camera:
+the tests of detection in a board's plane hold for any focal length. Distortion bends boards, so many are rejected. A
+first camera is estimated from the boards that were read, and, if they are few, from rejected ones too. It searches
+these images again, and the others. The same images give the same camera, so an interrupted run can go on.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def check_intrinsics_files(rig: Rig) -> None:
 
 
 def _stated(rig: Rig, name: str, source: Intrinsics) -> Camera:
-    """A camera of numbers, or of a file: the one that is named, or the only one, or the one of the sensor's name."""
+    """The camera from numbers or from a file: the named one, the only one, or that of the sensor's name."""
     file = source.kalibr or source.file
     if file is None:
         return source.camera_of_numbers(f"rig file, sensor {name}")
@@ -144,17 +144,17 @@ def _numbers(camera: Camera) -> tuple[object, ...]:
 
 #: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
 FIRST, TIMES = 16, 4
-#: From fewer views than this a first camera is made with those too that the lens bends too much for a pinhole.
+#: With fewer views than this, the first camera also uses those that were rejected because distortion bends them.
 FEW = 6
 #: The focal length of a usual lens over the width.
 USUAL = 0.87
-#: These rejections are about poses, which need intrinsics.
+#: These rejections depend on poses, and so on intrinsics.
 ABOUT_POSES = (Rejection.NO_POSE, Rejection.REPROJECTION, Rejection.GRAZING)
 
 
 @dataclass(frozen=True, eq=False)
 class NotEstimated:
-    """A sensor whose images determine no intrinsics: why not, what was searched with, and what was found."""
+    """A sensor whose images determine no intrinsics: why not, the camera for the search, and the detections."""
 
     why: str
     camera: Camera
@@ -189,7 +189,7 @@ def estimate_intrinsics(
 
 
 def in_words(sensor: str, found: EstimatedIntrinsics) -> str:
-    """What was estimated, for a report."""
+    """A sentence for the report about the estimated intrinsics."""
     K, camera = found.camera.K, found.camera
     bent = ", ".join(f"{k:.4g}" for k in camera.D) if camera.D.any() else "none"
     return (
@@ -230,7 +230,7 @@ def refuse_not_estimated(
 def _of_images(
     log: Log, rig: Rig, sensor: str, topic: str, size: Size, lens: Lens, workers: int | None, progress: Progress
 ) -> EstimatedIntrinsics | NotEstimated:
-    """Search some images with a pinhole, and more, while there are too few boards, with what the boards so far say."""
+    """Search some images with a pinhole; while boards are few, search more with a camera from the boards so far."""
     total = message_count(log, topic)
     camera = pinhole = _camera(size)
     found: dict[int, DetectedImage] = {}
@@ -276,7 +276,7 @@ def _of_images(
 
 
 def _roughly(rig: Rig, found: Mapping[int, DetectedImage], size: Size, lens: Lens) -> Camera | None:
-    """A camera from the boards that were read; if they are few, also from those that no pinhole would see so bent."""
+    """A camera from the boards that were read; if they are few, also from those rejected for their distortion."""
     views = _views(rig, found)
     if len(views) < FEW:
         views = _views(rig, found, (*ABOUT_POSES, Rejection.NOT_A_GRID))
@@ -324,7 +324,7 @@ def _flat(target: Target) -> Array | None:
 
 
 def _without_poses(image: DetectedImage) -> DetectedImage:
-    """The image without the rejections that intrinsics would have to be right for."""
+    """The image without the rejections that depend on the intrinsics."""
 
     def plain(seen: Detection) -> Detection:
         return replace(seen, rejection=None) if seen.rejection in ABOUT_POSES else seen

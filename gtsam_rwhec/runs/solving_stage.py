@@ -1,4 +1,4 @@
-"""The third stage: from a cleaned log to its calibration, with what only a log shows of it."""
+"""The third stage: calibrate from a cleaned log, with the findings that only a log allows."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Reasons for which cleaning removes a measurement that does not agree with the carriers' motion.
 OF_THE_MOTION = (RemovalReason.NO_CONSENSUS, RemovalReason.ROTATION_OFF, RemovalReason.TRANSLATION_OFF)
-#: Findings of ``calibrate`` that a log says in its own words, with the lines of its rig file and the images.
+#: Findings of ``calibrate`` that this stage words anew, with the lines of the rig file and the images.
 SAID_BY_THE_LOG = frozenset({
     Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS, Ground.SIZE_DOUBTED, Ground.SIZE_UNCERTAIN, Ground.SIZE_ESTIMATED,
     Ground.NO_SIZE_FITS, Ground.MANY_OUTLIERS,
 })  # fmt: skip
-#: What the rig file's word for sizes asks ``calibrate`` for.
+#: The option of ``calibrate`` for each value of ``sizes`` in the rig file.
 SIZES: dict[str, SizesChoice] = {"known": "check", "check": "correct", "estimate": "estimate"}
 
 
@@ -143,7 +143,7 @@ class CleanedLog:
         return problem
 
     def options(self) -> CalibrateOptions:
-        """What the rig file says."""
+        """The options of ``calibrate`` that the rig file states."""
         rig, noise = self.rig, self.motion.noise
         return CalibrateOptions(
             noise="estimate" if rig.noise == "estimate" else "given",
@@ -160,7 +160,7 @@ class CleanedLog:
         )
 
     def recording(self, pairs: Pairs) -> Recording:
-        """What the log knows beside its measurements."""
+        """What the log has besides its measurements."""
         rig, offsets_s = self.rig, self.cleaning.time_offsets_s
         used = {pair.sensor for pair, measured in pairs.items() if measured.used.any()}
         stated = {name: offsets_s.get(name, 0.0) for name in rig.sensors if name in used and name not in self.estimated}
@@ -230,7 +230,7 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
         outliers=left_out,
     )
     inliers = found.outliers.inliers
-    # With B by the stated intrinsics, as it was read: a log that is solved again begins where it began.
+    # B is by the stated intrinsics, as it was read, so that solving this log again starts from the same values.
     measured = {
         pair: replace(one, B=log.pairs[pair].B, covariance=log.pairs[pair].covariance) for pair, one in pairs.items()
     }
@@ -241,7 +241,7 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
 
 
 def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progress | None) -> Refined:
-    """A refinement of measurements that were misread, or of which the noise is not known: for figures alone."""
+    """A refinement of misread measurements, or of those with unknown noise. It is used only for figures."""
     how = RefineOptions(
         noise="given" if options.noise == "given" else "estimate",
         carrier_noise=options.carrier_noise,
@@ -257,7 +257,7 @@ def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progr
 def _findings(
     log: CleanedLog, found: Calibration, refined: Refined, fields: LogFields, pairs: Pairs
 ) -> Iterator[Finding]:
-    """What speaks against the poses, in the words of a log."""
+    """The findings against the poses, worded for a log."""
     rig, is_misread, late = log.rig, bool(found.misreadings), Ground.LATE_CLOCK
     is_late = any(finding.ground is late for finding in found.findings) and found.refined is None
     for sensor, one in log.doubted.items():
@@ -315,7 +315,7 @@ def _fields(
 
 
 def _sizes(rig: Rig, found: Calibration, refined: Refined) -> tuple[SizeFields, ...]:
-    """What the motion says of the targets' sizes: those that the answer estimates as it has them, and the others."""
+    """The targets' sizes by the motion: estimated ones as in the answer, and the others."""
     told = {size.target: (size.scale, size.sigma, False) for size in found.sizes}
     for name in rig.targets:
         unknown = Unknown(UnknownKind.SCALE, name)
@@ -336,7 +336,7 @@ def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
 
 
 def _with_outliers_marked(pairs: Pairs, outliers: Outliers) -> Pairs:
-    """The pairs with their outliers marked; these have a boolean for each used measurement of a pair."""
+    """The pairs with their outliers marked. `outliers` has a boolean for each used measurement of a pair."""
     result = {}
     for pair, measured in pairs.items():
         reasons = list(measured.reasons)

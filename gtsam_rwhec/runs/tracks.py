@@ -45,7 +45,7 @@ class Track:
         return TrackCount(target=self.target, sensor=self.sensor, used=int(self.used.sum()), removed=dict(removed))
 
     def without(self, reason: str) -> Self:
-        """The track with no measurement used, for this reason where there is no other."""
+        """The track with all measurements removed, for this reason if they had none before."""
         return replace(self, reasons=tuple(why or reason for why in self.reasons))
 
     def marked(self, kept: Kept, at: np.ndarray) -> Self:

@@ -1,7 +1,7 @@
-"""Images that are upside down: what was left out, and agrees with the answer once its image is turned by half a turn.
+"""Find images that are upside down: their measurements were left out, but agree with the answer after half a turn.
 
-A viewer that rotates and saves, or a camera that follows gravity, turns single images of a folder. The poses in them
-are then turned by 180 degrees about the optical axis, which no wrong corner and no wrong pose of an arm makes.
+An image viewer that rotates and saves, or a camera that rotates images by gravity, may turn single images of a folder.
+Their poses are then turned by 180 degrees about the optical axis. No wrong corner and no wrong arm pose does this.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 from gtsam_rwhec.runs.run_log import image_name
 
-#: A pose is turned by half a turn about the optical axis, up to this angle: the principal point is not quite the
-#: middle of the image, so the turned image has the target some pixels off.
+#: An image is upside down if its pose is half a turn about the optical axis from the expected one, within this angle.
+#: It is not exact: the principal point is not the middle of the image, so the turned target is some pixels off.
 NEAR_RAD = float(np.radians(6.0))
 #: At most this number of images is named.
 MOST_NAMED = 5
@@ -38,7 +38,7 @@ def turned_images(
     refined : Refined
         The answer.
     names : dict of str to str
-        Of the images' files, as `image_names` has them.
+        Names of the images' files, as `image_names` returns them.
     """
     stamps: dict[str, set[int]] = defaultdict(set)
     of_all: dict[str, set[int]] = defaultdict(set)

@@ -1,7 +1,7 @@
-"""Why targets are not read, where most are not: what some of the images say, with what to write in the rig file.
+"""Find why most detections of a target fail, from some of the images, and what to write in the rig file.
 
-Each cause was tried on images (`detect.clues`) and is named with how many of them show it. Where nothing that was tried
-explains it, that is said.
+Each cause is tried on images (`detect.clues`) and reported with the number of images that show it. If no cause explains
+the failure, the message says so.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SHARE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What some images say about a target: how many there were, and the clues of each."""
+    """The clues about a target in some images, and how many images there were."""
 
     looked_at: int
     of_image: Sequence[Sequence[Clue]]
@@ -166,13 +166,13 @@ def _of_clues(rig: Rig, target: Target, seen: _Seen) -> list[str]:
     ]
 
 
-#: A reason for rejections is a cause if it is that of at least this share of a target's detections.
+#: A reason for rejection counts as a cause if at least this share of a target's detections has it.
 MOSTLY = 0.3
 _SHARPER = "Focus the lens, stand still for each image, or expose for a shorter time"
 
 
 def sentence(rig: Rig, target: Target, about: About, value: object, figures: Sequence[float], looked_at: int) -> str:
-    """What images show, and what to do."""
+    """A sentence about what the images show, and what to do."""
     name, of = target.name, f"{len(figures)} of {looked_at} images"
     figure = float(np.median(figures))
 
@@ -259,7 +259,7 @@ def _family_of(family: str, target: Target) -> str:
 def of_rejections(
     rig: Rig, target: Target, found: Mapping[str, SensorDetections], images: Mapping[str, Mapping[int, Gray]]
 ) -> list[str]:
-    """What the rejected detections say themselves, with their figures and limits."""
+    """Causes from the reasons of rejected detections, with the measured values and the limits."""
     records = [(sensor, r) for sensor, of in found.items() for r in of.records if r.id == target.name]
     options, name = rig.detection_options, target.name
 
@@ -310,7 +310,7 @@ def of_rejections(
 
 
 def nothing_explains(targets: Sequence[Target], found: Mapping[str, SensorDetections]) -> str:
-    """What is said where nothing that was tried explains why targets are not read."""
+    """The message if no tried cause explains why targets are not read."""
     names = [target.name for target in targets]
     tried = ["other families, ids and borders"] * any(target.ids for target in targets)
     tried += ["other numbers of columns and rows"] * any(not target.ids for target in targets)
@@ -360,16 +360,16 @@ def _named(tags: dict[str, int]) -> str:
     return ", ".join(some) + (f" and {len(tags) - MOST_STRANGERS} others" if len(tags) > MOST_STRANGERS else "")
 
 
-#: So many images of a sensor, and this share of them, have no target that is used.
+#: Motion blur may hide targets if at least this many images of a sensor, and this share of them, have no used target.
 FEWEST, UNREAD = 3, 0.15
-#: At most so many of them are looked at.
+#: At most this many of these images are examined.
 LOOKED_AT = 8
-#: Edges across the motion have a blur of so many pixels at least, and of so many times that of edges along it; sharp
-#: ones have less than one.
+#: An image has motion blur if its edges across the motion have more than this blur in pixels, and more than this many
+#: times the blur of edges along the motion. Sharp edges have less than 1 pixel.
 WIDE_PX, WIDER = 1.6, 1.5
-#: The same for images in which targets are read all the same: their poses are of no one instant.
+#: The same limit in pixels for images in which targets are read although they are blurred.
 WIDE_AND_READ_PX = 2.2
-#: This share of those that were looked at is blurred.
+#: A sensor is reported if at least this share of the examined images is blurred.
 BLURRED_SHARE = 0.6
 
 

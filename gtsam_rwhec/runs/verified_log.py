@@ -42,8 +42,8 @@ from gtsam_rwhec.runs.run_log import (
     read_metadata,
 )
 
-#: Standard deviation of a corner along each axis where the old calibration is not from corners, pixels: what detection
-#: takes before it has measured it. The test finds the noise of poses itself.
+#: Standard deviation in pixels of a corner along each axis, for an old calibration that is not from corners. Detection
+#: assumes the same until it has measured it. The test estimates the noise of poses itself.
 CORNER_PX = 0.1
 
 
@@ -114,7 +114,7 @@ def verify_log(
 
 
 def _cleaned(detections: Log, given: Rig | None, old: OldCalibration, tell: Progress) -> RunLog:
-    """A cleaned log; where its motion does not tell the time offset of a sensor, the old one is taken as stated."""
+    """Clean the log. If its motion does not determine a sensor's time offset, the old offset is taken as stated."""
     before = {} if old.result.log is None else {one.sensor: one.offset_s for one in old.result.log.time_offsets}
     rig = rig_for_cleaning(detections, given)
     free = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in before]
@@ -212,7 +212,7 @@ def pixel_errors(
 ) -> Array:
     """How far (n,) each corner is from where the poses say that it is, pixels.
 
-    A target's corners are of its stated size; the answer's scale makes it the true one.
+    A target's corners are given with its stated size; the scale of the answer corrects it to the true size.
     """
     found = []
     for pair, measured in pairs.items():

@@ -60,7 +60,7 @@ OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in WRITTEN), *F
 
 @dataclass(frozen=True)
 class _Choices:
-    """The options of `calibrate_log` that all its roads share."""
+    """The options of `calibrate_log` that are the same for all kinds of input."""
 
     images: Images
     workers: int | None
@@ -111,7 +111,7 @@ def calibrate_log(
     replace : bool
         Whether a finished calibration in the folder, or an unfinished run of other inputs, is replaced: by default yes,
         so that a script can be run again. False refuses both, as the command does without ``--force``. In either case
-        an unfinished run of the same inputs is gone on with, and only files that a calibration wrote are replaced: a
+        an unfinished run of the same inputs is continued, and only files that a calibration wrote are replaced: a
         folder with other files, and without a calibration, is refused.
     report_images : bool
         Whether ``report.html`` shows images. They may be confidential, as the contact sheet ``seen.png`` then is.
@@ -157,7 +157,7 @@ def calibrate_log(
 def _calibrate_files(
     source: Path, rig: Rig, out: str | Path, choices: _Choices, *, replace: bool, progress: Progress | None
 ) -> Calibrated:
-    """As `calibrate_log`, by way of a log of a folder's images or of samples, which is removed at the end."""
+    """As `calibrate_log`, for a folder of images or a file of samples: a log is made of it, and removed at the end."""
     folder = source if source.is_dir() else None
     if folder is not None:
         rig = rig.model_copy(update={"folder": folder})
@@ -209,7 +209,7 @@ def _stages(
     calibrated = solve_log(found, rig, progress=progress)
     result = _write_solution(found, calibrated, out, choices.images)
     _export(calibrated, out, anyway=choices.anyway, progress=progress)
-    # A driver's log has no sheet, and that of an earlier calibration is not its own.
+    # A log of a driver's detections has no sheet; one in the folder is of an earlier calibration.
     pictures = Pictures(log, sheet if has_images(calibrated.rig) else None, choices.report_images)
     write_report(calibrated, found, out, sources, pictures, result, progress)
     return calibrated
@@ -263,7 +263,8 @@ def export_solved(
 ) -> list[Path]:
     """Write the files for other programs from a solved log into a folder; return their paths.
 
-    Poses that are not to be used get no such files: those of an earlier calibration in this folder are removed.
+    For poses that are not to be used no files are written, and those of an earlier calibration in this folder are
+    removed.
 
     `solved_path` is the log that ``solve_into`` wrote; the folder is made if it does not exist. With `anyway` the files
     of poses that are not to be used are written too, each with the reason as a comment in its head.
