@@ -1,8 +1,8 @@
-"""Which way up a board is that looks the same turned: checkerboards and grids of circles, by half a turn or quarters.
+"""The orientation of boards that look the same after a half or quarter turn: checkerboards and grids of circles.
 
-One image cannot tell. Over a track the motion does: A_i R_X = R_Y B_i R_z(w_i) in every image, with one R_X, one R_Y
-and the turn w_i of each image. The turn of the first image stays free: it is a name for the target's frame, which all
-images of all sensors must share.
+One image does not show it. Over a track the motion does: A_i R_X = R_Y B_i R_z(w_i) in every image, with one R_X, one
+R_Y and the turn w_i of each image. The turn of the first image stays free: it only defines the target's frame, which
+all images of all sensors must share.
 """
 
 from __future__ import annotations
@@ -132,10 +132,10 @@ def _settled(
 
 
 def turn_between(first: Turns, second: Turns, ways: int) -> tuple[int, float]:
-    """The turn that gives the second sensor's target the first one's frame, and by how much it is better than others.
+    """The turn that gives the second sensor's target the first one's frame, and how much better it fits than others.
 
-    Between images of one sensor, A_i^-1 A_j = X B_i^-1 B_j X^-1: the axes of the carriers' turns are the board's,
-    turned by R_X, which is the same for all sensors.
+    Between images of one sensor, A_i^-1 A_j = X B_i^-1 B_j X^-1: R_X rotates the board's turn axes into the carriers'
+    axes, and R_X is the same for all sensors.
     """
     of_first, of_other = (_axes(turns.R_A, turns.R_B) for turns in (first, second))
     if not (len(of_first[0]) and len(of_other[0])):

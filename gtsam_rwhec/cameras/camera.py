@@ -122,7 +122,8 @@ class Camera:
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera's frame, any unit.
 
-        They are nan behind the camera and beyond `ring`, where polynomials, unlike a lens, lead back into the image.
+        They are nan behind the camera and beyond `ring`, where the polynomials fold back into the image, as no lens
+        does.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             x = points[..., :2] / points[..., 2:]
@@ -153,14 +154,14 @@ class Camera:
 
     @property
     def reach_px(self) -> float:
-        """How far from the principal point rays lead to pixels, along x."""
+        """The largest distance from the principal point, along x, of a pixel that has a ray."""
         with np.errstate(over="ignore"):
             furthest = self.pixels(np.array([min((1.0 - 1e-9) * self.ring, 1e9), 0.0]))
         return float(np.linalg.norm(furthest - self._centre))
 
     @property
     def share_beyond_fold(self) -> float:
-        """Which share of the image's pixels has no ray because the distortion folds back; 0 where it does not."""
+        """The share of the image's pixels without a ray because the distortion folds back; 0 if it does not."""
         if not np.isfinite(self.ring):
             return 0.0
         u, v = ((np.arange(40.0) + 0.5) * size / 40.0 - 0.5 for size in (self.width, self.height))
@@ -173,16 +174,17 @@ class Camera:
 
     @property
     def parameters(self) -> Array:
-        """Its numbers (4 + n,): fx, fy, cx, cy and D; of a unified camera fx / (1 + xi), fy / (1 + xi), cx, cy and D.
+        """Parameters (4 + n,): fx, fy, cx, cy and D; for a unified camera fx / (1 + xi), fy / (1 + xi), cx, cy and D.
 
-        These are the pixels of one rad at the optical axis, which images tell; f and xi alone move together.
+        fx / (1 + xi) is the number of pixels per rad at the optical axis, which images determine; f and xi are
+        correlated.
         """
         K = self.K
         return np.concatenate([self._focal / self._zoom, [K[0, 2], K[1, 2]], self.D])
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Of `parameters`."""
+        """The names of `parameters`."""
         of_f = ("fx/(1+xi)", "fy/(1+xi)") if self.model == "unified" else ("fx", "fy")
         return (*of_f, "cx", "cy", *NAMES.get(self.model, "").split()[: len(self.D)])
 
@@ -195,7 +197,7 @@ class Camera:
 
     @property
     def focal_px(self) -> float:
-        """Pixels of one rad at the optical axis, the mean of both directions."""
+        """Pixels per rad at the optical axis, the mean of both directions."""
         return float(self._focal.mean()) / self._zoom
 
     @property

@@ -1,10 +1,10 @@
 """Whether the corners of a plane, seen from many sides, fit the stated intrinsics: Zhang's test.
 
-A view of a plane has eight numbers, and its pose takes six: two are left that say something of the intrinsics (Zhang
-2000, section 2.3). Focal lengths and principal point are estimated with all poses, from what is stated as a nominal
-prior (3 % and 30 pixels), with the distortion as stated; then far from it, with two coefficients of distortion: a
-lens that nobody stated, or the intrinsics of another resolution. The change counts by the scatter between the views
-too, since errors of one view's corners are alike where a board is bent.
+A view of a plane gives eight equations, and its pose uses six: two are left for the intrinsics (Zhang 2000, section
+2.3). Focal lengths and principal point are estimated with all poses, with a prior at the stated values (3 % and 30
+pixels) and the stated distortion. A second fit has a wide prior and two coefficients of distortion: it finds a lens
+distortion that nobody stated, or intrinsics of another resolution. The change is also compared with the scatter between
+views, since a bent board gives all corners of a view similar errors.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import fitted_to_planes, linearised, poses_eliminated
 from gtsam_rwhec.geometry.poses import Array
 
-#: With fewer views nothing is said; a view needs this number of corners.
+#: Fewer views give no result; a view needs this number of corners.
 LEAST_VIEWS, LEAST_CORNERS = 8, 8
-#: Of more views, this number is taken, evenly over the track.
+#: At most this number of views is used, spread evenly over the track.
 MOST_VIEWS = 40
 #: Prior of nominal intrinsics: focal length (relative), principal point (pixels).
 NOMINAL_SHARE, NOMINAL_PX = 0.03, 30.0
-#: Far from what is stated, the prior is this many times as wide, and coefficients of distortion have this deviation.
+#: In the second fit, the prior is this many times as wide, and coefficients of distortion have this standard deviation.
 WIDER, DISTORTION = 20.0, 0.5
 #: Views are different if the board is turned by this angle (radians), or moved by this share of its distance.
 APART = 0.03
@@ -37,9 +37,9 @@ ROUNDS, SETTLED_PX = 30, 1e-3
 #: Shares of a step that are tried, until the cost is smaller.
 SHARES = (1.0, 0.5, 0.25, 0.1, 0.02)
 #: The stated intrinsics do not fit if the scatter between views explains the change with at most this probability, and
-#: residuals are larger by at least this factor, and by this much (pixels, in squares).
+#: residuals are larger by at least this factor, and by this many pixels (difference of squares).
 LEAST_PROBABILITY, LARGER, LARGER_PX = 1e-4, 1.08, 0.02
-#: The same with distortion, which a bent board may look like.
+#: The same for the second fit: a bent board may look like distortion.
 LEAST_FAR, LARGER_FAR = 1e-6, 1.25
 #: A change by more than this share of the focal length, beyond two standard deviations, makes poses useless; and a
 #: distortion that moves the outermost corner by more than that share.
@@ -130,7 +130,7 @@ def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsE
 
 
 def different(poses: Sequence[Array]) -> list[int]:
-    """Numbers of different poses, evenly over the track: a camera at rest sees one view in however many images."""
+    """Indices of different poses, spread evenly over the track: all images of a camera at rest are one view."""
     kept: list[int] = []
     for i in np.unique(np.linspace(0, len(poses) - 1, 4 * MOST_VIEWS).astype(int)) if len(poses) else ():
         if kept:
@@ -144,7 +144,7 @@ def different(poses: Sequence[Array]) -> list[int]:
 
 
 def _with_distortion(camera: Camera) -> Camera:
-    """The camera with coefficients to be fitted: a pinhole has those of a lens that nobody stated, all zero."""
+    """The camera with coefficients to be fitted: for a pinhole, radial-tangential coefficients that start at zero."""
     return replace(camera, model="radtan", D=np.zeros(4)) if camera.model == "pinhole" else camera
 
 
@@ -166,7 +166,7 @@ def _far_start(camera: Camera, p: Array, u: Array, known: np.ndarray) -> tuple[C
 
 
 def _compared(camera: Camera, stated: _Fit, fitted: _Fit, known: np.ndarray, reach: float) -> IntrinsicsEvidence | None:
-    """Test the change by the scatter between the views, and by that of all corners: the less sure of both counts."""
+    """Test the change by the scatter between the views, and by that of all corners: the less certain one counts."""
     n, corners, free = len(known), int(known.sum()), len(fitted.H)
     if n <= free:
         return None
@@ -183,8 +183,8 @@ def change_test(
 ) -> tuple[float, Array]:
     """The probability of a change (q,) by chance, and its standard deviations (q,): the larger of two each.
 
-    By the scatter of the views' gradients `parts` (views, q), which holds what is alike within a view (Liang and Zeger
-    1986; Hotelling's T^2), and by the variance of a corner's residual, with so many degrees of freedom. `least` is
+    By the scatter of the views' gradients `parts` (views, q), which includes errors shared within a view (Liang and
+    Zeger 1986; Hotelling's T^2), and by the variance of a corner's residual, with its degrees of freedom. `least` is
     added to the covariances' diagonals.
     """
     n, q = parts.shape
@@ -212,9 +212,9 @@ class _Fit:
 def _fitted(
     prior: Camera, T: Array, p: Array, u: Array, known: np.ndarray, *, free: float, lens: Camera | None = None
 ) -> _Fit | None:
-    """Gauss-Newton on all poses, and on intrinsics: as free as a nominal prior, times `free`.
+    """Gauss-Newton on all poses, and on intrinsics with the nominal prior, made wider by the factor `free`.
 
-    With a `lens`, which is the start then, two coefficients of distortion are free too.
+    If `lens` is given, it is the start, and two coefficients of distortion are free too.
     """
     nominal = np.array([NOMINAL_SHARE * prior.K[0, 0], NOMINAL_SHARE * prior.K[1, 1], NOMINAL_PX, NOMINAL_PX])
     nominal *= free or 1.0

@@ -18,7 +18,7 @@ from gtsam_rwhec.geometry.poses import Array
 #: Kalibr's camera models that are supported, with the distortion models that go with them.
 KALIBR_MODELS = {"pinhole": ("none", "radtan", "equidistant"), "omni": ("none", "radtan")}
 _KALIBR_CAMERA = re.compile(r"cam\d+")
-#: ROS, OpenCV's samples and people write these keys of intrinsics; here they have lower case and no underscores.
+#: Keys of intrinsics in files of ROS, OpenCV's samples and users; here in lower case and without underscores.
 _WIDTH, _HEIGHT = ("imagewidth", "width", "imgwidth", "w"), ("imageheight", "height", "imgheight", "h")
 _SIZE = ("imagesize", "imgsize", "resolution", "size")
 _MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "m")
@@ -101,7 +101,8 @@ def read_calibration_yaml(path: str | Path) -> Camera:
         YAML, JSON or OpenCV's XML. Has image_width, image_height, camera_matrix, distortion_coefficients, and
         distortion_model; or the plain numbers fx, fy, cx, cy with the size, and coefficients k1, k2, p1, p2, k3 by
         name. Other tools' names of these keys are read too (K, D, mtx, dist, image_size). Without a distortion_model,
-        fisheye_model (of OpenCV's sample) or xi (of its omnidir) tells the model; five coefficients or more are radtan.
+        fisheye_model (of OpenCV's sample) or xi (of its omnidir) gives the model; five coefficients or more mean
+        radtan.
 
     Raises
     ------
@@ -132,8 +133,8 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     Returns
     -------
     dict of str to Camera
-        By the file's names: ``cam0`` of Kalibr, ``1`` of COLMAP and of stereo files, the sensors' of this library; the
-        name of one alone is empty.
+        By the file's names: ``cam0`` of Kalibr, ``1`` of COLMAP and of stereo files, the sensors' names of this
+        library; a single camera without a name has the name "".
 
     Raises
     ------
@@ -207,7 +208,7 @@ def _xi(file: YamlFile, number: str = "") -> list[float]:
 
 
 def _image_size(file: YamlFile, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Width and height in pixels, of the file or as stated; a FileFormatError if both say it, and differ."""
+    """Width and height in pixels, from the file or as stated; a FileFormatError if both exist and differ."""
     fields = file.data if isinstance(file.data, dict) else {}
     whole, wide = _found(fields, _SIZE), _found(fields, _WIDTH)
     if whole is not None and wide is None:
@@ -356,7 +357,7 @@ _LINE = re.compile(r"\d+[\s,]+[A-Z][A-Z_]+[\s,]+\d+[\s,]+\d+[\s,]")
 
 
 def is_colmap(text: str) -> bool:
-    """Whether the first line that is no comment is a camera of COLMAP."""
+    """Whether the first line that is not a comment is a camera of COLMAP."""
     lines = (line.strip() for line in text.splitlines())
     return _LINE.match(next((line for line in lines if line and line[0] != "#"), "")) is not None
 
@@ -367,7 +368,7 @@ def read_colmap_cameras(path: str | Path) -> dict[str, Camera]:
     Returns
     -------
     dict of str to Camera
-        By COLMAP's numbers: ``1``, ``2`` and so on.
+        By COLMAP's camera ids: ``1``, ``2`` and so on.
 
     Raises
     ------

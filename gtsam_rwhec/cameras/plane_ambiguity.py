@@ -1,12 +1,12 @@
 """The choice between a plane's two poses, over a whole track.
 
 A far or nearly frontal plane looks almost the same in two poses, mirror images of each other about the line of sight.
-The reprojection errors of one image hardly tell them apart. A track tells more: between two images the target turns
-relative to the camera by the same angle as the target carrier relative to the sensor carrier, for any extrinsics
-(A_i^-1 A_j and B_i B_j^-1 are conjugate). A wrong choice changes that angle. Dynamic programming finds the most likely
-choice of the whole track, a chain with two states for each image; the cost of the best chain through the other state
-says how sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation for all
-images tells more than the angles between neighbours do (`choose_by_agreement`).
+The reprojection errors of one image hardly distinguish them. A track gives more information: between two images the
+target turns relative to the camera by the same angle as the target carrier relative to the sensor carrier, for any
+extrinsics (A_i^-1 A_j and B_i B_j^-1 are conjugate). A wrong choice changes that angle. Dynamic programming finds the
+most likely choice of the whole track, a chain with two states for each image; the cost of the best chain through the
+other state says how sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation
+for all images decides better than the angles between neighbours (`choose_by_agreement`).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def choose_over_time(
 
 
 def _links(stamps_ns: np.ndarray, T: Array, covariance: Array, carrier: Array | None) -> Array:
-    """Costs (n - 1, 2, 2) of each state after each: they say how far their angle is from the carriers' angle."""
+    """Costs (n - 1, 2, 2) of each pair of successive states: how far their angle is from the carriers' angle."""
     seconds = np.diff(stamps_ns) * 1e-9
     R = np.nan_to_num(T[..., :3, :3])
     between = R[:-1, :, None] @ np.swapaxes(R[1:, None], -1, -2)  # B_i B_j^-1
@@ -133,7 +133,7 @@ STEPS = 4
 FEW = 4
 #: This number of the best choices become starts.
 BEST = 3
-#: Two images are compared for a first R_Y if their numbers differ by one of these.
+#: Two images are compared for a first R_Y if their indices differ by one of these.
 LAGS = (1, 2, 4, 8, 16, 32)
 #: A translation's standard deviation is this share of the distance. The tag's size, clocks and corner noise add to it.
 SIGMA_SHARE = 0.03
@@ -196,7 +196,7 @@ def choose_by_agreement(
 
 
 def _starts(track: _Track) -> list[np.ndarray]:
-    """First choices (n,): the best combination of candidates in a few images; in the others, what agrees with it."""
+    """First choices (n,): the best combination of candidates in a few images; in the others, those that fit it."""
     few = _apart(track.R_A)
     found: list[tuple[float, np.ndarray]] = []
     for picked in itertools.product((0, 1), repeat=len(few)):
@@ -237,7 +237,7 @@ def _settled(track: _Track, which: np.ndarray) -> _Answer:
         disagreement = _disagreement(track, R_X, R_Y)
         cost = track.image + disagreement
         before, which = which, np.argmin(cost, axis=1)
-        # Images with the largest cost do not count: another tag with this id, or a clock that jumped.
+        # Images with the largest cost do not count: they may show another tag with this id, or a clock may have jumped.
         sure = np.trace(track.information[each, which], axis1=1, axis2=2)
         weight = np.where(disagreement[each, which] < track.most, sure, 0.0)
         if not weight.any():

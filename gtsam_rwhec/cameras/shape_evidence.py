@@ -1,8 +1,8 @@
 """Whether a board's tags are where the rig file has them: each tag's place, turn and size, and the gap of a grid.
 
-All images of a track see one board: what a mistake of the rig file makes is alike in all of them, in the board's frame.
-Each hypothesis moves corners by G theta in that frame; theta is estimated with all poses, and counts by its scatter
-between the views. And which parts of a board are in no image, though the images have their places.
+All images of a track see one board: a mistake of the rig file moves the corners equally in all of them, in the board's
+frame. Each hypothesis moves corners by G theta in that frame; theta is estimated with all poses, and tested against its
+scatter between the views. Also: which parts of a board no image shows, although the images cover their places.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gtsam_rwhec.cameras.targets import Charuco, Target
 from gtsam_rwhec.cameras.unknown_intrinsics import board_rows, poses_eliminated
 from gtsam_rwhec.geometry.poses import Array
 
-#: With fewer views, in which the moved corners were seen beside others, nothing is said.
+#: A hypothesis needs this many views that show moved corners beside other corners.
 LEAST_VIEWS = 6
 #: Rounds of Gauss-Newton.
 ROUNDS = 6
@@ -57,7 +57,7 @@ class ShapeEvidence:
     theta: Array
     sigma: Array
     moved_m: float  #: Largest distance by which a corner is moved, less two standard deviations; metres
-    #: The same in the median view, pixels; of a gap its change, since a tag's edges beside it are what tells it
+    #: The same in the median view, pixels; for a gap its change, since the tags' edges beside the gap show it
     moved_px: float
     #: Root mean squares of the reprojection errors, pixels, each with the poses that fit best
     stated_px: float
@@ -68,7 +68,7 @@ class ShapeEvidence:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the stated shape does not fit the corners, by more than chance and by more than matters."""
+        """Whether the stated shape does not fit the corners: the difference is significant and matters."""
         return (
             self.probability < LEAST_PROBABILITY
             and self.stated_px > LARGER * self.fitted_px
@@ -78,7 +78,7 @@ class ShapeEvidence:
 
     @property
     def is_far_off(self) -> bool:
-        """Whether the shape is so far off that poses are wrong by more than a calibration may be."""
+        """Whether the shape is so wrong that the poses are useless for a calibration."""
         return self.moved_m > max(USELESS_M, USELESS_SHARE * self.extent_m)
 
 
@@ -94,7 +94,7 @@ def evidence_of_shape(
     hypotheses : mapping to (n, 3, q) arrays
         By how much each corner moves for each of the q numbers of a hypothesis.
     views : sequence of BoardView
-        Those of different poses count.
+        Only views of different poses count.
     """
     views = [views[i] for i in different([view.T for view in views])]
     if len(views) < LEAST_VIEWS:
@@ -107,7 +107,7 @@ def evidence_of_shape(
     found = []
     for key, G in hypotheses.items():
         moves = G.any(axis=(1, 2))
-        # A tag alone has no place: other corners must be beside it. A gap moves all tags of a grid against each other.
+        # The place of a tag needs other corners in the view. A gap moves all tags of a grid against each other.
         beside = (known & ~moves).sum(axis=1) >= 4 if moves.sum() <= 4 else known.sum(axis=1) >= 8
         told = np.flatnonzero(beside & (known & moves).any(axis=1))
         if len(told) >= max(LEAST_VIEWS, G.shape[2] + 3):
@@ -157,7 +157,7 @@ class _Fit:
 def _fitted(
     camera: Camera, corners: Array, G: Array, T: Array, u: Array, known: np.ndarray, *, is_free: bool
 ) -> _Fit | None:
-    """Gauss-Newton on all poses, and on theta if it is free; None where it finds no end."""
+    """Gauss-Newton on all poses, and on theta if it is free; None if it does not converge."""
     q = G.shape[2]
     theta = np.zeros(q)
     for round_ in range(ROUNDS + 1):
@@ -178,7 +178,7 @@ def _fitted(
     return _Fit(T, theta, float(np.sqrt((r**2).sum() / known.sum())), H, parts)
 
 
-#: A part counts as never seen if this number of images have its place.
+#: A part counts as never seen if this number of images cover its place and do not show it.
 LEAST_IMAGES = 5
 #: Places count within the image, by this share of its width and height from its edges.
 EDGE = 0.05
@@ -187,7 +187,7 @@ LEAST_FACING = 0.5
 
 
 def never_seen(board: Target, camera: Camera, views: Sequence[BoardView]) -> str:
-    """Name what of a board of tags is in no image; "" if nothing is missing.
+    """Name the parts of a board of tags that no image shows; "" if nothing is missing.
 
     Of a ChArUco board these are rows and columns of corners at its edges; of other boards, tags.
     """

@@ -2,7 +2,7 @@
 
 IPPE (Collins and Bartoli 2014, in OpenCV) gives two poses. Gauss-Newton on the reprojection error in pixels refines
 both, for all targets at once. A far or nearly frontal plane has two minima of nearly the same error: a single image
-does not tell which minimum is right (see `ambiguity`).
+does not show which one is right (see `ambiguity`).
 
 Corners of several planes start from SQPnP (Terzakis and Lourakis 2020, in OpenCV). The second candidate is that of the
 plane nearest to them, if it leads to another minimum: a thin bundle far away is almost a plane.
@@ -149,7 +149,7 @@ def _refined(
             T[taken], errors[taken], H[taken] = tried[better], new_errors[better], new_H[better]
             g[taken], cost[taken] = new_g[better], new_cost[better]
             damping[left] = np.where(better, damping[left] * 0.1, np.maximum(damping[left], 1e-6) * 100.0)
-            # A change within rounding is settled, for the better or for the worse.
+            # A change within rounding counts as converged, whether the cost falls or rises.
             moved = np.abs(before - new_cost) > SETTLED * (1e-6 + before)
             left = left[moved & (better | (damping[left] < 1.0))]
             if not len(left):

@@ -37,7 +37,7 @@ def grid(columns: int, rows: int, step_m: float) -> Array:
 
 
 def check(name: str, family: str | None, ids: tuple[int, ...], lengths: dict[str, float]) -> None:
-    """Raise `TargetError` if there is no such family, if ids are not in it, or if a length is no length."""
+    """Raise `TargetError` if there is no such family, if ids are not in it, or if a length is not valid."""
     if family is not None:
         if family not in FAMILIES:
             raise TargetError(f"there is no family {family!r}; there are {', '.join(FAMILIES)}", name)
@@ -61,7 +61,7 @@ def check_grid(name: str, columns: int, rows: int, least: int) -> None:
         raise TargetError(f"{columns} columns and {rows} rows; each must be {least} to 100", name)
 
 
-#: A quaternion's norm is 1 within this; apriltag_ros's own files have four digits.
+#: A quaternion's norm may differ from 1 by this much: apriltag_ros's own files have four digits.
 UNIT = 0.01
 
 
@@ -162,7 +162,7 @@ class Bundle:
 
     @property
     def length_m(self) -> float:
-        """The length that a scale multiplies: of the first tag, and of all others with it."""
+        """The length that a scale multiplies: the first tag's side; all other lengths scale with it."""
         return self.tags[0].size_m
 
     def corners(self) -> Array:
@@ -287,7 +287,7 @@ class Checkerboard:
     """A checkerboard of columns x rows inner corners, numbered left to right, from the top.
 
     If columns and rows are both even or both odd, the board looks the same turned by half a turn (or by quarters, see
-    `ways`): which way up it is in each image only the motion tells.
+    `ways`): only the motion shows its orientation in each image.
     """
 
     name: str
@@ -304,7 +304,7 @@ class Checkerboard:
 
     @property
     def ways(self) -> int:
-        """In how many ways the board looks the same: turned by half a turn 2, by quarters 4, else 1.
+        """In how many orientations the board looks the same: 2 (half turns), 4 (quarter turns), or 1.
 
         With columns and rows both even, the four outermost squares have one colour; both odd, opposite ones have.
         """
@@ -330,7 +330,7 @@ class CircleGrid:
     the first row begins at the left edge and every other row is shifted to the right by one spacing. The first circle
     is the upper left one as printed. Neighbours in a row are two spacings apart, diagonal ones sqrt(2).
 
-    A grid may look the same turned (see `ways`): which way up it is only the motion tells.
+    A grid may look the same after a turn (see `ways`): then only the motion shows its orientation.
     """
 
     name: str
@@ -366,11 +366,11 @@ class CircleGrid:
 
     @property
     def ways(self) -> int:
-        """In how many ways the grid looks the same: with a larger dot 1, else by half a turn 2, by quarters 4.
+        """In how many orientations the grid looks the same: 2 (half turns), 4 (quarter turns), or 1.
 
-        Half a turn of an asymmetric grid brings the first row to the last one. With an odd number of rows both begin
-        at the left edge, and then the turned rows begin one spacing off it: the grid looks the same in one way only.
-        With an even number they fit. A quarter never does: it takes circles to the places between circles.
+        A half turn of an asymmetric grid moves the first row to the last one. With an odd number of rows both begin at
+        the left edge, but the turned rows begin one spacing off it: the grid looks the same in one orientation only.
+        With an even number the turned rows fit. A quarter turn never fits: it moves circles to places between circles.
         """
         if self.larger_dot or (self.asymmetric and self.rows % 2 == 1):
             return 1
@@ -399,7 +399,7 @@ Target: TypeAlias = Tag | Charuco | AprilGrid | TagGrid | Bundle | Checkerboard 
 
 
 def is_same_print(first: str, second: str) -> bool:
-    """Whether tags with the same id look the same in two families, named by drivers' words.
+    """Whether tags with the same id look the same in two families, given by drivers' names.
 
     ArUco's larger dictionaries begin with the tags of its smaller dictionaries: their sizes do not matter.
     """
@@ -407,7 +407,7 @@ def is_same_print(first: str, second: str) -> bool:
 
 
 def print_of(family: str) -> str:
-    """What tags of a family look like, in one word: two families with one word share the tags of each id."""
+    """The print of a family, as one word: in two families with the same word, tags with the same id look the same."""
     return re.sub(r"^(\dx\d)_\d+$", r"\1", _bare(family))
 
 

@@ -1,7 +1,7 @@
 """Intrinsics of a camera that nobody calibrated, from its views of flat boards: by homographies (Zhang 2000).
 
-The lens model has no more coefficients than the corners ask for (Schwarz's criterion): those that they do not determine
-would bend the image where no corner was seen.
+The lens model has only the coefficients that the corners determine (Schwarz's criterion): others would distort the
+image where no corner was seen.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def fitted_to_planes(
 def fisheye_fitted_to_planes(
     corners_m: Sequence[Array], corners_px: Sequence[Array], size: tuple[int, int], coefficients: int = 4
 ) -> PlanesFitted | None:
-    """As `fitted_to_planes`, for an equidistant lens whose first so many coefficients are free, and the others 0."""
+    """As `fitted_to_planes`, for an equidistant lens: its first ``coefficients`` are free, the others 0."""
     with extra_named():
         import cv2
 
@@ -132,7 +132,7 @@ def _fisheye_flag(name: str) -> int:
 Lens = Literal["any", "pinhole", "radtan", "equidistant", "unified"]
 #: Views with fewer corners, and cameras with fewer views, give no intrinsics.
 CORNERS, VIEWS = 6, 3
-#: This many views, as different as there are, are enough.
+#: This many views, as different as possible, are enough.
 ENOUGH = 40
 #: A fisheye's model is tried where the image reaches further than this (degrees) from its axis, or where corners are
 #: off by more than this (pixels) without it; it is taken if Schwarz's criterion is less by this (very strong evidence).
@@ -225,9 +225,9 @@ def estimated_intrinsics(
 
 
 def different_views(views: Sequence[tuple[Array, Array]], most: int = ENOUGH) -> list[tuple[Array, Array]]:
-    """At most so many views, in their order, each as different from those before it as there are.
+    """At most ``most`` views, in their order, chosen as different from each other as possible.
 
-    Views differ by where a board's outline is in the image: many are of a camera that stood still.
+    Views differ by the place of a board's outline in the image: many views come from a camera that stood still.
     """
     if len(views) <= most:
         return list(views)
@@ -269,7 +269,7 @@ def _outline(points: Array, pixels: Array) -> Array:
 
 
 def _best(views: Sequence[tuple[Array, Array]], size: tuple[int, int], lens: Lens) -> _Fit | None:
-    """The fit with the lens model that the corners ask for."""
+    """The fit with the lens model that Schwarz's criterion selects."""
     corners = sum(len(p) for p, _ in views)
 
     def least(fits: Iterator[_Fit]) -> _Fit | None:
@@ -415,7 +415,7 @@ def linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, 
 def poses_eliminated(r: Array, J: Array, K: Array) -> tuple[Array, Array, Array]:
     """Gauss-Newton with the poses eliminated: H (q, q) and gradients (views, q) of the q numbers that all views share.
 
-    And the poses' solutions (views, 6, q + 1), by these numbers and by one. Raises LinAlgError for a singular view.
+    Also the poses' solutions (views, 6, q + 1), for the columns of K and for r. Raises LinAlgError for a singular view.
     """
     Jt, Kt = J.swapaxes(1, 2), K.swapaxes(1, 2)
     H_pk, q = Jt @ K, K.shape[2]
