@@ -47,9 +47,9 @@ def check_arguments(observations: object, options: object) -> None:
 
 
 def check_options(options: CornerOptions, observations: Observations) -> None:
-    """FrameError where options are of a frame that nobody knows; CameraError where two cameras cannot be one.
+    """FrameError where options name an unknown frame; CameraError where two cameras cannot share intrinsics.
 
-    A misspelt name would leave a calibration nominal, or a size as stated, without a word.
+    Without this check, a misspelt name would silently leave intrinsics nominal, or a size as stated.
     """
     sensors = observations.sensors
     every = [name for group in options.shared for name in group]
@@ -77,7 +77,7 @@ def check_options(options: CornerOptions, observations: Observations) -> None:
 
 
 def check_clocks(options: CornerOptions, observations: Observations) -> None:
-    """FrameError where a time offset is that of a sensor that saw nothing; CountError where velocities are missing."""
+    """FrameError where a time offset is asked of a sensor without images; CountError where velocities are missing."""
     for name in options.time_offsets:
         if name not in observations.sensors:
             raise FrameError(
@@ -93,7 +93,7 @@ def check_clocks(options: CornerOptions, observations: Observations) -> None:
 
 
 def check_names(start: object, names: tuple[str, ...], *, letter: str) -> None:
-    """FrameError where a start X or Y lacks a frame that was seen, or that saw; OptionError where it is no dict."""
+    """FrameError where a start X or Y lacks a target or sensor of the images; OptionError where it is no dict."""
     what, pose = {"X": ("target", "T_targetcarrier_target"), "Y": ("sensor", "T_sensorcarrier_sensor")}[letter]
     if not isinstance(start, Mapping):
         raise OptionError(f"{letter}={brief(start)} is not a dict; give {pose} of each {what} by its name")
@@ -137,7 +137,7 @@ def check_corners(model: Model, point: Point) -> None:
 def check_determined(
     model: Model, start: Point, point: Point, joint: Array, slots: Mapping[tuple[str, str], slice]
 ) -> None:
-    """UnderdeterminedError where a frame's deviation is not finite, or so large that the images do not say its pose."""
+    """UnderdeterminedError where a frame's standard deviation is infinite or too large: images do not determine it."""
     distance = min(farthest(model, start), farthest(model, point))
     limits = ROTATION_RAD, TRANSLATION_OF_DISTANCE * distance
     faults = []
@@ -194,7 +194,7 @@ def _what_there_is(model: Model) -> str:
 
 
 def few_corners(model: Model) -> str:
-    """In words that the corners give no more numbers than there are unknowns; empty where they give more."""
+    """A sentence if the corners give no more equations than there are unknowns; else empty."""
     numbers = 2 * sum(int(stack.known.sum()) for stack in model.stacks)
     cameras = sum(len(mean) for mean, off in model.camera_priors.values() if off[2] > CENTRE_PX["exact"])
     boards = sum(len(model.free_shape(name)) for name in model.targets)
@@ -204,21 +204,22 @@ def few_corners(model: Model) -> str:
     return "" if numbers > unknowns else f"{numbers} coordinates of corners for {unknowns} unknowns"
 
 
-#: Noise is drawn so many times.
+#: Number of random draws of the noise.
 DRAWS = 6
-#: Of what noise gives, more noise gives twice as much; a frame whose information grows by more than this factor is told
-#: by noise for a fourth and more.
+#: Added noise doubles the information that comes from noise alone. If a frame's information grows by more than this
+#: factor, a fourth of it or more comes from noise.
 GROWS = 1.25
-#: Frames with a smaller deviation (rad, and a share of the corners' distance) are told by motion: no noise is so large.
+#: Frames with a smaller deviation (rad, and a share of the corners' distance) are determined by motion: noise alone
+#: does not give so much.
 SMALL = 3e-3
 
 
 def grows_by_noise(
     model: Model, point: Point, noise: Noise, joint: Array, slots: Mapping[tuple[str, str], slice], distance_m: float
 ) -> dict[str, float]:
-    """By how much noise of A would add to what is known of each frame's least known direction: 1 is nothing.
+    """The factor by which noise of A increases the information on each frame's least known direction; 1: none.
 
-    Only frames with large deviations are asked. `joint` is the covariance (d, d) of the unknowns in `slots`.
+    Only frames with large deviations are tested. `joint` is the covariance (d, d) of the unknowns in `slots`.
     """
     scale = np.repeat([1.0, 1.0 / distance_m], 3)
     weakest = {}
@@ -244,7 +245,7 @@ def grows_by_noise(
 def check_motion(
     model: Model, point: Point, noise: Noise, joint: Array, slots: Mapping[tuple[str, str], slice], distance_m: float
 ) -> None:
-    """UnderdeterminedError where noise of A alone says where a frame is."""
+    """UnderdeterminedError where a frame's pose is determined by noise of A alone."""
     with told_where_it_fails(model, point):
         grows = grows_by_noise(model, point, noise, joint, slots, distance_m)
     faults = [name for name, factor in grows.items() if factor > GROWS]
@@ -261,7 +262,7 @@ def _covariance(model: Model, point: Point, noise: Noise) -> Array:
     return covariance
 
 
-#: Corners that are left out count where they are more than this share: a single one may be misread.
+#: Corners without a ray that are left out count only above this share of all: a single one may be misread.
 SHARE = 0.01
 
 LENS_CURE = (

@@ -21,10 +21,10 @@ AT_BOUND = 0.99
 LAST_STEP = 0.1
 #: Over a longer time than this, s, the carriers' velocity is not constant.
 CONSTANT_S = 0.02
-#: Distortion that nobody stated is named where chance gives it with less than this probability, and where it moves a
-#: corner by more pixels than this.
+#: Distortion that was not stated is reported if chance gives it with less than this probability, and it moves a corner
+#: by more pixels than this.
 NO_LENS, BEND_PX = 1e-4, 1.0
-#: A coefficient is named alone where it is not 0 by so many deviations; at most so many are named.
+#: A coefficient is reported if it differs from 0 by so many deviations; at most so many are reported.
 TOLD, MOST_TERMS = 3.0, 2
 #: More corners than this share left out are many.
 MANY = 0.2
@@ -185,7 +185,7 @@ def _off(intrinsics: RefinedIntrinsics, part: str) -> str:
 
 
 def lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
-    """The distortion of sensors that share a camera, which was stated without; empty where there is none."""
+    """The distortion found for sensors that share a camera stated without distortion; empty if there is none."""
     model, intrinsics = refined.graph.model, refined.intrinsics[sensors[0]]
     mean, _ = model.camera_priors[model.camera_of[sensors[0]]]
     D = intrinsics.camera.D

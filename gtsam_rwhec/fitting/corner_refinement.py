@@ -1,4 +1,4 @@
-"""Refinement from corners: GTSAM's optimum, the noise that the corners have, and what was stated and is not so."""
+"""Refinement from corners: GTSAM's optimum, the noise of the corners, and stated values that they contradict."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def check_choices(options: object, choices: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """What ``refine`` and ``calibrate`` are both told."""
+    """Options that ``refine`` and ``calibrate`` share."""
 
     #: The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": from the residuals; what is
     #: stated gives the ratios. "auto": ``refine`` takes what is given if there are weights, else it estimates;
@@ -124,9 +124,9 @@ class RefineOptions(PoseOptions):
     time_offsets: bool | tuple[str, ...] = False
     #: Largest number of the optimiser's steps.
     max_iterations: int = 100
-    #: What is refined from: the measured poses B, or, from there on, the corners of the images that the problem holds
-    #: (``problem.add_corners``). The other options are then those of the poses, of which outliers among images are left
-    #: out too (``robust="gnc"``); ``rw.CornerOptions`` has those of the corners.
+    #: The data of the refinement: the measured poses B, or, starting from their result, the corners of the problem's
+    #: images (``problem.add_corners``). The other options are then those of the poses, of which outliers among images
+    #: are left out too (``robust="gnc"``); ``rw.CornerOptions`` has those of the corners.
     observations: ObservationKind = "poses"
 
     def __post_init__(self) -> None:
@@ -212,7 +212,7 @@ class Walk(NamedTuple):
     frame: DriftFrame
 
 
-#: Whether a track drifts: found out, a random walk, errors with a correlation time, or neither.
+#: Whether a track drifts: "auto" (the data decide), a random walk, errors with a correlation time, or neither.
 Drift = Literal["auto", "walk", "correlated", "none"]
 
 
@@ -240,9 +240,9 @@ class CornerOptions:
     """The options of `refine_corners`."""
 
     #: Where the stated intrinsics come from. A calibration's are right to 0.3 % of f and 3 pixels of c, nominal ones to
-    #: 3 % and to 30 pixels or 2 % of the width; the images alone say unknown ones, and exact ones are held. Sensors
-    #: that a dict lacks are nominal. Where the images contradict what is stated, the deviation is widened, and the
-    #: result says so.
+    #: 3 % and to 30 pixels or 2 % of the width; unknown ones are estimated from the images alone, and exact ones are
+    #: fixed. Sensors that a dict lacks are nominal. Where the images contradict what is stated, the deviation is
+    #: widened, and the result says so.
     stated: Stated | Mapping[str, Stated] = "nominal"
     #: Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
     shared: tuple[tuple[str, ...], ...] = field(default=())

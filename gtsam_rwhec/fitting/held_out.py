@@ -1,8 +1,8 @@
 """How well corners are predicted in images that the calibration has not seen.
 
-Instants are left out in blocks, each pair's images in their order; poses and intrinsics are refined from the others,
-and predict the corners by the measured A. A refinement that frees the carriers' poses fits its own images
-to a tenth of a pixel, whatever is wrong with the arm: its residuals prove nothing, and this error decides.
+Blocks of instants are left out, in the order of each pair's images. Poses and intrinsics are refined from the others,
+and predict the left-out corners with the measured A. A refinement that frees the carriers' poses fits its own images to
+a tenth of a pixel, whatever is wrong with the arm: its residuals prove nothing, and this error decides.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class LeftOut:
 
     #: By sensor.
     errors: dict[str, HeldOut]
-    #: By unknown: how much the blocks' estimates differ, over what their covariance says (the jackknife).
+    #: By unknown: the scatter of the blocks' estimates (jackknife), divided by that which their covariance predicts.
     spread: dict[tuple[str, str], float]
 
 
