@@ -5,8 +5,8 @@ With z the whitened difference, |z|^2 is a chi-square of as many degrees of free
 frame of many is hard to see. So each group of quantities, a frame's pose or a size, is also tested for "this changed,
 and nothing else did": the squared length of z's projection on the directions in which that group moves z. The alarm is
 the smaller of the joint chance and, at a third of its weight, the smallest of a group times their number: one frame
-gains by it, and a change of all of them hardly loses. How often it is so small without any change is counted over
-random z, because the tests share what they are made of.
+gains by it, and a change of all of them hardly loses. The tests are not independent. So the chance of so small a value
+without any change is counted over random z.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from gtsam_rwhec.geometry.real_numbers import is_real
 LEVEL = 0.01
 #: The weight of the groups' tests beside the joint one.
 OF_GROUPS = 1.0 / 3.0
-#: Random differences without a change, and the most numbers of one array of them.
+#: Number of random differences without a change, and the most elements of their array.
 DRAWS, MOST_NUMBERS = 20_000, 2_000_000
-#: A chance that fewer of them fall below is bounded by the sum of both tests'.
+#: If fewer random differences fall below a chance, it is bounded by the sum of the chances of both tests.
 FEWEST_DRAWS = 50
-#: A direction whose length is below this share of the longest is rounding.
+#: A direction shorter than this share of the longest one is taken as rounding error.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class GroupChange:
-    """What the test says of one group of quantities: a frame's pose, a size, a clock, a camera's intrinsics."""
+    """The test of one group of quantities: a frame's pose, a size, a clock, or a camera's intrinsics."""
 
     dimension: int  #: Directions that were compared; 0 where both estimates leave all of them free
     #: The group's own difference, in joint (Mahalanobis) deviations: the root of d' C^-1 d, correlations counted
@@ -70,7 +70,8 @@ class ChangeTest:
     def changed(self) -> tuple[str, ...]:
         """The groups that changed, as far as they can be named; empty without an alarm, or if none stands out.
 
-        They are those that differ by themselves; if none does, the one whose change alone explains everything best.
+        These are the groups that differ by themselves; if none does, the group whose change alone explains the alarm
+        best.
         """
         if not self.has_changed:
             return ()
@@ -82,7 +83,7 @@ class ChangeTest:
 
 
 def checked_level(level: float) -> float:
-    """A level between 0 and 1; OptionError for any other."""
+    """The level, if it is between 0 and 1. Raises OptionError for any other."""
     if not (is_real(level) and 0.0 < level < 1.0):
         raise OptionError(f"level={brief(level)}; give one between 0 and 1, such as {LEVEL}")
     return float(level)
@@ -158,7 +159,7 @@ def change_test(
 
 
 def _tail(square: Array | float, dimension: int, freedom: float) -> Array:
-    """How often a squared length of so many dimensions is larger by chance."""
+    """The chance that a squared length of this many dimensions is larger."""
     if not dimension:
         return np.ones_like(square)
     square = np.maximum(square, 0.0)
@@ -168,13 +169,13 @@ def _tail(square: Array | float, dimension: int, freedom: float) -> Array:
 
 
 def _family(chances: list[float], moved: list[Array]) -> float:
-    """The number of groups times the smallest of their chances, at their weight."""
+    """The smallest chance of a group, times the number of groups, divided by their weight."""
     compared = [chance for chance, U in zip(chances, moved, strict=True) if U.shape[1]]
     return len(compared) * min(compared, default=1.0) / OF_GROUPS
 
 
 def _calibrated(smallest: float, size: int, freedom: float, moved: list[Array]) -> float:
-    """How often the smaller of the two chances is as small without a change.
+    """The chance that the smaller of the two chances is so small without a change.
 
     It is counted over random differences, always the same ones. Below ``FEWEST_DRAWS`` of them it is the sum of both
     chances; where everything is one group, it is the joint one.
@@ -220,7 +221,7 @@ def _whitening(covariance: Array) -> Array:
 
 
 def _span(columns: Array) -> Array:
-    """An orthonormal basis of the columns, each of which counts by its direction."""
+    """An orthonormal basis of the columns; only their directions count, not their lengths."""
     length = np.linalg.norm(columns, axis=0)
     columns = columns[:, length > ROUNDING * length.max(initial=0.0)] if length.any() else columns[:, :0]
     if not columns.shape[1]:
@@ -231,7 +232,7 @@ def _span(columns: Array) -> Array:
 
 
 def _own(difference: Array, covariance: Array, free: Array) -> tuple[float, int]:
-    """The squared joint deviation of one group, and the directions it is of: without those that free ones reach."""
+    """The squared joint deviation of one group, without the directions that are free, and the number of directions."""
     U, s, _ = np.linalg.svd(free, full_matrices=True)
     Q = U[:, int((s > SHARE).sum()) :]
     W = _whitening(Q.T @ covariance @ Q)

@@ -83,7 +83,7 @@ def _deviations(test: ChangeTest, name: str) -> str:
 
 
 def share_words(chance: float) -> str:
-    """A chance in words: "23 of 100 comparisons"."""
+    """A chance in words, such as "23 of 100 comparisons"."""
     if chance >= 0.01:
         return f"{100.0 * chance:.0f} of 100 comparisons"
     return "less than one of 100 comparisons"
@@ -120,8 +120,8 @@ def difference(
         Whether the carriers' poses come from the same arm or tracker. A constant error of these, which no residual
         shows, is then the same in both, and does not count in the difference.
     same_measurements : bool
-        Whether the measurements of both are known to be the same, such as by their files' checksums: then nothing is
-        tested. What the numbers themselves show of it is seen without.
+        Whether both are known to have the same measurements, such as by checksums of files: then nothing is tested. The
+        same numbers in both are noticed without this option.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def difference(
 
 
 def as_result(given: object) -> Result:
-    """A result, or a calibration that was just computed as one; OptionError for anything else."""
+    """The given result, or a result made of a calibration. Raises OptionError for anything else."""
     if isinstance(given, Calibration):
         if given.solution is None:
             raise OptionError(f"a calibration to compare has no answer: {given.judgement}")
@@ -236,7 +236,7 @@ SAME = 1e-12
 
 
 def check_same_rig(old: Result, new: Result) -> None:
-    """A FrameError for calibrations that do not say poses of the same frames in the same carriers."""
+    """Raise FrameError if the calibrations do not have poses of the same frames on the same carriers."""
     first, second = old.refined or old.solution, new.refined or new.solution
     if old.log is not None and new.log is not None:
         for what in ("sensor_carrier", "target_carrier"):
@@ -300,7 +300,7 @@ def remarks_of(old: Result, new: Result) -> list[str]:
     return remarks
 
 
-#: An eigenvalue of correlations that is below zero by more than this is none of rounding.
+#: An eigenvalue of correlations below zero by more than this is not a rounding error.
 ROUNDING = 1e-9
 
 
@@ -310,9 +310,9 @@ def has_constant_errors(result: Result) -> bool:
 
 
 def without_constant_errors(result: Result) -> RefinedPoses:
-    """The refined calibration with the covariance that it has beside a constant error of the carriers' poses.
+    """The refined calibration with its covariance less that of a constant error of the carriers' poses.
 
-    As it is where the result does not say what it holds, or where the covariance does not hold that much of it.
+    Unchanged if the result does not state this error, or if the covariance is smaller than that of the error.
     """
     refined, fields = result.refined, result.calibration
     assert refined is not None

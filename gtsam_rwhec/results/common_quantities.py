@@ -89,7 +89,7 @@ class Answer(Protocol):
 
 
 def quantities(old: Answer, new: Answer, without: Collection[UnknownKind] = ()) -> Quantities:
-    """What both have, of frames, scales, time offsets and intrinsics; kinds in ``without`` are left out."""
+    """The frames, scales, time offsets and intrinsics that both have; kinds in ``without`` are left out."""
     unknowns = [unknown for unknown in _common(old, new) if unknown.kind not in without]
     not_compared = {}
     rows: list[tuple[Unknown, Array, tuple[Array, Array], tuple[Array, Array], Array]] = []
@@ -165,7 +165,7 @@ def _why_not(old: Answer, new: Answer, unknown: Unknown, G: tuple[Array, Array])
 
 
 def _is_free(reach: Array, unknown: Unknown) -> bool:
-    """Whether a free direction turns a frame, after which nothing linear is left; or moves a number."""
+    """Whether a free direction turns a frame (no linear model holds then), or changes a number."""
     rows = reach[:3] if unknown.kind is UnknownKind.FRAME else reach
     return bool(reach.shape[1]) and float(np.linalg.norm(rows, axis=1).max()) > SHARE
 

@@ -1,4 +1,4 @@
-"""How much each image tells: its information, what would change without it, and how many images tell nearly all.
+"""The information of each image, what would change without it, and how many images have nearly all information.
 
 At the level of poses, with independent noise: an image is all that one sensor measured at one stamp; without stamps
 each measurement counts by itself.
@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
 from gtsam_rwhec.results.linear_model import OWN, LinearModel, inverse_of
 
-#: More images are chosen in bundles of neighbours.
+#: If there are more images than this, neighbours are chosen together.
 MOST_CHOSEN_FROM = 125
 #: The choice begins with this share of all information, so that every direction has a finite deviation.
 BEGIN = 1e-6
@@ -29,7 +29,7 @@ LISTED = 10
 
 
 class ImageContribution(EvidenceRecord):
-    """What one image tells."""
+    """The contribution of one image."""
 
     sensor: str = Field(description="the sensor's name")
     targets: tuple[str, ...] = Field(description="what it saw")
@@ -43,7 +43,7 @@ class ImageContribution(EvidenceRecord):
 
 
 class Fewer(EvidenceRecord):
-    """How many images tell nearly as much as all."""
+    """How many images have nearly as much information as all."""
 
     growth: float = Field(description="no standard deviation is larger by more than this share")
     bundles: int = Field(description="so many bundles of images are enough, if they are chosen well", ge=0)
@@ -175,7 +175,7 @@ def _stacked(model: LinearModel, J: Array, rows: np.ndarray) -> tuple[np.ndarray
 
 
 def _chosen(model: LinearModel, J: Array, covariance: Array, images: list[np.ndarray]) -> list[float]:
-    """The largest growth of a standard deviation after each image, if each next one is that which tells most.
+    """The largest growth of a standard deviation after each image, if the most informative image comes next each time.
 
     The gain log det(1 + J S J') falls as images are added, so an image whose old gain is below another's new one need
     not be looked at again.

@@ -41,7 +41,7 @@ OF_ALL = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """What the nights say of changes, one for each profile c."""
+    """The evidence of the nights for a change with each profile c."""
 
     S: Array  #: (K, m, m): information of the change beside an unknown baseline
     u: Array  #: (K, m): its score
@@ -77,7 +77,7 @@ class Shifts:
 
 @dataclass(frozen=True)
 class NightTest:
-    """What the chart says at the last night."""
+    """The test of the chart at the last night."""
 
     nights: int  #: In the chart, with those that are its reference
     chance: float  #: The smallest chance over moments and frames; 1 where nothing can be tested
@@ -135,7 +135,7 @@ def shifts(nights: Nights, profiles: Array, correlation: float = 0.0) -> Shifts:
     known = seen.any(axis=0)
     A = A + np.diag(np.where(known, 0.0, 1.0))
     A_inverse = np.linalg.inv(A)
-    # From the mean on, so that nothing cancels.
+    # Numbers are taken relative to their mean, against cancellation.
     first, second = _scores(nights.x, L, R, g[:n], q[:n])
     x = nights.x - np.where(known, A_inverse @ (first - second).sum(axis=0), 0.0)
     first, second = _scores(x, L, R, g[:n], q[:n])
@@ -254,7 +254,7 @@ def _table() -> tuple[Array, dict[float, dict[tuple[int, int], Array]]]:
     return np.array(tree["nights"], float), table
 
 
-#: What a movement of the frames named leaves must be as large by chance in at least this share of series.
+#: Frames explain a change if what is left after their movement has at least this chance.
 EXPLAINED = 0.01
 #: Moments whose log likelihood is less than this below the best one's count as possible.
 POSSIBLE = 3.0
@@ -320,7 +320,7 @@ def change_of(nights: Nights, test: NightTest, spread: Spread) -> ChangeFound:
 def _fewest(
     nights: Nights, found: Shifts, k: int, tested: list[str], spread: Spread
 ) -> tuple[tuple[str, ...], np.ndarray]:
-    """The fewest frames, taken one by one, after which no more than chance is left; and their rows."""
+    """The fewest frames, added one by one, whose movement explains all but chance; and their rows."""
     (everything,), (size,) = (each[[k]] for each in found.ratios())
     chosen: list[str] = []
     rows = np.zeros(0, int)

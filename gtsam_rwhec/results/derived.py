@@ -1,4 +1,4 @@
-"""What follows from a calibration's poses and covariances alone, as people read it: angles, relative poses, points."""
+"""What follows from a calibration's poses and covariances, for people: angles, relative poses, errors of points."""
 
 from __future__ import annotations
 

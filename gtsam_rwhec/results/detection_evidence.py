@@ -29,7 +29,7 @@ from gtsam_rwhec.results.image_errors import (
 )
 from gtsam_rwhec.results.linear_model import MeasuredRows
 
-#: Time is divided into so many pieces: a figure has no more pixels.
+#: Time is divided into this many pieces: a figure cannot show more.
 PIECES = 400
 #: So many rows of detections over time; with more pairs there is one row a sensor.
 MOST_ROWS = 24
@@ -97,7 +97,7 @@ class Marked(Protocol):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Of each measurement."""
+        """The reason of each measurement."""
 
 
 @dataclass(frozen=True, eq=False)

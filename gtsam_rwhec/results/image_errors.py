@@ -1,4 +1,4 @@
-"""A target's corners in one image against where a calibration has them: what pictures and reports show of images."""
+"""Corners in an image against their predictions by a calibration, for pictures and reports."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class WorstImage(EvidenceRecord):
 
 #: Fewer corners than this in an image say nothing beside its pose.
 FEWEST = 4
-#: A corner is far off beyond so many times the median of its image, or the noise.
+#: A corner is far off if its error exceeds this many times the median of its image, or the noise.
 FAR = 6.0
 
 
@@ -109,7 +109,7 @@ class CornerErrors(NamedTuple):
 
 
 def board_of(refined: RefinedPoses, target: str, corners: Array) -> Array:
-    """A target's corners (n, 3) as they were found to be: larger or smaller than stated, and bent."""
+    """A target's corners (n, 3) with its estimated size and warp."""
     scale = refined.scale if isinstance(refined.scale, float) else refined.scale[target]
     shape = np.array([1.0 / scale - 1.0, 0.0, 0.0])
     found = None if refined.reprojection is None else refined.reprojection.boards.get(target)
@@ -130,9 +130,9 @@ def errors_as_measured(camera: Camera, view: SeenView) -> CornerErrors:
 def errors_at_optimum(camera: Camera, view: SeenView, found: Reprojection) -> CornerErrors | None:
     """Errors of an image's corners at the optimum of a refinement from corners; None where an image says nothing.
 
-    A of each image is off there by what its noise and its corners together say.
-    With the derivatives J of the pixels by A's errors over their deviations, and residuals r over the corners' noise:
-    r - J (J' J + I)^-1 J' r, to first order. Corners that are far off do not count.
+    There A of each image has an error too, which its noise and its corners determine together. With the derivatives J
+    of the pixels by A's errors over their deviations, and residuals r over the corners' noise: r - J (J' J + I)^-1 J'
+    r, to first order. Corners that are far off do not count.
     """
     P = view.points
     deviations = np.repeat([found.carrier_rotation_rad, found.carrier_translation_m], 3)

@@ -194,7 +194,7 @@ class MeasuredRows:
         return np.array([not reason for reason in self.reasons], dtype=bool)
 
 
-#: A measurement of a problem that robust estimation left out.
+#: The reason for a measurement that robust estimation left out.
 LEFT_OUT = "farther off than the noise of the others explains"
 
 

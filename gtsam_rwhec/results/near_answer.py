@@ -120,7 +120,7 @@ def near(
 
 
 def _has_all(inliers: Mapping[Pair, np.ndarray]) -> bool:
-    """Whether each pair keeps something: without it, its frames would be no longer there to test."""
+    """Whether each pair keeps measurements. Without any, its frames could not be tested."""
     return all(mask.any() for mask in inliers.values())
 
 
@@ -188,8 +188,8 @@ def stated_as(old: RefinedPoses, problem: Problem) -> Problem:
 def without_gross_errors(old: RefinedPoses, problem: Problem) -> dict[Pair, np.ndarray]:
     """Masks (N,) of measurements that are not far off, as seen from the sensor or from the target.
 
-    A sensor that moved turns all B alike from the left, a target that moved from the right. A measurement that is far
-    from the others' median both ways is a gross error.
+    A sensor that moved changes all B alike by a motion on the left, a target that moved by one on the right. A
+    measurement that is far from the median of the others in both ways is a gross error.
     """
     result = {}
     for pair in problem.pairs:

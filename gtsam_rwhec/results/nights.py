@@ -117,13 +117,13 @@ def _root(information: Array, first: Array) -> Array:
     return root
 
 
-#: The stated covariances count as much as this many squared deviations, which rules before there are any nights.
+#: The stated covariances have the weight of this many squared deviations, so they decide while nights are few.
 STATED_COUNTS = 10.0
-#: Robots' variances differ by this much (variance of the logarithm) before they say so, as PRIOR_ROBOTS would.
+#: The prior of how much robots' variances differ (variance of the logarithm), with the weight of this many robots.
 ROBOTS_DIFFER, PRIOR_ROBOTS = 0.02, 4.0
-#: The correlation's deviation before there are any nights; it lies below the most.
+#: The prior standard deviation of the correlation, and the largest correlation.
 CORRELATION_DEVIATION, MOST_CORRELATION = 0.3, 0.9
-#: A difference that is as large by chance less often is left out.
+#: A difference is left out if the chance of one so large is below this.
 TOO_LARGE = 1e-3
 #: Squared differences of successive nights overlap: of n of them, n / OVERLAP count.
 OVERLAP = 1.5

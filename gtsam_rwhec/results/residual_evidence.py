@@ -17,9 +17,9 @@ from gtsam_rwhec.results.linear_model import LinearModel, inverse_of
 MOST_KEPT = 5_000
 #: The measurements are cut into so many blocks in time, each of which the others predict.
 BLOCKS = 5
-#: Of fewer measurements nothing is said about neighbours in time, or about the configuration.
+#: With fewer measurements, neighbours in time and the configuration are not examined.
 FEWEST = 8
-#: A normal error is beyond three deviations so often.
+#: The chance of a normal error beyond three standard deviations.
 BEYOND_3_BY_CHANCE = 0.0026997960632601866
 #: A dependence counts beyond so many of its standard deviations: that is 1 % for the 72 that are looked at.
 CHANCE_OF_MANY = 3.8

@@ -76,8 +76,8 @@ MOST_REASONS = 3
 def short_of_measurements(log: LogFields, poses: Mapping[str, int]) -> list[Finding]:
     """What speaks against the sensors and targets of the rig file that have no answer, or rest on too few measurements.
 
-    A sensor that was used at fewer than ``FEWEST_OF_A_FRAME`` poses has no answer that anything agrees to. Of a target
-    that was seen at one or two, only its own pose is to be doubted: the sensors' poses do not rest on it.
+    A sensor that was used at fewer than ``FEWEST_OF_A_FRAME`` poses has an answer that nothing can check. If a target
+    was seen at one or two, only its own pose is in doubt: the sensors' poses do not depend on it.
 
     Parameters
     ----------

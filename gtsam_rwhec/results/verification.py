@@ -33,7 +33,7 @@ UNSEEN_TARGET = "the new log has no measurement of it"
 class SensorCheck:
     """How well the old poses predict what a sensor saw in the new log."""
 
-    #: Of the old poses: what a robot that uses them is off by, with the noise of the measurements
+    #: Errors of predictions by the old poses: what a robot that uses them is off by, with the noise of the measurements
     held: PredictionError
     #: Of the poses that fit the new log best: the noise of the measurements. None where none near the old ones fit.
     best: PredictionError | None
@@ -60,7 +60,7 @@ class Verification:
 
     @property
     def holds(self) -> bool:
-        """Whether nothing says that the old calibration no longer holds."""
+        """Whether there is no evidence against the old calibration."""
         return self.test is not None and not self.test.has_changed
 
     @property
@@ -105,7 +105,7 @@ class Verification:
         return f"{shown(name)} {by}: {deviations}"
 
 
-#: Predictions are far off from so many times the old log's residuals on, and from so much on.
+#: Predictions are far off if they exceed this many times the old log's residuals, and these lengths and angles.
 FAR, LEAST_MM, LEAST_DEG = 10.0, 5.0, 0.5
 
 
@@ -175,7 +175,7 @@ def far_off(result: Result, old: RefinedPoses, problem: Problem) -> dict[str, Se
     return checks
 
 
-#: Residuals that are this many times those of the old log are told.
+#: Residuals that are this many times those of the old log are reported.
 NOISIER = 2.0
 
 
