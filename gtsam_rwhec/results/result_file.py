@@ -162,7 +162,11 @@ def parse_tree(content: bytes, path: str | Path) -> dict[str, Any]:
         )
     if header.format_version != FORMAT_VERSION:
         is_newer = header.format_version > FORMAT_VERSION
-        remedy = "Install a newer gtsam-rwhec" if is_newer else "Calibrate again to write a new file"
+        remedy = (
+            "Calibrate again, or install the gtsam-rwhec that wrote it"
+            if is_newer
+            else "Calibrate again to write a new file"
+        )
         raise ResultVersionError(
             f"{path} has version {header.format_version} of the result format (written by {shown(header.written_by)}); "
             f"this gtsam-rwhec reads version {FORMAT_VERSION}. {remedy}."

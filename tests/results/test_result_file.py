@@ -188,7 +188,7 @@ def spoil(written: Path, change: Callable[[dict[str, Any]], object]) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("version", "remedy"), [(FORMAT_VERSION + 1, "Install a newer gtsam-rwhec"), (0, "Calibrate again")]
+    ("version", "remedy"), [(FORMAT_VERSION + 1, "install the gtsam-rwhec that wrote it"), (0, "Calibrate again")]
 )
 def test_another_version_says_what_to_do(written: Path, version: int, remedy: str) -> None:
     spoil(written, lambda raw: raw.update(format_version=version, written_by="gtsam-rwhec 9.9", new_field=1))
