@@ -99,8 +99,8 @@ LEAST_RESIDUAL = 1e-6
 def certified_hand_eye(stations: Stations) -> tuple[Array, Array]:
     """The certified pose of the camera in the gripper.
 
-    The target's own origin is restored: the camera measures the position of this origin. About another origin each
-    rotation error would move the position.
+    The translations are taken about the target's own origin again, since the camera measures its position. About
+    another origin each rotation error would move the position.
     """
     R_A = stations.R_G.transpose(0, 2, 1)  # gripper_T_base
     t_A = -np.einsum("nab,nb->na", R_A, stations.t_G)
@@ -118,9 +118,9 @@ def certified_robot_world(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tup
 def certified_poses(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Array]:
     """X and Y (4, 4) of A X = Y B, solved with unit weights, then with weights from the first answer's residuals.
 
-    OpenCV's calls have no argument for the noise; the residuals of a consistent answer estimate the noise of rotations
-    and of translations. An isotropic rotation of rms angle s has s / sqrt(3) an axis and kappa = 1 / (2 sigma_R^2).
-    OpenCV's calls name no unit either: the solver's unit of length is the spread of the given translations.
+    OpenCV's calls have no argument for the noise, so residuals are used to estimate the noise of rotations and
+    of translations. An isotropic rotation of rms angle s has s / sqrt(3) an axis and kappa = 1 / (2 sigma_R^2).
+    OpenCV's calls have no unit either: the solver's unit of length is the spread of the given translations.
     """
     unit = float(np.sqrt(t_A.var(axis=0).sum() + t_B.var(axis=0).sum())) or 1.0
     A, B = _transforms(R_A, t_A / unit), _transforms(R_B, t_B / unit)

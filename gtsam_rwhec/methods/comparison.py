@@ -2,8 +2,8 @@
 
 Methods for one pair are chained on a problem of many, as people do by hand: each pair of the best tree is solved alone.
 The tree has the pairs with the most measurements (a maximum spanning tree, by Prim's algorithm), without those whose
-own measurements do not determine their frames. A frame takes the pose that it has in the answer of the pair by which
-the tree reaches it. What the other pairs measured counts nowhere: the joint answer's gain is the point of comparing.
+own measurements do not determine their frames. A frame gets its pose from the pair by which the tree
+reaches it. The measurements of all other pairs are not used: the comparison shows what the joint answer gains.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Chained:
 
 
 def undetermined_pairs(problem: Problem, solution: Solution) -> tuple[Pair, ...]:
-    """The pairs whose own measurements do not determine their frames: no tree takes them."""
+    """The pairs whose own measurements do not determine their frames; they are in no tree."""
     alone = solution.identifiability.pairs
     return tuple(pair for pair in problem.pairs if not pair.is_motion and not alone[pair].is_unique)
 
@@ -91,7 +91,7 @@ def solver_of(method: Method[[Problem, MethodOptions]], options: MethodOptions) 
 def solved_pair(problem: Problem, method: str) -> tuple[Array, Array]:
     """X and Y (4, 4) of the one pair of a problem, metres; raises what ``solve_hand_eye`` raises.
 
-    From A_i X = Y B_i of two following measurements, C X = X H with C = A_j^-1 A_i and H = B_j^-1 B_i.
+    Two consecutive measurements A_i X = Y B_i give C X = X H with C = A_j^-1 A_i and H = B_j^-1 B_i.
     """
     (pair,) = problem.pairs
     raw = problem.measurements(*pair)
@@ -124,7 +124,7 @@ def chained(name: str, solver: PairSolver, problem: Problem, solution: Solution)
     problem : Problem
         Of known scale, with raw measurements, without priors.
     solution : Solution
-        The joint answer: it says which pairs are determined alone, and differences are from it.
+        The joint answer: it shows which pairs are determined alone, and differences are relative to it.
     """
     start = time.perf_counter()
     avoided = set(undetermined_pairs(problem, solution))
@@ -292,7 +292,7 @@ def _chained(
     others: Mapping[str, PairSolver],
     progress: Progress | None,
 ) -> tuple[tuple[Chained, ...], tuple[Pair, ...]]:
-    """The methods that take one pair only, and ``others``, on the pairs of the best tree; and pairs that it avoids."""
+    """Methods for one pair only, and ``others``, on the pairs of the best tree; and the undetermined pairs."""
     has_knowledge = bool(problem.fixed or problem.priors) or problem.scale != "known"
     of_poses = [pair for pair in problem.pairs if not pair.is_motion]
     if solution is None or len(of_poses) < 2 or has_knowledge or not problem.keep_measurements:

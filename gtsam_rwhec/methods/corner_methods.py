@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
 from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
 
-#: Boards are as stated.
+#: Boards have their stated shape.
 FLAT = np.zeros(SHAPE)
 
 
@@ -41,7 +41,7 @@ class Corners:
 
     @property
     def number(self) -> int:
-        """How many corners were seen."""
+        """The number of corners that were seen."""
         return sum(int(stack.known.sum()) for stack in self.stacks)
 
     def frames_of(self, stack: Stack) -> tuple[int, int]:
@@ -65,7 +65,7 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where a method's descent ended: the frames (n, 4, 4), its own cost there, its steps, and whether it converged."""
+    """The end of a method's descent: the frames (n, 4, 4), its own cost there, its steps, and whether it converged."""
 
     frames: Array
     cost: float
@@ -132,7 +132,7 @@ def cost_at(corners: Corners, frames: Array, A: Array, deviations: tuple[float, 
 
 
 def _graph_at(corners: Corners, frames: Array, A: Array) -> Graph:
-    """The images' poses as the frames and poses A (I, 4, 4) of the robot have them."""
+    """The graph whose images' poses follow from the frames and the robot's poses A (I, 4, 4)."""
     B = []
     for stack in corners.stacks:
         i, j = corners.frames_of(stack)

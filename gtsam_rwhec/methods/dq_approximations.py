@@ -22,7 +22,7 @@ from gtsam_rwhec.methods.dual_quaternion_cost import DualQuaternionCost, to_tran
 from gtsam_rwhec.methods.hand_eye_request import Request, free_directions, free_of_rotations_alone
 from gtsam_rwhec.methods.method import Outcome
 
-#: DQItr has converged when mu changes by less than this part of Appendix C's range of mu.
+#: DQItr has converged when mu changes by less than this share of Appendix C's range of mu.
 STILL = 1e-13
 #: DQItr stops after this many iterations.
 ITERATIONS = 200
@@ -211,11 +211,11 @@ def outcome_of(request: Request, q: Array) -> Outcome[Array]:
     return Outcome(to_transform(q, best_dual(request.cost, q)), free_directions=free)
 
 
-#: The searches end at this many times eq. 22's gap. The gap is an upper bound, up to rounding.
+#: The searches end at this many times the gap of eq. 22, which is an upper bound up to rounding.
 BEYOND = 1.25
-#: A remainder below this part of its dividend is rounding error: two roots have met.
+#: A remainder below this share of its dividend is rounding error: two roots are equal.
 MET = 1e-15
-#: The resultant's search starts at this part of eq. 22's gap: at 0 one root is mu = 0 and spoils the roots' mean.
+#: The resultant's search starts at this share of eq. 22's gap. At 0 one root is mu = 0, and the roots' mean fails.
 NOT_ZERO = 1e-3
 #: Sturm's interval is halved this many times, to below the rounding of a double.
 BISECTIONS = 60

@@ -32,7 +32,7 @@ from gtsam_rwhec.methods.hand_eye_request import Request, free_directions, free_
 from gtsam_rwhec.methods.method import Outcome
 from gtsam_rwhec.methods.motions import Motions, squared_residuals
 
-#: least_squares stops where a step changes cost or unknowns by less than this part, which is rounding error.
+#: least_squares stops when a step changes cost or unknowns by less than this share, which is rounding error.
 STOP = 1e-15
 #: An entry of a form of unit diagonal has this rounding error.
 ROUNDING = float(np.finfo(np.float64).eps)
@@ -43,13 +43,13 @@ Lift = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def dqnlopt(request: Request) -> Outcome[Array]:
-    """DQNLOpt descends on the cost (8) from DQOpt's answer, where it should stay (Section 4.4)."""
+    """DQNLOpt minimises the cost (8) from DQOpt's answer, and should stay there (Section 4.4)."""
     found = minimum(request.cost)
     return _outcome(request, found, _descend_dual_quaternion(request, to_transform(found.q, found.q_dual)))
 
 
 def dqnlopt_random(request: Request) -> Outcome[Array]:
-    """DQNLOptRnd descends on the cost (8) from a random pose. Some runs end in local minima (Table 1).
+    """DQNLOptRnd minimises the cost (8) from a random pose. Some runs end in local minima (Table 1).
 
     The start's rotation is uniform. Its translation is normal, with the root mean square of the motions' translations.
     """

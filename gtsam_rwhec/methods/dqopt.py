@@ -161,7 +161,7 @@ def bound_at(cost: DualQuaternionCost, found: Minimum) -> float:
 ITERATIONS = 50
 #: Alpha has converged when it changes by less than this part. Residuals give alpha to a few per cent at best.
 STILL = 1e-6
-#: Residuals below this part of the motions' own size are rounding error and tell nothing.
+#: Residuals below this share of the motions' own size are only rounding error.
 ROUNDING = 1e-24
 #: Alpha stays within this factor of its starting value.
 RANGE = 1e6
@@ -172,8 +172,8 @@ def estimate_alpha(motions: Motions, weights: Array | None = None, prior: DualQu
 
     Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2): the likelihood of normal residuals whose two
     sigmas are unknown. For given poses alpha is that ratio, and for given alpha the poses are DQOpt's. Alpha starts as
-    the ratio of the motions' own sizes. Where the residuals are rounding error, it stays as it is. A prior's a and b
-    keep their meaning while alpha changes.
+    the ratio of the motions' own sizes. Where the residuals are rounding error, it stays as it is. The
+    meaning of a prior's a and b does not depend on alpha.
     """
     moments = motion_moments(motions.rows, weights)
     turned, moved = float(np.trace(moments.AA)), float(np.trace(moments.BB))

@@ -107,11 +107,11 @@ HAND_EYE_METHODS: dict[str, Method[[Request]]] = {
 
 #: The cost with a prior has this name, by the prior's form.
 _COST_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
-#: A gap is closed when it is below this part of the cost,
+#: A gap counts as zero when it is below this share of the cost,
 CLOSED = 1e-9
-#: or below this part of the squares that cancel in the cost, which is rounding error,
+#: or below this share of the squares that cancel in the cost, which is rounding error,
 ROUNDING = 1e-12
-#: or below this part of all squares: the cost is then zero.
+#: or below this share of all squares: the cost is then zero.
 NOTHING = 1e-28
 
 

@@ -1,4 +1,4 @@
-"""What every AX = XB method gets, the prior of the DQ paper's cost (Section 3.3), and what the motions leave free."""
+"""The input of every AX = XB method, the prior of the DQ paper's cost (Section 3.3), and the free directions."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Request:
 
 #: Information below this part of the largest is rounding error.
 ROUNDING = 1e-12
-#: A finite difference with this step (rad) tells how the translation follows a turn.
+#: The step (rad) of the finite difference that gives the translation's change with a rotation.
 STEP_RAD = 1e-5
 
 

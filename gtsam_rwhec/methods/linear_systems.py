@@ -146,7 +146,7 @@ def linear_rotations(stack: Stack) -> Array:
 
 
 def rotations_up_to_sign(V: Array) -> Array:
-    """The nearest right-handed rotations to matrices (n, 3, 3) that are known up to a factor of either sign."""
+    """The nearest rotations (det = 1) to matrices (n, 3, 3) that are known up to a factor of either sign."""
     signs = np.where(np.linalg.det(V) < 0.0, -1.0, 1.0)
     return project(signs[:, None, None] * V)
 

@@ -1,4 +1,4 @@
-"""The record of a calibration method: its name, its source, what it assumes, what it takes.
+"""The record of a calibration method: its name, source, assumptions, and the inputs that it accepts.
 
 The record serves A X = Y B and A X = X B. ``run`` and
 ``solve_hand_eye`` check the input against the record, call the method's function for an ``Outcome``, and make an
@@ -52,7 +52,7 @@ class Outcome(Generic[X]):
 
 @dataclass(frozen=True)
 class Proof:
-    """What a method proves of its own cost."""
+    """The bound that a method proves for its own cost."""
 
     cost: float  #: The answer's cost
     cost_name: str  #: The name of this cost, which may differ from ``Estimate.cost_name``.
@@ -105,12 +105,12 @@ Arguments = ParamSpec("Arguments")
 #: Frames that a method solves for at once (RWHEC paper, Table 1). Empty: one X and one Y; "Xs": several Xs and one Y.
 Multiple = Literal["", "Xs or Ys", "Xs", "Xs and Ys"]
 
-#: What most methods assume of the noise (``Method.assumes``).
+#: The assumption of most methods about the noise (``Method.assumes``).
 UNWEIGHTED = "All measurements equally accurate, a radian weighs as much as a metre."
 
 
 class Takes(Enum):
-    """What a method takes besides poses (or motions) of known scale."""
+    """The inputs that a method accepts in addition to poses (or motions) of known scale."""
 
     SHARED_SCALE = "an unknown scale"
     SCALE_PER_TARGET = "an unknown scale for each target"
@@ -200,7 +200,7 @@ def checked_start(
 
 #: A X = Y B of one X and one Y takes this many measurements: they give two motions about axes that are not parallel.
 FEWEST = 3
-#: A method must take this for each kind of scale.
+#: What a method must accept for each kind of scale.
 _FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
     "known": frozenset(),
     "shared": frozenset({Takes.SHARED_SCALE}),

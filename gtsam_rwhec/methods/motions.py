@@ -1,8 +1,8 @@
 """The motions of AX = XB, C_i X = X H_i: checked, with signs of quaternions that agree, and their weights.
 
 The DQ paper's cost depends on the signs of q_C and q_H, and the paper does not say how to choose them. L(q_C) - R(q_H)
-is small for one relative sign only: both quaternions get a scalar part that is not negative. Near half a turn it is
-noise about 0; there the motion takes the sign that agrees with the rotation from the other motions.
+is small for one relative sign only: both quaternions get a scalar part that is not negative. Near half a turn the
+scalar part is noise about 0; there the sign is taken that agrees with the rotation from the other motions.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gtsam_rwhec.geometry.real_numbers import is_between, real_array
 from gtsam_rwhec.methods.dq_saddle import minimum
 from gtsam_rwhec.methods.dual_quaternion_cost import DualQuaternionCost, E, blocks, from_rows, motion_moments, residuals
 
-#: Weights above this, and below its inverse, leave no room for squares and sums in double precision.
+#: Squares and sums of weights above this, or below its inverse, overflow or underflow in double precision.
 LARGEST = 1e100
 
 
@@ -101,11 +101,11 @@ def check_covariances(covariances: ArrayLike | None, count: int) -> Array | None
     return array
 
 
-#: Scalar parts whose sum is below this do not tell the sign: noise of 11 degrees could have changed it.
+#: If the sum of the scalar parts is below this, the sign is uncertain: noise of 11 degrees could change it.
 UNCERTAIN = 0.2
 #: The other motions determine the rotation when M's second eigenvalue is this many times its first.
 DETERMINED = 9.0
-#: Signs and rotation are found from each other this many times.
+#: Rounds in which signs and rotation are found from each other.
 ROUNDS = 3
 
 
@@ -119,7 +119,7 @@ def flipped(rows: Array, sums: Array) -> Array:
 
 
 def resolve_signs(rows: Array, sums: Array, uncertain: NDArray[np.bool_]) -> None:
-    """Choose the signs of the motions ``uncertain`` (N,), whose scalar parts do not tell the sign, in place.
+    """Choose, in place, the signs of the motions ``uncertain`` (N,), whose scalar parts do not determine the sign.
 
     ``rows`` (14, N) are ``Motions.rows``, whose scalar parts are not negative; ``sums`` (2, N) are the sums of the
     scalar parts of q_C and q_H, and of their duals.
@@ -171,7 +171,7 @@ def _candidate_rotations(rows: Array) -> list[Array]:
     return starts
 
 
-#: When all motions are smaller than this (rad, m), nothing moved.
+#: If all motions are smaller than this (rad, m), nothing moved.
 STILL = 1e-14
 
 

@@ -1,4 +1,4 @@
-"""OpenCV's hand-eye calls with its names, arguments, frames, shapes and constants; OpenCV 5's package has none.
+"""OpenCV's hand-eye calls with its names, arguments, frames, shapes and constants. OpenCV 5's package lacks them.
 
 Change one line: ``from gtsam_rwhec.methods import opencv as cv2``. OpenCV's methods give OpenCV's answers (from
 the same motions between all pairs of poses) in a fraction of its time. Two methods are this library's: DQOpt over the
@@ -38,7 +38,7 @@ from gtsam_rwhec.methods.opencv_methods import (
     tsai,
 )
 
-#: Two motions about different axes need at least this many poses; OpenCV asks for as many.
+#: Two motions about different axes need at least this many poses; OpenCV requires the same.
 FEWEST_POSES = 3
 #: Second row times third row, entries (1, 2), (2, 0), (0, 1), then (2, 1), (0, 2), (1, 0): their cross product.
 _NEXT, _AFTER = [4, 5, 3, 5, 3, 4], [8, 6, 7, 7, 8, 6]
@@ -74,7 +74,7 @@ def check_counts(first: int, second: int, names: tuple[str, str]) -> None:
 
 
 def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
-    """Raise UnderdeterminedError for motions R_j' R_i that leave every method's answer free.
+    """Raise UnderdeterminedError for motions R_j' R_i that determine no method's answer.
 
     Over all ordered pairs, the sum of I - R_j' R_i is N^2 I - (sum R)'(sum R). No motion turns a vector of its null
     space. The matrix is zero when nothing rotates, and has rank two when all motions rotate about one axis.

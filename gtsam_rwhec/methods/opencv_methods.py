@@ -24,7 +24,7 @@ from gtsam_rwhec.methods.linear_systems import solve_scaled
 from gtsam_rwhec.methods.motions import UNCERTAIN
 from gtsam_rwhec.solver.rotations import project
 
-#: Turning of the axes below this share of the largest possible turning is rounding error.
+#: Rotation of the axes below this share of the largest possible one is rounding error.
 PARALLEL = 1e-13
 #: A block has at most about this many pairs: a dozen arrays of this size stay within the processor's cache.
 BLOCK_PAIRS = 1 << 15
@@ -223,7 +223,7 @@ def _log_factor(q: Array) -> Array:
 
 #: An eigenvalue below this of the scaled normal equations is rounding error.
 SINGULAR = 1e-15
-#: A user reads this when the poses leave entries of the rotation free.
+#: The message if the poses do not determine all entries of the rotation.
 LENGTH_UNKNOWN = (
     "{} linear system finds the rotation's length from the translations, and these do not determine it: the gripper "
     "only turned, or hardly moved; move the gripper, or use another method"

@@ -41,7 +41,7 @@ from gtsam_rwhec.solver.solve_options import check_against_knowledge, check_type
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an answer costs, how well it fits, and what it leaves free.
+    """An answer's cost, its residuals, and its free directions.
 
     The cost is J (eq. 18) with priors, in the inverse form where the certified solver uses the inverse form. Larger
     residuals leave more directions free.

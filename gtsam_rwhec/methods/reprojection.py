@@ -48,7 +48,7 @@ from gtsam_rwhec.problem.problem import Problem
 OURS = "refine_corners"
 #: The published methods.
 NAMES = ("evangelista2023", "tabb2017_rp1")
-#: A descent from a start (n, 4, 4) with at most so many steps.
+#: A descent from a start (n, 4, 4); the number is its most steps.
 Descend = Callable[[Corners, Array, int], Minimum]
 
 
@@ -60,7 +60,7 @@ class ReprojectionAnswer:
     #: T_targetcarrier_target and T_sensorcarrier_sensor, metres
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
-    #: The method's own, over corner_px^2, halved; of ``refine_corners`` with a noise of A, that of the graph
+    #: Half the method's own cost, over corner_px^2; for ``refine_corners`` with noise of A, the graph's cost
     cost: float
     #: Half the sum of squared reprojection errors by the measured A, over corner_px^2: the same for all methods.
     #: Infinite where a corner that was seen is behind its camera.
@@ -188,7 +188,7 @@ def compare(
 
 
 def certified_start(observations: Observations, options: MethodOptions | None = None) -> tuple[Poses, Poses]:
-    """X and Y of the certified solution of the images' poses, whose two candidates it chooses between."""
+    """X and Y of the certified solution, which also chooses between the two candidate poses of each image."""
     options = options or MethodOptions()
     solution = solved_with_chosen_poses(
         observations, lambda problem: quiet_solution(problem, options), lambda answer: (answer.X, answer.Y)
