@@ -28,7 +28,7 @@ from gtsam_rwhec.solver.answers import Action, Answer, Evaluation, Point, as_poi
 from gtsam_rwhec.solver.block_matrix import sum_into
 from gtsam_rwhec.solver.full_form import ALPHA, SIDES, Slots, rounding_of_fixed
 from gtsam_rwhec.solver.parts import Given, Part
-from gtsam_rwhec.solver.residual_sums import Coefficients, Measured, Sums, plain_sums, weighted_sums
+from gtsam_rwhec.solver.residual_sums import Coefficients, Measured, Sums, cost_sums, weighted_sums
 
 #: An upper limit of the rounded operations of a prior after its residual, which is accurate to one rounding.
 OPERATIONS = 40
@@ -356,7 +356,7 @@ class MeasuredForm:
         gradient, gradient_error = np.zeros((2, size))
         for at in self._blocks():
             measured, coefficients = self._coefficients(ends(at), at)
-            sums = plain_sums(measured, coefficients) or weighted_sums(measured, coefficients)
+            sums = cost_sums(measured, coefficients)
             cost += 0.5 * float(np.sum(sums.products))
             error += 0.5 * float(sums.products_error.sum())
             for whole, of_block in zip((gradient, gradient_error), self._by_variables(sums, range(1), at), strict=True):
@@ -381,10 +381,9 @@ class MeasuredForm:
         result, bound = np.zeros((size, D)), np.zeros((size, D))
         for d in directions:
             at = slice(12 * d, 12 * d + 12)
-            value = _by_pair(sums.front[..., at], sums.back[..., at], sums.one[:, at], 1.0)
-            error = _by_pair(sums.front_error[..., at], sums.back_error[..., at], sums.one_error[:, at], -1.0)
-            front, back, one = (np.abs(each[..., at]) for each in (sums.front, sums.back, sums.one))
-            error += gamma(8) * _by_pair(front, back, one, -1.0)
+            value = _by_pair(*(each[..., at] for each in sums.by_features), 1.0)
+            error = _by_pair(*(each[..., at] for each in sums.by_features_error), -1.0)
+            error += gamma(8) * _by_pair(*(np.abs(each[..., at]) for each in sums.by_features), -1.0)
             shares = 0.5 * np.einsum("ep,epq->eq", value, S)
             slack = 0.5 * np.einsum("ep,epq->eq", error + gamma(E + 40) * np.abs(value), np.abs(S))
             of_fixed = self._of_fixed[at_pairs]

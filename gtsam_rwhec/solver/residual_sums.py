@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import fsum
 
 import numpy as np
 
-from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import Doubled, gamma
 from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.solver.block_matrix import sum_into
 from gtsam_rwhec.solver.parts import SMALL, Shared
 
 #: This many measurements are evaluated at once: the slices of a block stay in the processor's cache.
@@ -35,6 +35,16 @@ COEFFICIENT_BITS = 28
 LOW_PART = 2.0**-70
 #: Operations of a residual's last sum, its weight, and its square.
 _FEW = 12
+#: The kind of weight of each residual, kappa or 1 / sigma^2.
+_KINDS = np.repeat(np.eye(2), (9, 3), axis=1)
+#: Where the translation is among a pose's twelve features.
+_T = slice(3, 12, 4)
+#: Operations of a residual in plain doubles: 24 products, a constant, and the low parts of its coefficients.
+OPERATIONS = 30
+#: From so many measurements on, sums of plain doubles are tried first: the exact ones take longer.
+MANY = 10_000
+#: Plain sums are used if the cost's relative error is below this: a hundredth of a percent of the tolerance.
+KNOWN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -87,18 +97,15 @@ class Sums:
     """Weighted sums over the measurements of each pair, each with a bound on its rounding.
 
     ``products``: of products of residuals in two directions; (E, 1, 1, 12) for one direction, and for several the sum
-    over pairs and residuals, (1, D, D, 1). ``front``, ``back`` (E, 12, 12 D) and
-    ``one`` (E, 12 D): of features times residuals, with the translations of A about the gauge.
+    over pairs and residuals, (1, D, D, 1). ``by_features``: of features times residuals, for the features [R | t] of
+    the front and of the back pose, with the translations of A about the gauge, (E, 12, 12 D) each, and for one
+    (E, 12 D).
     """
 
     products: Array
     products_error: Array
-    front: Array
-    front_error: Array
-    back: Array
-    back_error: Array
-    one: Array
-    one_error: Array
+    by_features: list[Array]
+    by_features_error: list[Array]
 
 
 def stacks_of(measured: Measured) -> Iterator[Stack]:
@@ -149,72 +156,60 @@ def _rows(T: Array) -> Array:
     return T.reshape(len(T), 16)[:, :12]
 
 
-def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
-    """Sum the products of residuals, and of features with residuals, over all measurements of each pair."""
-    pairs = len(measured.a)
-    outputs = coefficients.one.hi.shape[1]
+def cost_sums(measured: Measured, coefficients: Coefficients) -> Sums:
+    """The sums for one direction, in plain doubles where there are many measurements and these are accurate enough."""
+    if measured.count >= MANY:
+        plain = weighted_sums(measured, coefficients, exact=False)
+        if plain.products_error.sum() <= KNOWN * plain.products.sum():
+            return plain
+    return weighted_sums(measured, coefficients)
+
+
+def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool = True) -> Sums:
+    """Sum the products of residuals, and of features with residuals, over all measurements of each pair.
+
+    Without ``exact`` the residuals are rounded as doubles are, and their bounds are larger.
+    """
+    pairs, outputs = coefficients.one.hi.shape
     D = outputs // 12
-    products: dict[int, list[Array]] = {}
     # In several directions only the sum over pairs and residuals counts: one product of matrices makes it.
-    shape = (pairs, 1, 1, 12) if D == 1 else (1, D, D, 1)
-    products_error = np.zeros(shape)
-    tables: list[Array] = [np.zeros((pairs, 12, outputs)), np.zeros((pairs, 12, outputs)), np.zeros((pairs, outputs))]
-    errors, sizes = ([np.zeros_like(table) for table in tables] for _ in range(2))
-    for stack in stacks_of(measured):
-        front, back = (stack.B, stack.A) if measured.is_swapped else (stack.A, stack.B)
-        r, low = _residuals(stack.pairs, front, back, coefficients)
+    shapes = (pairs, 1, 1, 12) if D == 1 else (1, D, D, 1), (pairs, 12, outputs), (pairs, 12, outputs), (pairs, outputs)
+    tables, errors, sizes = ([np.zeros(shape) for shape in shapes] for _ in range(3))
+    number = 0
+    for number, stack in enumerate(stacks_of(measured), start=1):
+        of_A_and_B = slice(None, None, -1 if measured.is_swapped else 1)
+        r, low = _residuals(stack.pairs, *(stack.A, stack.B)[of_A_and_B], coefficients, exact=exact)
         A, off = _centred(stack, measured)
-        front, back = (stack.B, A) if measured.is_swapped else (A, stack.B)
         k, m = stack.weight.shape
-        is_once = len(np.unique(stack.pairs)) == k  # a pair may have several batches in a stack
-        weights = np.empty((k, m, 12))
-        weights[:, :, :9], weights[:, :, 9:] = stack.kappa[:, :, None], stack.weight[:, :, None]
-        of_directions = r.reshape(k, m, D, 12)
-        weighted = of_directions * weights[:, :, None, :]
-        own = np.einsum("kmdo,kmdo->kdo", weighted, of_directions)
+        residuals, weights = r.reshape(k, m, D, 12), np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
+        weighted = residuals * weights[:, :, None, :]
         flat = weighted.reshape(k, m, outputs)
         unit = gamma(m + _FEW)
-        total = np.repeat(weights.sum(axis=1)[:, None, :], D, axis=1)  # (k, D, 12)
+        of_ones = np.sqrt(np.ones(m) @ weights)[:, None, :]
         # |r| has an error of low: by Cauchy and Schwarz each root of a sum of squares is off by sqrt(total) low.
-        slack = np.sqrt(total) * low.reshape(k, D, 12)
+        slack = of_ones * low.reshape(k, D, 12)
+        own = np.einsum("kmdo,kmdo->kdo", weighted, residuals)
         root = np.sqrt(np.maximum(own, 0.0)) * (1.0 + unit) + slack
         if D == 1:
             square, places = own[:, :, None], stack.pairs
             error = (unit * root * root + 2.0 * slack * root)[:, :, None]
         else:
-            square, error = _together(weighted, of_directions, root, slack)
+            square, error = _together(weighted, residuals, root, slack)
             places = np.zeros(1, dtype=int)
-        one = flat.sum(axis=1)
-        one_error = (np.sqrt(total) * (unit * root + slack)).reshape(k, outputs)
-        front_reach, back_reach = np.abs(front).max(axis=1), np.abs(back).max(axis=1)
-        of_size = (np.sqrt(total) * root).reshape(k, 1, outputs) * off[:, :, None]
-        np.add.at(products_error, places, error)
-        for pair, of_pair in zip(places.tolist(), square, strict=True):
-            products.setdefault(pair, []).append(of_pair)
-        new = (np.matmul(front.transpose(0, 2, 1), flat), np.matmul(back.transpose(0, 2, 1), flat), one)
-        reaches = [front_reach[:, :, None] * one_error[:, None], back_reach[:, :, None] * one_error[:, None], one_error]
-        reaches[int(measured.is_swapped)] += of_size
-        for table, bound, size, value, reach in zip(tables, errors, sizes, new, reaches, strict=True):
-            for total_of_pairs, of_stack in ((table, value), (bound, reach), (size, np.abs(value))):
-                if is_once:
-                    total_of_pairs[stack.pairs] += of_stack
-                else:
-                    np.add.at(total_of_pairs, stack.pairs, of_stack)
-    # Blocks of one pair are added exactly, so a million measurements have no larger rounding error than one block.
-    summed = np.zeros(shape)
-    for pair, parts in products.items():
-        if len(parts) == 1:
-            summed[pair] = parts[0]
-        else:
-            columns = np.array(parts).reshape(len(parts), -1).T
-            summed[pair] = np.reshape([fsum(column) for column in columns], shape[1:])
-    blocks = gamma(2 + max((len(parts) for parts in products.values()), default=1))
+        one_error = (of_ones * (unit * root + slack)).reshape(k, 1, outputs)
+        of_poses, of_errors = [], []
+        for poses, rounding in ((A, off), (stack.B, np.zeros((k, 12))))[of_A_and_B]:
+            of_poses.append(np.matmul(poses.transpose(0, 2, 1), flat))
+            reach = _reach(poses)[:, :, None] * one_error
+            of_errors.append(reach + rounding[:, :, None] * (of_ones * root).reshape(k, 1, outputs))
+        values, bounds = (square, *of_poses, np.ones(m) @ flat), (error, *of_errors, one_error[:, 0])
+        for table, bound, size, value, of_value in zip(tables, errors, sizes, values, bounds, strict=True):
+            for whole, of_stack in ((table, value), (bound, of_value), (size, np.abs(value))):
+                sum_into(whole, places if len(whole) == 1 else stack.pairs, of_stack)
     for bound, size in zip(errors, sizes, strict=True):
-        bound += blocks * size
+        bound += gamma(number + 2) * size
         bound *= 1.0 + 1e-9
-    products_error += gamma(2) * np.abs(summed)
-    products_error *= 1.0 + 1e-9
-    return Sums(summed, products_error, tables[0], errors[0], tables[1], errors[1], tables[2], errors[2])
+    return Sums(tables[0], errors[0], tables[1:], errors[1:])
 
 
 def _together(weighted: Array, residuals: Array, root: Array, slack: Array) -> tuple[Array, Array]:
@@ -233,18 +228,20 @@ def _together(weighted: Array, residuals: Array, root: Array, slack: Array) -> t
 
 def _centred(stack: Stack, measured: Measured) -> tuple[Array, Array]:
     """A with its translations about the gauge, t_A + R_A c - a, and a bound (k, 12) on their rounding."""
-    k, m = stack.weight.shape
+    k = len(stack.pairs)
     A, a, c = stack.A.copy(), measured.a[stack.pairs], measured.c[stack.pairs]
-    rows = A.reshape(k, m, 3, 4)
-    rows[..., 3] += np.matmul(rows[..., :3], c[:, None, :, None])[..., 0] - a[:, None, :]
-    rows[stack.weight == 0.0] = 0.0  # padding
-    off = np.zeros((k, 3, 4))
-    off[:, :, 3] = np.abs(stack.A.reshape(k, m, 3, 4)[..., 3]).max(axis=1) + np.abs(c).sum(axis=1)[:, None] + np.abs(a)
-    return A, 8.0 * gamma(1) * off.reshape(k, 12)
+    turned = np.zeros((k, 12, 3))
+    for i in range(3):
+        turned[:, 4 * i : 4 * i + 3, i] = c
+    is_filled = stack.weight[:, :, None] > 0.0  # and no padding
+    A[:, :, _T] += (np.matmul(stack.A, turned) - a[:, None, :]) * is_filled
+    off = np.zeros((k, 12))
+    off[:, _T] = _reach(stack.A[:, :, _T]) + np.abs(c).sum(axis=1)[:, None] + np.abs(a)
+    return A, 8.0 * gamma(1) * off
 
 
 def _residuals(
-    pairs: np.ndarray, front_rows: Array, back_rows: Array, coefficients: Coefficients
+    pairs: np.ndarray, front_rows: Array, back_rows: Array, coefficients: Coefficients, *, exact: bool
 ) -> tuple[Array, Array]:
     """Residuals (k, m, 12 D), to their last digit and an absolute error of at most the second array (k, 12 D)."""
     front, back, one = (
@@ -253,7 +250,11 @@ def _residuals(
     front_unit, back_unit = _feature_units(front_rows), _feature_units(back_rows)
     total = (front_unit[:, :, None] * np.abs(front.hi)).sum(axis=1)
     total += (back_unit[:, :, None] * np.abs(back.hi)).sum(axis=1) + np.abs(one.hi)
-    top: Array = _power_above(total * (1.0 + 1e-9))
+    total *= 1.0 + 1e-9
+    if not exact:
+        plain = np.matmul(front_rows, front.hi) + np.matmul(back_rows, back.hi) + one.hi[:, None, :]
+        return plain, gamma(OPERATIONS) * total
+    top: Array = _power_above(total)
     result: Array = np.zeros((*front_rows.shape[:2], total.shape[1]))
     low = np.zeros_like(result)
     for x, unit, c in ((front_rows, front_unit, front), (back_rows, back_unit, back)):
@@ -275,7 +276,13 @@ def _residuals(
 
 def _feature_units(x: Array) -> Array:
     """A power of two (k, 12) that no feature of a batch exceeds."""
-    return _power_above(np.abs(x).max(axis=1))
+    return _power_above(_reach(x))
+
+
+def _reach(x: Array) -> Array:
+    """The largest absolute value of each feature, (k, f) of (k, m, f): quick along contiguous numbers."""
+    result: Array = np.abs(np.ascontiguousarray(x.transpose(0, 2, 1))).max(axis=2)
+    return result
 
 
 def _power_above(values: Array) -> Array:
@@ -283,207 +290,3 @@ def _power_above(values: Array) -> Array:
     mantissa, exponent = np.frexp(values)
     powers: Array = np.where(values > 0.0, np.ldexp(1.0, exponent - (mantissa == 0.5)), 1.0)
     return powers
-
-
-#: With fewer measurements the exact sums are quick enough.
-MANY = 10_000
-#: Plain sums are used if the cost's relative error is below this: a hundredth of a percent of the tolerance.
-KNOWN = 1e-10
-#: A residual sums 24 products, a constant, and the low parts of its coefficients.
-OPERATIONS = 30
-#: Operations of a centred translation, and of weights and squares.
-_FEW_MORE = 16
-#: The square of an entry of a rotation that was not refused is at most this.
-_OF_ROTATION = 1.0 + ROTATION_TOLERANCE
-#: Where the translation is among a pose's twelve features.
-_T = slice(3, 12, 4)
-
-
-def plain_sums(measured: Measured, coefficients: Coefficients) -> Sums | None:
-    """The sums for one direction; None for few measurements, or if sums in doubles are not accurate enough.
-
-    The result is that of `exact_residuals.weighted_sums`, with larger bounds.
-    """
-    if coefficients.one.hi.shape[1] != 12 or measured.count < MANY:
-        return None
-    pairs = len(measured.a)
-    products, products_error = np.zeros((pairs, 12)), np.zeros((pairs, 12))
-    tables: list[Array] = [np.zeros((pairs, 12, 12)), np.zeros((pairs, 12, 12)), np.zeros((pairs, 12))]
-    errors, sizes = ([np.zeros_like(table) for table in tables] for _ in range(2))
-    front, back, one = (each.hi for each in (coefficients.front, coefficients.back, coefficients.one))
-    counts = np.zeros(pairs, dtype=int)
-    for at, own in _sums_of(measured, (back, front) if measured.is_swapped else (front, back), one):
-        of_A, of_B = (back[at], front[at]) if measured.is_swapped else (front[at], back[at])
-        square, error, by_A, by_B, by_one = own.bounded(of_A, of_B, one[at], measured.a[at], measured.c[at])
-        np.add.at(products, at, square)
-        np.add.at(products_error, at, error)
-        by_front, by_back = (by_B, by_A) if measured.is_swapped else (by_A, by_B)
-        np.add.at(counts, at, 1)
-        for table, bound, size, (value, reach) in zip(tables, errors, sizes, (by_front, by_back, by_one), strict=True):
-            np.add.at(table, at, value)
-            np.add.at(bound, at, reach)
-            np.add.at(size, at, np.abs(value))
-    batches = gamma(int(counts.max(initial=0)) + 2)
-    for bound, size in zip(errors, sizes, strict=True):
-        bound += batches * size
-        bound *= 1.0 + 1e-9
-    products_error += batches * products
-    products_error *= 1.0 + 1e-9
-    if not products_error.sum() <= KNOWN * products.sum():
-        return None
-    shape = (pairs, 1, 1, 12)
-    return Sums(
-        products.reshape(shape),
-        products_error.reshape(shape),
-        tables[0],
-        errors[0],
-        tables[1],
-        errors[1],
-        tables[2],
-        errors[2],
-    )
-
-
-def _sums_of(
-    measured: Measured, of_A_and_B: tuple[Array, Array], one: Array
-) -> Iterator[tuple[np.ndarray, _BatchSums]]:
-    """Pairs (k,) and the sums over one batch of each pair; small batches come many at once."""
-    of_A, of_B = of_A_and_B
-    for stack in small_stacks(measured):
-        at = stack.pairs
-        yield at, _BatchSums.of_stack(stack, of_A[at], of_B[at], one[at], measured.a[at], measured.c[at])
-    for pair, raw in measured.batches:
-        if len(raw.A) > SMALL:
-            own = _BatchSums.of(raw, of_A[pair], of_B[pair], one[pair], measured.a[pair], measured.c[pair])
-            yield np.array([pair]), own
-
-
-def _wide(of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Matrices from A, from B and from 1 to the columns [12 residuals, t_A + R_A c - a, t_A, t_B, 1] of k pairs."""
-    k = len(one)
-    wide_A, wide_B, constant = np.zeros((k, 12, 22)), np.zeros((k, 12, 22)), np.zeros((k, 22))
-    wide_A[:, :, :12], wide_B[:, :, :12], constant[:, :12] = of_A, of_B, one
-    for i in range(3):
-        wide_A[:, 4 * i : 4 * i + 3, 12 + i] = c
-        wide_A[:, 4 * i + 3, 12 + i] = wide_A[:, 4 * i + 3, 15 + i] = wide_B[:, 4 * i + 3, 18 + i] = 1.0
-    constant[:, 12:15], constant[:, 21] = -a, 1.0
-    return wide_A, wide_B, constant
-
-
-@dataclass(frozen=True)
-class _BatchSums:
-    """Sums over a batch of each of k pairs: squares of translations and residuals, features times residuals, weights.
-
-    Columns of residuals have two kinds of weights, nine times kappa and three times 1 / sigma^2; so every translation
-    has two sums of squares.
-    """
-
-    count: int  #: of the longest batch
-    square: Array  #: (k, 12)
-    total: Array  #: (k, 12), of the weights
-    one: Array  #: (k, 12)
-    by_A: Array  #: (k, 12, 12)
-    by_B: Array  #: (k, 12, 12)
-    by_t: Array  #: (k, 3, 12)
-    #: (k, 9, 12): squares of the translations of A about the gauge, of A, and of B, by the weights of the residuals.
-    translations: Array
-
-    @staticmethod
-    def of(raw: Measurements, of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> _BatchSums:
-        """One pass over a batch, with few products of wide matrices: operations on narrow ones take as long."""
-        n = len(raw.A)
-        A, B = raw.A.reshape(n, 16)[:, :12], raw.B.reshape(n, 16)[:, :12]
-        is_uniform = raw.sigma.strides == (0,) and raw.kappa.strides == (0,)
-        (wide_A,), (wide_B,), (constant,) = _wide(of_A[None], of_B[None], one[None], a[None], c[None])
-        by_A, by_B = np.zeros((12, 12)), np.zeros((12, 12))
-        of_kappa, of_weight = np.zeros((22, 22)), np.zeros((22, 22))
-        size = min(BLOCK, n)
-        columns_of_all, second_of_all = np.empty((size, 22)), np.empty((size, 22))
-        for first in range(0, n, BLOCK):
-            block = slice(first, min(first + BLOCK, n))
-            k = block.stop - first
-            columns, second = columns_of_all[:k], second_of_all[:k]
-            np.matmul(A[block], wide_A, out=columns)
-            columns += np.matmul(B[block], wide_B, out=second)
-            columns += constant
-            flat = columns[:, :12]
-            if is_uniform:
-                of_kappa[:, :21] += columns.T @ columns[:, :21]  # a product of a matrix with itself is slower
-            else:
-                kappa, weight = raw.kappa[block, None], 1.0 / raw.sigma[block, None] ** 2
-                of_kappa += columns.T @ (columns * kappa)
-                of_weight += columns.T @ (columns * weight)
-                flat = np.concatenate([columns[:, :9] * kappa, columns[:, 9:12] * weight], axis=1)
-            by_A += A[block].T @ flat
-            by_B += B[block].T @ flat
-        if is_uniform:
-            of_kappa[21, 21] = n
-            weights = np.repeat([float(raw.kappa[0]), 1.0 / float(raw.sigma[0]) ** 2], [9, 3])
-            of_weight = of_kappa * weights[-1]
-            of_kappa *= weights[0]
-            by_A *= weights
-            by_B *= weights
-        return _BatchSums._of_products(n, of_kappa[None], of_weight[None], by_A[None], by_B[None])
-
-    @staticmethod
-    def of_stack(stack: Stack, of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> _BatchSums:
-        """The sums over small batches of k pairs; padding has weight zero."""
-        wide_A, wide_B, constant = _wide(of_A, of_B, one, a, c)
-        columns = np.matmul(stack.A, wide_A) + np.matmul(stack.B, wide_B) + constant[:, None, :]
-        turned = columns.transpose(0, 2, 1)
-        weighted = columns * stack.kappa[:, :, None], columns * stack.weight[:, :, None]
-        flat = np.concatenate([weighted[0][:, :, :9], weighted[1][:, :, 9:12]], axis=2)
-        return _BatchSums._of_products(
-            columns.shape[1],
-            np.matmul(turned, weighted[0]),
-            np.matmul(turned, weighted[1]),
-            np.matmul(stack.A.transpose(0, 2, 1), flat),
-            np.matmul(stack.B.transpose(0, 2, 1), flat),
-        )
-
-    @staticmethod
-    def _of_products(count: int, of_kappa: Array, of_weight: Array, by_A: Array, by_B: Array) -> _BatchSums:
-        """The sums from the weighted products of all columns, (k, 22, 22) for each kind of weight."""
-        by_residual = np.concatenate([of_kappa[:, :, :9], of_weight[:, :, 9:12]], axis=2)
-        squares = (
-            np.repeat(np.einsum("kii->ki", each)[:, 12:, None], columns, axis=2)
-            for each, columns in ((of_kappa, 9), (of_weight, 3))
-        )
-        of_features = np.concatenate(list(squares), axis=2)
-        return _BatchSums(
-            count,
-            np.einsum("kii->ki", by_residual[:, :12]).copy(),
-            of_features[:, 9],
-            by_residual[:, 21],
-            by_A,
-            by_B,
-            by_residual[:, 12:15],
-            of_features[:, :9],
-        )
-
-    def bounded(
-        self, of_A: Array, of_B: Array, one: Array, a: Array, c: Array
-    ) -> tuple[Array, Array, tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:
-        """The squares (k, 12), by A and by B (k, 12, 12) and by one (k, 12), each followed by a bound on its error."""
-        up = 1.0 + 1e-9
-        of_ones: Array = np.sqrt(self.total) * up
-        k = len(of_ones)
-        of_t, of_A_t, of_B_t = (np.sqrt(self.translations).reshape(k, 3, 3, 12) * up).transpose(1, 0, 2, 3)
-        A_size, B_size = np.empty((k, 12, 12)), np.empty((k, 12, 12))
-        A_size[...] = B_size[...] = np.sqrt(_OF_ROTATION) * up * of_ones[:, None, :]
-        A_size[:, _T], B_size[:, _T] = of_A_t, of_B_t
-        # The root of the weighted sum of squares of the residuals' own errors.
-        terms = np.abs(one) * of_ones
-        terms += np.einsum("kfo,kfo->ko", np.abs(of_A), A_size)
-        terms += np.einsum("kfo,kfo->ko", np.abs(of_B), B_size)
-        slack = gamma(OPERATIONS) * up * terms
-        unit = gamma(min(BLOCK, self.count) + -(-self.count // BLOCK) + _FEW_MORE)
-        root = np.sqrt(self.square) * up + slack
-        error = unit * root * root + 2.0 * slack * root
-        off = unit * root + slack
-        by_A, A_error = self.by_A.copy(), A_size * off[:, None, :]
-        reach = np.abs(c).sum(axis=1)[:, None] + np.abs(a)
-        of_centring = 8.0 * gamma(1) * (of_A_t + reach[:, :, None] * of_ones[:, None, :])
-        by_A[:, _T] = self.by_t
-        A_error[:, _T] = of_t * off[:, None, :] + of_centring * root[:, None, :]
-        return self.square, error, (by_A, A_error), (self.by_B, B_size * off[:, None, :]), (self.one, of_ones * off)
