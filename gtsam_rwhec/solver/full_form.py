@@ -34,60 +34,32 @@ class Slots:
     """Where the variables of each pair are in the form.
 
     ``frames`` (E, 2) are the free frames of target and sensor, by their places, one past the last where there is none;
-    a motion has its sensor alone. The 25 variables of a pair come from the 28 numbers of these frames (13 each), alpha
-    and h, by ``matrices``.
+    a motion has its sensor alone. Each of a pair's 25 variables is one of the 28 numbers of these frames (13 each),
+    alpha and h, at ``place`` (E, 25), times ``factor`` (E, 25).
     """
 
     frames: np.ndarray
-    #: (E, 2): where the numbers of target and sensor begin among the 28, 0 or 13; -1 for a fixed frame.
-    first: np.ndarray
-    #: (E, 2): the row of ``poses`` for fixed frames, and else -1.
-    fixed: np.ndarray
-    #: (K, 12): [t, vec R] of the fixed frames, as the form's variables.
-    poses: Array
-    t_of_fixed: int  #: which of the 28 numbers multiplies a fixed frame's translation
-    scale_at: np.ndarray  #: (E,): which of the 28 numbers is the pair's scale variable
-    scale: Array  #: (E,): and times what
+    place: np.ndarray
+    factor: Array
 
-    def matrices(self, at: slice | np.ndarray = slice(None)) -> Array:
-        """Matrices (k, 25, 28) from k pairs' 28 numbers to their 25 variables. They are large: ask for few pairs."""
-        first, fixed = self.first[at], self.fixed[at]
-        k = len(first)
-        S = np.zeros((k, 25, 28))
-        for side, (t, r) in enumerate(((0, 7), (3, 16))):
-            free = np.flatnonzero(first[:, side] >= 0)
-            begin = first[free, side]
-            for i in range(3):
-                S[free, t + i, begin + i] = 1.0
-            for i in range(9):
-                S[free, r + i, begin + 4 + i] = 1.0
-            known = np.flatnonzero(first[:, side] < 0)
-            pose = self.poses[fixed[known, side]]
-            S[known, t : t + 3, self.t_of_fixed] = pose[:, :3]
-            S[known, r : r + 9, H] = pose[:, 3:]
-        S[np.arange(k), 6, self.scale_at[at]] = self.scale[at]
-        return S
+    def variables(self, numbers: Array, at: slice) -> Array:
+        """The variables (k, 25, D) of the pairs' numbers (k, 28, D)."""
+        place = self.place[at].astype(int)[:, :, None]
+        result: Array = np.take_along_axis(numbers, place, axis=1) * self.factor[at][:, :, None]
+        return result
 
-    def alike(self, at: slice) -> list[tuple[np.ndarray, np.ndarray | None]]:
-        """Sets of pairs of a slice with the same layout, and the index (of 25) of each number's variable.
+    def summed(self, values: Array, at: slice) -> Array:
+        """Values of the pairs' variables (k, 25), summed by numbers (k, 28)."""
+        k = len(values)
+        index = self.place[at] + 28 * np.arange(k)[:, None]
+        return np.bincount(index.ravel(), values.ravel(), minlength=28 * k).reshape(k, 28)
 
-        -1 stands for none. Pairs with a fixed frame, and motions, are one set without such a table.
-        """
-        first, scale_at = self.first[at], self.scale_at[at]
-        is_plain = (first >= 0).all(axis=1) & (first[:, 0] != first[:, 1]) & (self.scale[at] == 1.0)
-        sets: list[tuple[np.ndarray, np.ndarray | None]] = []
-        if not is_plain.all():
-            sets.append((np.flatnonzero(~is_plain), None))
-        kinds = 28 * first[:, 0] + scale_at
-        for kind in np.unique(kinds[is_plain]):
-            members = np.flatnonzero(is_plain & (kinds == kind))
-            source = np.full(28, -1)
-            for begin, t, r in zip(first[members[0]], (0, 3), (7, 16), strict=True):
-                source[begin : begin + 3] = np.arange(t, t + 3)
-                source[begin + 4 : begin + 13] = np.arange(r, r + 9)
-            source[scale_at[members[0]]] = 6
-            sets.append((members, source))
-        return sets
+    def forms(self, own: Array, at: slice) -> Array:
+        """Forms over the pairs' variables (k, 25, 25) as forms over their numbers (k, 28, 28)."""
+        place, factor, k = self.place[at].astype(int), self.factor[at], len(own)
+        index = 28 * place[:, :, None] + place[:, None, :] + 784 * np.arange(k)[:, None, None]
+        values = own * factor[:, :, None] * factor[:, None, :]
+        return np.bincount(index.ravel(), values.ravel(), minlength=784 * k).reshape(k, 28, 28)
 
 
 def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
@@ -112,58 +84,21 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
             translation = translation[:, SWAPPED[:, None], SWAPPED]
             rotation = rotation.transpose(0, 2, 1)
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
-        of_both = of_translations
-        of_both += of_rotations
-        for members, source in slots.alike(at):
-            pairs = begin + members
-            frames, has_both = slots.frames[pairs], coupled[pairs]
-            for form, of_edges in zip(forms, (of_both, of_rotations), strict=True):
-                m = form.frames.shape[1]
-                if m == 9 and source is not None:  # kappa / 2 |R_A R_X|^2, and the same of R_Y R_B
-                    half = 0.5 * np.tile(part.moments.kappa[pairs], 2)
-                    sums = np.bincount(frames.T.ravel(), half, minlength=n)
-                    np.einsum("nii->ni", form.frames)[...] += sums[:, None]
-                    continue
-                own = of_edges if len(members) == len(of_edges) else of_edges[members]
-                if source is None:
-                    S = slots.matrices(pairs)
-                    numbers = _Numbers(S.transpose(0, 2, 1) @ own @ S, np.arange(28))
-                else:
-                    numbers = _Numbers(own, source)
-                one, two, tail = np.arange(13 - m, 13), np.arange(26 - m, 26), np.arange(26, 28)
-                for index, side in zip(frames.T, (one, two), strict=True):
-                    has = index < n
-                    sum_into(form.frames, index[has], numbers.block(side, side)[has])
-                    sum_into(form.tails, index[has], numbers.block(side, tail)[has])
-                if m == 13:
-                    couplings[where[pairs[has_both]]] = numbers.block(one, two)[has_both]
-                form.tail[...] += numbers.block(tail, tail).sum(axis=0)
+        has_both, frames = coupled[at], slots.frames[at].T
+        for form, own in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
+            m, numbers = form.frames.shape[1], slots.forms(own, at)
+            one, two, tail = slice(13 - m, 13), slice(26 - m, 26), slice(26, 28)
+            for index, side in zip(frames, (one, two), strict=True):
+                has = index < n
+                sum_into(form.frames, index[has], numbers[has, side, side])
+                sum_into(form.tails, index[has], numbers[has, side, tail])
+            if m == 13:
+                couplings[where[at][has_both]] = numbers[has_both, one, two]
+            form.tail[...] += numbers[:, tail, tail].sum(axis=0)
     for form in forms:
         _add_priors(form, part)
         _make_symmetric(form.frames)
     return forms[0], forms[1]
-
-
-@dataclass(frozen=True)
-class _Numbers:
-    """The forms of k pairs over their 28 numbers.
-
-    They are stored over other variables; ``source`` has the variable of each number, or -1 for none.
-    """
-
-    forms: Array
-    source: np.ndarray
-
-    def block(self, rows: np.ndarray, columns: np.ndarray) -> Array:
-        """(k, rows, columns)."""
-        i, j = self.source[rows], self.source[columns]
-        k, size = len(self.forms), self.forms.shape[1]
-        at = (np.maximum(i, 0)[:, None] * size + np.maximum(j, 0)).ravel()
-        taken = self.forms.reshape(k, size * size).take(at, axis=1)
-        result: Array = taken.reshape(k, len(rows), len(columns))
-        result[:, i < 0] = 0.0
-        result[:, :, j < 0] = 0.0
-        return result
 
 
 def slots_of(part: Part) -> Slots:
@@ -173,28 +108,26 @@ def slots_of(part: Part) -> Slots:
     (its translation times alpha, where t is alpha times the translation); a known scale becomes h; both ends of a
     motion are one frame.
     """
-    n, motion = len(part.free), part.moments.motion[:, None]
+    n, E, motion = len(part.free), len(part.pairs), part.moments.motion[:, None]
     is_free = part.ends < n
     frames = np.where(is_free & ~(motion & [True, False]), part.ends, n)
-    fixed = np.where(is_free, -1, part.ends - n)
-    first = np.where(is_free, np.where(motion, 13, [0, 13]), -1)
-    poses = np.empty((len(part.fixed), 12))
-    for i, T in enumerate(part.fixed.values()):
+    begin = np.where(motion, 13, [0, 13])
+    constants = np.ones((n + len(part.fixed), 12))  # [t, vec R] of fixed frames, as the form's variables
+    for i, T in enumerate(part.fixed.values(), start=n):
         variable = as_variable(T, part)
-        poses[i] = np.r_[variable[:3, 3], variable[:3, :3].T.ravel()]
-    E = len(part.pairs)
-    scale_at, scale = np.full(E, H), np.ones(E)
+        constants[i] = np.r_[variable[:3, 3], variable[:3, :3].T.ravel()]
+    place, factor = np.full((E, 25), H, dtype=np.int8), np.ones((E, 25))
+    for side, (t, r) in enumerate(((slice(0, 3), slice(7, 16)), (slice(3, 6), slice(16, 25)))):
+        free, first = is_free[:, side, None], begin[:, side, None]
+        place[:, t] = np.where(free, first + np.arange(3), ALPHA if part.is_scaled else H)
+        place[:, r] = np.where(free, first + np.arange(4, 13), H)
+        factor[:, t], factor[:, r] = np.split(constants[part.ends[:, side]], [3], axis=1)
     if part.scale == "shared":
-        scale_at[:] = ALPHA
+        place[:, 6] = ALPHA
     else:
-        owners, of_target = frozenset(part.scale_owners), part.fixed_scales
-        owns = np.array([target in owners for target, _ in part.pairs], dtype=bool)
-        scale_at[owns] = first[owns, 0] + 3
-        scale = np.array([1.0 / of_target.get(target, 1.0) for target, _ in part.pairs])
-        scale[owns] = 1.0
-    return Slots(
-        frames, first, fixed, poses, ALPHA if part.kind == "direct" and part.scale == "shared" else H, scale_at, scale
-    )
+        place[part.owns_scale, 6] = begin[part.owns_scale, 0] + 3
+        factor[:, 6] = 1.0 / part.known_scales
+    return Slots(frames, place, factor)
 
 
 def as_variable(T: Array, part: Part) -> Array:
@@ -252,7 +185,7 @@ def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) 
 def rounding_of_fixed(part: Part) -> Array:
     """Bound on the rounding of a fixed frame's translation about the gauge, where alpha multiplies it, (E, 2, 3)."""
     result = np.zeros((len(part.pairs), 2, 3))
-    if part.kind == "direct" and part.scale == "shared" and part.fixed:
+    if part.is_scaled and part.fixed:
         for e, pair in enumerate(part.pairs):
             for side, name in enumerate(pair):
                 if name in part.fixed:
@@ -308,7 +241,7 @@ def rounding_of(part: Part, slots: Slots) -> Array:
     of_alpha = 0.0
     for begin in range(0, len(of_pairs), PAIRS_AT_ONCE):
         at = slice(begin, begin + PAIRS_AT_ONCE)
-        of_slots = np.einsum("ep,epq->eq", of_pairs[at], slots.matrices(at) ** 2)
+        of_slots = slots.summed(of_pairs[at] * slots.factor[at] ** 2, at)
         for index, side in zip(slots.frames[at].T, SIDES, strict=True):
             sum_into(result, index[index < n], of_slots[index < n, side])
         of_alpha += float(of_slots[:, ALPHA].sum())

@@ -131,9 +131,7 @@ def pair_information(part: Part, poses: PairPoses) -> PairInformation:
         # (c^)_{kj} = -eps_{kjm} c_m, so sum w (R_A' c^)_{ij} = -sum w R_A[k, i] eps_{kjm} c_m.
         arm[at] = R_Xt @ np.einsum("eikm,kjm->eij", Rt_c, HATS) @ R_Y
         along[at] = np.einsum("eij,ej->ei", R_Xt, np.einsum("eikk->ei", Rt_c))
-    free, owners = part.ends < len(part.free), frozenset(part.scale_owners)
-    owns = np.array([target in owners for target, _ in part.pairs], dtype=bool) if owners else np.zeros(E, dtype=bool)
-    motion = moments.motion
+    free, owns, motion = part.ends < len(part.free), part.owns_scale, moments.motion
     used = np.zeros((E, 15), dtype=bool)
     used[:, :6] = (free[:, 0] & ~motion)[:, None]
     used[:, 7:13] = free[:, 1, None]

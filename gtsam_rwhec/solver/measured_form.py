@@ -251,38 +251,25 @@ class MeasuredForm:
             scales = np.full(E, answer.scale)
         else:
             of_frames = np.append(answer.own_scale, np.ones(len(part.fixed)))
-            scales = np.where(self._owns[at], of_frames[target], self._known_scales[at])
+            scales = np.where(part.owns_scale[at], of_frames[target], part.known_scales[at])
         return _stacked(R_1, R_2, Doubled(-arm.hi, -arm.lo), reciprocal(scales), turned(R_2, Doubled.of(t_Y)))
-
-    @cached_property
-    def _owns(self) -> np.ndarray:
-        """(E,): whether a pair's scale is its own variable."""
-        owners = frozenset(self.part.scale_owners)
-        return np.array([target in owners for target, _ in self.part.pairs], dtype=bool)
-
-    @cached_property
-    def _known_scales(self) -> Array:
-        """(E,): the scale of each pair where it is known."""
-        of_target = self.part.fixed_scales
-        return np.array([of_target.get(target, 1.0) for target, _ in self.part.pairs], dtype=float)
 
     def _of_directions(self, V: Array, h: float, at: slice) -> _Ends:
         """The coefficients of directions V (13 n + 1, D) about the gauge; with h = 1, of values of the variables."""
         part = self.part
         a, c = (each[at] for each in self._centres)
-        (target, sensor), S, D = self.slots.frames[at].T, self.slots.matrices(at), V.shape[1]
+        (target, sensor), D = self.slots.frames[at].T, V.shape[1]
         frames = np.concatenate([V[:-1].reshape(-1, 13, D), np.zeros((1, 13, D))])
         tail = np.stack([V[-1], np.full(D, h)])
-        x = np.matmul(
-            S, np.concatenate([frames[target], frames[sensor], np.broadcast_to(tail, (len(S), 2, D))], axis=1)
-        )
+        tails = np.broadcast_to(tail, (len(target), 2, D))
+        x = self.slots.variables(np.concatenate([frames[target], frames[sensor], tails], axis=1), at)
         x = x.transpose(0, 2, 1)  # (E, D, 25)
         R_1, R_2 = (x[:, :, at : at + 9].reshape(-1, D, 3, 3).transpose(0, 1, 3, 2) for at in (7, 16))
         t_1, t_2, s = Doubled.of(x[:, :, 0:3].copy()), Doubled.of(x[:, :, 3:6].copy()), Doubled.of(x[:, :, 6].copy())
-        factor = V[-1] if part.kind == "direct" and part.scale == "shared" else np.full(D, h)
+        factor = V[-1] if part.is_scaled else np.full(D, h)
         if part.kind == "inverse" and part.scale != "shared":
-            is_known = ~self._owns[at]
-            known = reciprocal(self._known_scales[at][is_known])
+            is_known = ~part.owns_scale[at]
+            known = reciprocal(part.known_scales[at][is_known])
             s.hi[is_known], s.lo[is_known] = h * known.hi[:, None], h * known.lo[:, None]
         # A fixed frame's translation about the gauge is a difference, which a double would round.
         for e in np.flatnonzero((part.ends[at] >= len(part.free)).any(axis=1)):
@@ -375,17 +362,17 @@ class MeasuredForm:
 
     def _by_variables(self, sums: Sums, directions: range, at_pairs: slice) -> tuple[Array, Array]:
         """The sums over features as Q V (13 n + 1, D) by variables, with a bound on its error: the chain rule."""
-        S = self.slots.matrices(at_pairs)
+        factor = self.slots.factor[at_pairs]
         n, E = len(self.part.free), len(self.part.pairs)
-        k, size, D = len(S), 13 * n + 1, len(directions)
+        k, size, D = len(factor), 13 * n + 1, len(directions)
         result, bound = np.zeros((size, D)), np.zeros((size, D))
         for d in directions:
             at = slice(12 * d, 12 * d + 12)
             value = _by_pair(*(each[..., at] for each in sums.by_features), 1.0)
             error = _by_pair(*(each[..., at] for each in sums.by_features_error), -1.0)
             error += gamma(8) * _by_pair(*(np.abs(each[..., at]) for each in sums.by_features), -1.0)
-            shares = 0.5 * np.einsum("ep,epq->eq", value, S)
-            slack = 0.5 * np.einsum("ep,epq->eq", error + gamma(E + 40) * np.abs(value), np.abs(S))
+            shares = 0.5 * self.slots.summed(value * factor, at_pairs)
+            slack = 0.5 * self.slots.summed((error + gamma(E + 40) * np.abs(value)) * np.abs(factor), at_pairs)
             of_fixed = self._of_fixed[at_pairs]
             slack[:, ALPHA] += 0.5 * np.einsum("esk,esk->e", of_fixed, np.abs(value[:, :6]).reshape(k, 2, 3))
             for of_pairs, out in ((shares, result), (slack, bound)):

@@ -123,6 +123,22 @@ class Part:
             return ()
         return tuple(dict.fromkeys(t for t, _ in self.pairs if t not in self.fixed_scales))
 
+    @cached_property
+    def owns_scale(self) -> np.ndarray:
+        """(E,): whether a pair's scale is its own variable."""
+        owners = frozenset(self.scale_owners)
+        return np.array([target in owners for target, _ in self.pairs], dtype=bool)
+
+    @cached_property
+    def known_scales(self) -> Array:
+        """(E,): the scale of each pair where it is known, else 1."""
+        return np.array([self.fixed_scales.get(target, 1.0) for target, _ in self.pairs], dtype=float)
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether the form's translations are alpha times those of the frames."""
+        return self.kind == "direct" and self.scale == "shared"
+
     @property
     def number_of_unknowns(self) -> int:
         """Six for each free frame, and one for each unknown scale."""

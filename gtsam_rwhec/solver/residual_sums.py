@@ -176,7 +176,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
     shapes = (pairs, 1, 1, 12) if D == 1 else (1, D, D, 1), (pairs, 12, outputs), (pairs, 12, outputs), (pairs, outputs)
     tables, errors, sizes = ([np.zeros(shape) for shape in shapes] for _ in range(3))
     number = 0
-    for number, stack in enumerate(stacks_of(measured), start=1):
+    for stack in stacks_of(measured):
+        number += 1
         of_A_and_B = slice(None, None, -1 if measured.is_swapped else 1)
         r, low = _residuals(stack.pairs, *(stack.A, stack.B)[of_A_and_B], coefficients, exact=exact)
         A, off = _centred(stack, measured)
