@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import fsum
 
@@ -57,26 +57,11 @@ class SearchPath:
     def words(self) -> str:
         """How the answer was found, and how its bound was proven."""
         mirrored = " and mirrored" if self.is_mirrored else ""
-        return f"found from {_STARTS[self.start]}{mirrored}, bound proven by {_MULTIPLIERS[self.multipliers]}"
+        of_rotations = " multipliers" if self.multipliers is Multipliers.KKT else ""
+        return f"found from the {self.start}{mirrored}, bound proven by the {self.multipliers}{of_rotations}"
 
     def __str__(self) -> str:
         return ", ".join([self.start, self.multipliers] + ["mirrored"] * self.is_mirrored)
-
-
-_STARTS = {
-    Start.GIVEN: "the given start",
-    Start.SPECTRAL: "a spectral start",
-    Start.BETTER: "a better start",
-    Start.CLARABEL: "the relaxation (Clarabel)",
-    Start.INTERIOR_POINT: "the relaxation (interior point)",
-    Start.LOCAL_RELAXATION: "the relaxation of a few frames",
-    Start.NONNEGATIVE_SCALE: "the relaxation with alpha >= 0",
-}
-_MULTIPLIERS = {
-    Multipliers.KKT: "dual multipliers",
-    Multipliers.ALL_CONSTRAINTS: "dual multipliers of all constraints",
-    Multipliers.RELAXATION: "the relaxation's multipliers",
-}
 
 
 class Status(StrEnum):
@@ -221,15 +206,11 @@ class Objective:
     @staticmethod
     def of(part: Part) -> Objective:
         """The cost of a part."""
+        objective = Objective(part.kind, bool(part.priors))
         if part.kind == "direct":
-            return Objective(part.kind, bool(part.priors))
-        has_motions = bool(part.moments.motion.any())
-        return Objective(
-            part.kind,
-            bool(part.priors),
-            _triple(part.gauge.target_carrier),
-            _triple(part.gauge.sensor_carrier) if has_motions else None,
-        )
+            return objective
+        of_motions = _triple(part.gauge.sensor_carrier) if part.moments.motion.any() else None
+        return replace(objective, origin_m=_triple(part.gauge.target_carrier), motion_origin_m=of_motions)
 
     @staticmethod
     def merged(objectives: list[Objective]) -> Objective:
@@ -254,7 +235,6 @@ def _triple(v: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-_OF = {Basis.MEASUREMENTS: "", Basis.MOMENTS: " (of the moments)"}
 _OBJECTIVES: dict[Kind, str] = {
     "direct": "Problem 3 of the RWHEC paper: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - "
     "R_Y t_B over sigma and R_A R_X - R_Y R_B times the square root of kappa",
@@ -331,23 +311,19 @@ class Certificate:
     @property
     def relative_gap(self) -> float:
         """The gap over the cost. Where exact data make the cost zero, the gap is divided by a million tolerances."""
-        return self._relative_gap(self.lower_bound)
+        is_zero = self.cost <= self.tolerance
+        return self.gap / (max(abs(self.cost), 1e6 * self.tolerance, 1e-300) if is_zero else self.cost)
 
     @property
     def float_gap(self) -> float:
         """The relative gap without the allowance for rounding."""
-        return self._relative_gap(self.float_bound)
-
-    def _relative_gap(self, bound: float) -> float:
-        is_zero = self.cost <= self.tolerance
-        return max(0.0, self.cost - bound) / (
-            max(abs(self.cost), 1e6 * self.tolerance, 1e-300) if is_zero else self.cost
-        )
+        return replace(self, lower_bound=self.float_bound).relative_gap
 
     def __str__(self) -> str:
         unit = " (unit weights: relative)" if self.is_relative else ""
+        of = " (of the moments)" if self.basis is Basis.MOMENTS else ""
         return (
-            f"{self.status}: cost {self.cost:.8g}{unit}, no answer below {self.lower_bound:.8g}{_OF[self.basis]}, "
+            f"{self.status}: cost {self.cost:.8g}{unit}, no answer below {self.lower_bound:.8g}{of}, "
             f"relative gap {self.relative_gap:.1e}; {self.reason}" + (f"; {self.region}" if self.region else "")
         )
 
@@ -358,9 +334,6 @@ class Certificate:
             return certificates[0]
         statuses, causes = list(Status), list(Cause)
         worst = max(certificates, key=lambda c: (statuses.index(c.status), causes.index(c.cause)))
-        seconds: Counter[str] = Counter()
-        for certificate in certificates:
-            seconds.update(certificate.seconds)
         return Certificate(
             status=worst.status,
             cause=worst.cause,
@@ -375,6 +348,6 @@ class Certificate:
             min_eigenvalue=min(c.min_eigenvalue for c in certificates),
             tolerance=sum(c.tolerance for c in certificates),
             is_relative=worst.is_relative,
-            seconds=dict(seconds),
+            seconds=dict(sum((Counter(c.seconds) for c in certificates), Counter())),
             figures={"cost": worst.cost} | worst.figures | {"parts": float(len(certificates))},
         )

@@ -18,6 +18,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -26,12 +27,16 @@ from gtsam_rwhec.geometry.rounding import Doubled, difference, gamma, product, r
 from gtsam_rwhec.problem.knowledge import Prior
 from gtsam_rwhec.solver.answers import Action, Answer, Evaluation, Point, as_point
 from gtsam_rwhec.solver.block_matrix import sum_into
-from gtsam_rwhec.solver.full_form import ALPHA, SIDES, Slots, rounding_of_fixed
+from gtsam_rwhec.solver.full_form import ALPHA, SIDES, Slots, as_variable, rounding_of_fixed
 from gtsam_rwhec.solver.parts import Given, Part
 from gtsam_rwhec.solver.residual_sums import Coefficients, Measured, Sums, cost_sums, weighted_sums
 
 #: An upper limit of the rounded operations of a prior after its residual, which is accurate to one rounding.
 OPERATIONS = 40
+
+
+#: Of one prior: residuals of translation (3, D) and of rotation (9, D), and magnitudes of their terms.
+Rows: TypeAlias = tuple[Array, Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -43,92 +48,81 @@ class MeasuredPriors:
 
     def at_poses(self, R: Array, t: Array) -> Evaluation:
         """The cost of frames R (n, 3, 3), t (n, 3) about the user's origin."""
-        residuals = {}
-        for i, prior, name in self._each():
+
+        def off(i: int, prior: Prior) -> Array:
             t_0 = prior.transform[:3, 3]
             if self.part.kind == "direct":
-                residuals[i, name] = difference(t[i], t_0).value
-            else:
-                residuals[i, name] = turned(R[None, i].transpose(0, 2, 1), _row(difference(t_0, t[i]))).value[0]
-        form_R = R if self.part.kind == "direct" else R.transpose(0, 2, 1)
-        return self._evaluated(form_R, residuals)
+                return difference(t[i], t_0).value
+            return turned(R[None, i].transpose(0, 2, 1), _row(difference(t_0, t[i]))).value[0]
+
+        return self._evaluated(R if self.part.kind == "direct" else R.transpose(0, 2, 1), off)
 
     def at(self, point: Point) -> Evaluation:
         """The cost at values of the variables about the gauge."""
-        residuals, R = {}, point.rotations
-        for i, prior, name in self._each():
-            t, about = point.numbers[i, :3], self._about_gauge(i, prior)
+        R = point.rotations
+
+        def off(i: int, prior: Prior) -> Array:
+            t, about = Doubled.of(point.numbers[i, :3]), self._about_gauge(i, prior)
             if self.part.kind == "direct":
-                residuals[i, name] = Doubled.of(t).minus(about).value
-            else:
-                residuals[i, name] = turned(R[None, i], _row(about)).plus(_row(Doubled.of(t))).value[0]
-        return self._evaluated(R, residuals)
+                return t.minus(about).value
+            return turned(R[None, i], _row(about)).plus(_row(t)).value[0]
+
+        return self._evaluated(R, off)
 
     def action(self, point: Point, V: Array) -> Action:
         """The products of the priors' form with directions V (13 n + 1, D)."""
-        D = V.shape[1]
-        QV, size = np.zeros_like(V), np.zeros_like(V)
-        products, of_products = np.zeros((D, D + 1)), np.zeros((D, D + 1))
-        residuals = self.at(point)
-        VQx = V.T @ residuals.gradient
-        VQx_error = np.abs(V).T @ (residuals.gradient_error + gamma(len(V)) * np.abs(residuals.gradient))
-        for i, prior, _ in self._each():
-            first = 13 * i
-            t, r = V[first : first + 3], V[first + 4 : first + 13]
-            if prior.sigma is not None:
-                weight = 0.5 / prior.sigma**2
-                about = self._about_gauge(i, prior).value
-                rows = t if self.part.kind == "direct" else t + _times(r, about)
-                # The magnitude of the terms that cancel in the rows.
-                terms = np.abs(t) if self.part.kind == "direct" else np.abs(t) + _times(np.abs(r), np.abs(about))
-                for out, value, s in ((QV, rows, about), (size, terms, np.abs(about))):
-                    out[first : first + 3] += weight * value
-                    if self.part.kind == "inverse":
-                        out[first + 4 : first + 13] += weight * np.einsum("k,pd->kpd", s, value).reshape(9, D)
-                products[:, :D] += weight * rows.T @ rows
-                of_products[:, :D] += weight * terms.T @ terms
-            if prior.kappa is not None:
-                weight = 0.5 * prior.kappa
-                QV[first + 4 : first + 13] += weight * r
-                size[first + 4 : first + 13] += weight * np.abs(r)
-                products[:, :D] += weight * r.T @ r
-                of_products[:, :D] += weight * np.abs(r).T @ np.abs(r)
-        unit = gamma(OPERATIONS)
-        return Action(QV, unit * size, products[:, :D], unit * of_products[:, :D], VQx, VQx_error)
+        of_frames, at_point = V[:-1].reshape(-1, 13, V.shape[1]), self.at(point)
 
-    def _each(self) -> Iterator[tuple[int, Prior, int]]:
-        """For each prior of a free frame: the frame's index, the prior, and the prior's number."""
-        for i, name in enumerate(self.part.free):
-            for number, prior in enumerate(self.priors.get(name, [])):
-                yield i, prior, number
+        def rows(i: int, prior: Prior) -> Rows:
+            t, r, about = of_frames[i, :3], of_frames[i, 4:], self._about_gauge(i, prior).value
+            if self.part.kind == "direct":
+                return t, r, np.abs(t), np.abs(r)
+            # The magnitude of the terms that cancel.
+            return t + _times(r, about), r, np.abs(t) + _times(np.abs(r), np.abs(about)), np.abs(r)
+
+        VQx_error = np.abs(V).T @ (at_point.gradient_error + gamma(len(V)) * np.abs(at_point.gradient))
+        return Action(*self._summed(rows, V.shape[1]), V.T @ at_point.gradient, VQx_error)
+
+    def _each(self) -> Iterator[tuple[int, Prior]]:
+        """Each prior of a free frame, with the frame's index."""
+        return ((i, prior) for i, name in enumerate(self.part.free) for prior in self.priors.get(name, []))
 
     def _about_gauge(self, i: int, prior: Prior) -> Doubled:
         return difference(prior.transform[:3, 3], self.part.frame_shift(self.part.free[i]))
 
-    def _evaluated(self, R: Array, residuals: dict[tuple[int, int], Array]) -> Evaluation:
-        """The cost from the translation residuals of each frame and prior; rotations as the form has them."""
-        n = len(R)
-        gradient, size, cost = np.zeros(13 * n + 1), np.zeros(13 * n + 1), 0.0
-        for i, prior, number in self._each():
-            first = 13 * i
-            if prior.sigma is not None:
-                residual, weight = residuals[i, number], 0.5 / prior.sigma**2
-                about = self._about_gauge(i, prior).value
-                cost += weight * float(residual @ residual)
-                for out, value, s in ((gradient, residual, about), (size, np.abs(residual), np.abs(about))):
-                    out[first : first + 3] += weight * value
-                    if self.part.kind == "inverse":
-                        out[first + 4 : first + 13] += weight * np.outer(s, value).ravel()
-            if prior.kappa is not None:
-                R_0 = prior.transform[:3, :3]
-                off = (R[i] - (R_0 if self.part.kind == "direct" else R_0.T)).T.ravel()  # column after column
-                cost += 0.5 * prior.kappa * float(off @ off)
-                gradient[first + 4 : first + 13] += 0.5 * prior.kappa * off
-                size[first + 4 : first + 13] += 0.5 * prior.kappa * np.abs(off)
-        count = len(self.priors) + sum(len(priors) for priors in self.priors.values())
-        unit = gamma(OPERATIONS + count)
+    def _evaluated(self, R: Array, off: Callable[[int, Prior], Array]) -> Evaluation:
+        """The cost from the translation residual (3,) of each frame and prior; rotations as the form has them."""
+
+        def rows(i: int, prior: Prior) -> Rows:
+            turn = R[i] - as_variable(prior.transform, self.part)[:3, :3]
+            t, r = off(i, prior)[:, None], turn.T.reshape(9, 1)  # column after column
+            return t, r, np.abs(t), np.abs(r)
+
+        gradient, gradient_error, cost, cost_error = self._summed(rows, 1)
         none = Point(np.zeros((0, 13)), 0.0)
-        return Evaluation(none, cost, unit * cost, gradient, unit * size)
+        return Evaluation(none, float(cost[0, 0]), float(cost_error[0, 0]), gradient[:, 0], gradient_error[:, 0])
+
+    def _summed(self, rows: Callable[[int, Prior], Rows], D: int) -> tuple[Array, Array, Array, Array]:
+        """Sums of Q V (13 n + 1, D) and V'Q V (D, D) from each prior's rows, each with a bound on its error."""
+        (QV, QV_size), (VQV, VQV_size) = np.zeros((2, 13 * len(self.part.free) + 1, D)), np.zeros((2, D, D))
+        for i, prior in self._each():
+            about = self._about_gauge(i, prior).value
+            of_t, of_r, t_size, r_size = rows(i, prior)
+            t_rows, r_rows = slice(13 * i, 13 * i + 3), slice(13 * i + 4, 13 * i + 13)
+            for by, products, t, r, s in (
+                (QV, VQV, of_t, of_r, about),
+                (QV_size, VQV_size, t_size, r_size, np.abs(about)),
+            ):
+                if prior.sigma is not None:
+                    by[t_rows] += 0.5 / prior.sigma**2 * t
+                    products += 0.5 / prior.sigma**2 * t.T @ t
+                    if self.part.kind == "inverse":
+                        by[r_rows] += 0.5 / prior.sigma**2 * np.kron(s[:, None], t)
+                if prior.kappa is not None:
+                    by[r_rows] += 0.5 * prior.kappa * r
+                    products += 0.5 * prior.kappa * r.T @ r
+        unit = gamma(OPERATIONS + len(self.priors) + sum(map(len, self.priors.values())))
+        return QV, unit * QV_size, VQV, unit * VQV_size
 
 
 def _row(v: Doubled) -> Doubled:

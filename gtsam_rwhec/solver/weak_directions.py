@@ -2,8 +2,8 @@
 
 Up to `DENSE_PARAMETERS` parameters all eigenvalues are computed. Above that the information's Cholesky factor follows
 the graph (``solver/block_matrix.py``). If the information less the highest threshold is positive definite, nothing is
-free (Sylvester's law of inertia), and a few Lanczos steps on its inverse give the weakest direction to a per cent. Else
-Lanczos on the inverse finds all directions below the threshold, and one above.
+free (Sylvester's law of inertia), and Lanczos on its inverse gives the weakest direction to a per cent. Else Lanczos on
+the inverse finds all directions below the threshold, and one above.
 """
 
 from __future__ import annotations
@@ -14,14 +14,13 @@ import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
+from gtsam_rwhec.solver.block_matrix import BlockMatrix
 from gtsam_rwhec.solver.noise_bounds import DENSE_PARAMETERS, free_threshold
 
 #: Information below this part of the largest is rounding error.
 ROUNDING = 4.0 * np.finfo(float).eps
-#: If nothing is free: the most Lanczos steps, and the relative precision of the weakest direction's information, which
-#: is only reported.
-STEPS, NEAR = 40, 0.01
+#: If nothing is free: the relative precision of the weakest direction's information, which is only reported.
+NEAR = 0.01
 #: If some directions are free: how many are searched first (then four times as many), and their relative precision.
 FIRST, PRECISION = 6, 1e-8
 #: If Lanczos finds very many free directions, all eigenvalues are computed up to this many parameters: 0.2 GB.
@@ -103,52 +102,25 @@ def _all_of(matrix: BlockMatrix, used: np.ndarray) -> tuple[Array, Array]:
 
 def _weakest_of_many(matrix: BlockMatrix, used: np.ndarray, enough: float) -> tuple[Array, Array]:
     """The smallest eigenpairs, up to one above ``enough``."""
-    unused = np.where(used, 0.0, _FAR)
-    factor = matrix.plus(unused - enough).factor()
-    if factor is not None:
-        return _told_by_few_steps(factor, used, enough)
-    shift = max(1e-6, 1e-13 * float(matrix.diagonal.max()))  # above the factorisation's rounding, far below thresholds
-    factor = matrix.plus(unused + shift).factor()
-    if factor is None:
-        raise FloatingPointError("the information matrix is not positive semidefinite: its entries overflow")
-
     from scipy.sparse.linalg import LinearOperator, eigsh  # slow to import, and few problems need it
 
     size, parameters = len(used), int(used.sum())
-    operator = LinearOperator((size, size), matvec=factor.solve_vector, dtype=np.float64)
+    unused = np.where(used, 0.0, _FAR)
     start = np.random.default_rng(0).standard_normal(size) * used
-    count = FIRST
+    # Nothing is free where the matrix less ``enough`` has a factor: then the weakest direction is only reported.
+    count, precision, shift, factor = 1, NEAR, -enough, matrix.plus(unused - enough).factor()
+    if factor is None:
+        # Above the factorisation's rounding, far below thresholds.
+        count, precision, shift = FIRST, PRECISION, max(1e-6, 1e-13 * float(matrix.diagonal.max()))
+        factor = matrix.plus(unused + shift).factor()
+    if factor is None:
+        raise FloatingPointError("the information matrix is not positive semidefinite: its entries overflow")
+    operator = LinearOperator((size, size), matvec=factor.solve_vector, dtype=np.float64)
     while 4 * count < parameters and count <= MOST_FREE:
-        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=PRECISION)
+        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=precision)
         values = np.maximum(1.0 / inverse - shift, 0.0)
         if values.max() > enough or (4 * count > MOST_FREE and parameters > MOST_DENSE):
             return values, vectors * used[:, None]
         count *= 4
     # Lanczos is not faster with so many free directions.
     return _all_of(matrix, used)
-
-
-def _told_by_few_steps(factor: BlockFactor, used: np.ndarray, enough: float) -> tuple[Array, Array]:
-    """A matrix's smallest eigenvalue, above ``enough``, and its vector, from the factor of (matrix - ``enough`` I).
-
-    Lanczos with all vectors kept, up to a residual of `NEAR`. The result is not below the smallest eigenvalue.
-    """
-    steps = min(STEPS, int(used.sum()))
-    vector = np.random.default_rng(0).standard_normal(len(used)) * used
-    basis = np.zeros((steps + 1, len(used)))
-    basis[0] = vector / np.linalg.norm(vector)
-    triangle = np.zeros((steps + 1, steps + 1))
-    values, vectors = np.ones(1), np.ones((1, 1))
-    for k in range(steps):
-        w = factor.solve_vector(basis[k]) * used
-        triangle[k, k] = w @ basis[k]
-        for _ in range(2):  # twice is enough
-            w -= basis[: k + 1].T @ (basis[: k + 1] @ w)
-        beside = float(np.linalg.norm(w))
-        values, vectors = np.linalg.eigh(triangle[: k + 1, : k + 1])
-        # The residual of the eigenpair bounds the distance to an eigenvalue.
-        if beside * abs(vectors[-1, -1]) <= NEAR * values[-1]:
-            break
-        basis[k + 1] = w / beside
-        triangle[k, k + 1] = triangle[k + 1, k] = beside
-    return np.array([enough + 1.0 / values[-1]]), (vectors[:, -1] @ basis[: len(values)])[:, None]

@@ -41,7 +41,7 @@ def test_the_three_reasons_of_design_fact_4_are_three_causes() -> None:
 
 def test_a_path_says_how_the_answer_was_found_and_its_bound_proven() -> None:
     path = SearchPath(Start.SPECTRAL, Multipliers.KKT)
-    assert path.words == "found from a spectral start, bound proven by dual multipliers"
+    assert path.words == "found from the spectral start, bound proven by the dual multipliers"
     assert str(SearchPath(Start.SPECTRAL, Multipliers.KKT, is_mirrored=True)) == "spectral start, dual, mirrored"
 
 
