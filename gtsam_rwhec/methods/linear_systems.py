@@ -15,9 +15,9 @@ from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import left, of_rotations
 from gtsam_rwhec.methods.method import Outcome, Poses
-from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.problem.moment_stack import MomentStack
-from gtsam_rwhec.problem.moments import Gauge, Moments
+from gtsam_rwhec.problem.many_measurements import Sorted
+from gtsam_rwhec.problem.measurements import Measurements, Pair
+from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.full_form import edge_forms
 from gtsam_rwhec.solver.parts import connected_components
@@ -188,9 +188,8 @@ def plain_form(stack: Stack) -> Array:
 
     x = [t_X, t_Y, 1, vec R_X, vec R_Y], translations about the stack's gauge; R_X and R_Y may be any matrices.
     """
-    ones = np.ones(len(stack.A))
-    moments = Moments.of(stack.A, stack.B, ones, ones, stack.gauge, False, "-".join([*stack.targets, *stack.sensors]))
-    stacked = MomentStack.of([moments], [False])
+    one, pair = np.array(1.0), Pair("-".join(stack.targets), "-".join(stack.sensors))
+    stacked = Sorted.of(pair, Measurements(stack.A, stack.B, one, one)).moments(stack.gauge, with_R_B=True)
     translation, rotation = edge_forms(stacked.translations(slice(None)), stacked.rotations(slice(None)), stacked.kappa)
     form: Array = translation[0] + rotation[0]
     return form

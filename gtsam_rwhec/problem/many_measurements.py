@@ -13,9 +13,9 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import ROTATION_ROUNDING, Array, checked_rows, orthonormality, rows_to_transforms
 from gtsam_rwhec.geometry.rounding import UNIT
 from gtsam_rwhec.problem.knowledge import check_name
-from gtsam_rwhec.problem.measurements import GivenMeasurements, Measurements, Pair, whole_stamps
+from gtsam_rwhec.problem.measurements import GivenMeasurements, LongTranslations, Measurements, Pair, whole_stamps
 from gtsam_rwhec.problem.moment_stack import BACK_ENTRIES, FRONT, FRONT_ENTRIES, MomentStack
-from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, Gauge, Moments
+from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, Gauge
 
 #: This many measurements are summed at once: some megabytes.
 SUMMED_AT_ONCE = 4096
@@ -29,8 +29,8 @@ _OF_FRONT = np.searchsorted(FRONT, FRONT_ENTRIES[0]), np.searchsorted(FRONT, FRO
 class Sorted:
     """Measurements of P pairs, sorted by pair: those of pair p are ``first[p]:first[p + 1]``.
 
-    A, B (N, 4, 4); sigma, kappa () or (N,); ``given`` (N,): their places in the user's arrays, for messages; stamps_ns
-    (N,) and covariances (N, 6, 6), or None.
+    A, B (N, 4, 4); sigma, kappa () or (N,); stamps_ns (N,), covariances (N, 6, 6) and pixels (N, n, 2), or None.
+    ``given`` (N,): their places in the user's arrays, for messages; None where these have the same order.
     """
 
     pairs: tuple[Pair, ...]
@@ -39,10 +39,38 @@ class Sorted:
     B: Array
     sigma: Array
     kappa: Array
-    given: np.ndarray
+    given: np.ndarray | None
     source: str
     stamps_ns: np.ndarray | None = None
     covariances: Array | None = None
+    pixels: Array | None = None
+
+    @staticmethod
+    def of(pair: Pair, raw: Measurements, source: str = "") -> Sorted:
+        """The measurements of one pair, without a copy."""
+        return Sorted(
+            (pair,), np.array([0, len(raw.A)]), raw.A, raw.B, raw.sigma, raw.kappa, None, source, *raw.options
+        )
+
+    def copied(self) -> Sorted:
+        """A copy of the poses, which are the caller's arrays."""
+        return replace(self, A=self.A.copy(), B=self.B.copy())
+
+    @property
+    def some(self) -> slice:
+        """At most `BLOCK` measurements, spread over all of them: a log begins at rest, so its first are not enough."""
+        return slice(None, None, -(-len(self.A) // BLOCK))
+
+    def sample(self) -> tuple[Array, np.ndarray]:
+        """Some poses of A, and which of them are motions."""
+        places = np.arange(0, len(self.A), self.some.step)
+        return self.A[places], self.motion[np.searchsorted(self.first, places, side="right") - 1]
+
+    def long_translations(self, gauge: Gauge, where: str) -> LongTranslations:
+        """Translations that are too long for metres."""
+        motion, from_corners = bool(self.motion.all()), self.pixels is not None
+        A, B = self.A[self.some], self.B[self.some]
+        return LongTranslations.of(A, B, gauge, where, motion=motion, from_corners=from_corners)
 
     @property
     def counts(self) -> np.ndarray:
@@ -67,10 +95,14 @@ class Sorted:
                 block[...] = rows_to_transforms(checked_rows(block, begin, self.source).rows)
         return replace(self, A=A, B=B)
 
-    def padded(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (p, k) of the measurements of some pairs, and which of them are no padding (a pair's last, again)."""
+    def padded(self, group: np.ndarray, begin: int = 0, most: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Places (p, k) of the measurements of some pairs, and which of them are no padding (a pair's last, again).
+
+        Up to ``most`` of each pair, counted from ``begin``.
+        """
         counts = self.counts[group][:, None]
-        step = np.arange(int(counts.max()))
+        longest = int(counts.max())
+        step = np.arange(begin, longest if most is None else min(longest, begin + most))
         return self.first[group][:, None] + np.minimum(step, counts - 1), step < counts
 
     def groups(self, pairs: np.ndarray) -> Iterator[np.ndarray]:
@@ -88,12 +120,10 @@ class Sorted:
 
     def moments(self, gauge: Gauge, *, with_R_B: bool) -> MomentStack:
         """The moments of every pair; a PoseError names the first pose of a block that is not valid."""
-        result = MomentStack.empty(self.motion, self.counts, with_R_B=with_R_B)
+        result = MomentStack.nothing(self.motion, with_R_B=with_R_B)
         for group in self.groups(np.arange(len(self.pairs))):
-            if len(group) == 1 and self.counts[group[0]] > BLOCK:
-                self._long(int(group[0]), gauge, result)
-            else:
-                self._sum(group, gauge, result)
+            for begin in range(0, int(self.counts[group[0]]), BLOCK):  # more than a block has only a pair that is alone
+                result.add_to(group, self._summed(group, begin, gauge, with_R_B=with_R_B))
         return result
 
     def _weights(self, at: np.ndarray) -> tuple[Array, Array]:
@@ -101,20 +131,11 @@ class Sorted:
         sigma, kappa = (each if each.ndim == 0 else each[at] for each in (self.sigma, self.kappa))
         return np.broadcast_to(1.0 / sigma**2, at.shape), np.broadcast_to(kappa, at.shape)
 
-    def _long(self, pair: int, gauge: Gauge, result: MomentStack) -> None:
-        own = np.arange(self.first[pair], self.first[pair + 1])
-        weight, kappa = self._weights(own)
-        try:
-            moments = Moments.of(
-                self.A[own], self.B[own], weight, kappa, gauge, self.pairs[pair].is_motion, self.pairs[pair].label
-            )
-        except PoseError:
-            self._name(own)
-            raise
-        result.fill(pair, moments)
-
-    def _sum(self, group: np.ndarray, gauge: Gauge, result: MomentStack) -> None:
-        places, valid = self.padded(group)
+    def _summed(self, group: np.ndarray, begin: int, gauge: Gauge, *, with_R_B: bool) -> MomentStack:
+        """The moments of a block of measurements of some pairs."""
+        places, valid = self.padded(group, begin, BLOCK)
+        result = MomentStack.nothing(self.motion[group], with_R_B=with_R_B)
+        result.count[:] = valid.sum(axis=1)
         p, k = places.shape
         flat, features = places.ravel(), np.empty((25, p * k))
         try:
@@ -126,10 +147,10 @@ class Sorted:
         f = features.reshape(25, p, k)
         if of_A.projected or of_B.projected:
             off = [orthonormality(_columns(poses[flat])) > ROTATION_ROUNDING for poses in (self.A, self.B)]
-            result.projected[group] = (np.sum(off, axis=0).reshape(p, k) * valid).sum(axis=1)
+            result.projected[:] = (np.sum(off, axis=0).reshape(p, k) * valid).sum(axis=1)
         reach = np.abs(f[T_A]).max(axis=2)  # (3, p)
         a = gauge.sensor_carrier[:, None]
-        c = np.where(result.motion[group], a, gauge.target_carrier[:, None])  # (3, p)
+        c = np.where(result.motion, a, gauge.target_carrier[:, None])  # (3, p)
         f[T_A] += c[0, :, None] * f[0:3] + c[1, :, None] * f[3:6] + c[2, :, None] * f[6:9] - a[:, :, None]
         f[ONE] = 1.0
         weight, kappa = self._weights(places)
@@ -140,25 +161,26 @@ class Sorted:
         total = weight.sum(axis=1)
         products[:, -1, -1] = total
         if result.back is None:
-            result.front[group] = products[:, _OF_FRONT[0], _OF_FRONT[1]]
+            result.front[:] = products[:, _OF_FRONT[0], _OF_FRONT[1]]
             diagonal = np.zeros((p, 25))
             diagonal[:, FRONT] = np.einsum("eii->ei", products)
             # Each column of a rotation has length 1, up to rounding: other rotations were projected.
             diagonal[:, R_B] = ((f[R_B] ** 2) * weight).sum(axis=2).T
         else:
-            result.front[group] = products[:, FRONT_ENTRIES[0], FRONT_ENTRIES[1]]
-            result.back[group] = products[:, BACK_ENTRIES[0], BACK_ENTRIES[1]]
+            result.front[:] = products[:, FRONT_ENTRIES[0], FRONT_ENTRIES[1]]
+            result.back[:] = products[:, BACK_ENTRIES[0], BACK_ENTRIES[1]]
             diagonal = np.einsum("eii->ei", products)
         turned = np.matmul((f[R_A] * kappa).transpose(1, 0, 2), f[R_B].transpose(1, 2, 0))
-        result.rotation[group] = turned.reshape(p, 81)
-        result.kappa[group] = kappa.sum(axis=1)
-        result.magnitude_as_summed[group] = np.sqrt(diagonal) * (1.0 + 1e-9)
+        result.rotation[:] = turned.reshape(p, 81)
+        result.kappa[:] = kappa.sum(axis=1)
+        result.magnitude_as_summed[:] = np.sqrt(diagonal) * (1.0 + 1e-9)
         centring = 8.0 * UNIT * (reach + np.abs(c).sum(axis=0) + np.abs(a))
-        result.error_as_summed[group] = (centring * np.sqrt(total)).T
+        result.error_as_summed[:] = (centring * np.sqrt(total)).T
         # The weight and its products take up to six operations; then a pair's measurements are summed.
-        result.operations_as_summed[group] = self.counts[group] + 7
+        result.operations_as_summed[:] = result.count + 7
         # The rounding of the test of R'R itself is added.
-        result.deviation[group] = max(of_A.deviation, of_B.deviation) + 8.0 * UNIT
+        result.deviation[:] = max(of_A.deviation, of_B.deviation) + 8.0 * UNIT
+        return result
 
     def _name(self, places: np.ndarray) -> None:
         """Raise the PoseError of the first measurement that is not valid: its pair, and its place in the arrays."""
@@ -166,7 +188,8 @@ class Sorted:
             pair = self.pairs[int(np.searchsorted(self.first, place, side="right")) - 1]
             for name, poses in (("A", self.A), ("B", self.B)):
                 where = f"{name} of {pair}{self.source}"
-                checked_rows(poses[place : place + 1], int(self.given[place]), where)
+                given = place if self.given is None else self.given[place]
+                checked_rows(poses[place : place + 1], int(given), where)
 
 
 def _columns(poses: Array) -> Array:
@@ -194,36 +217,29 @@ class Section:
             np.broadcast_to(value, at.stop - at.start) if value.ndim == 0 else value[at]
             for value in (many.sigma, many.kappa)
         )
-        stamps, covariances = (None if each is None else each[at] for each in (many.stamps_ns, many.covariances))
-        return Measurements(many.A[at], many.B[at], sigma, kappa, stamps, covariances)
+        options = (many.stamps_ns, many.covariances, many.pixels)
+        return Measurements(many.A[at], many.B[at], sigma, kappa, *(None if x is None else x[at] for x in options))
 
 
 @dataclass(frozen=True, slots=True)
 class KeptMeasurements:
     """Raw measurements of a pair that are kept, batch by batch, and whether any batch had covariances."""
 
-    stored: tuple[Measurements | Section, ...] = ()
+    stored: tuple[Section, ...] = ()
     has_covariances: bool = False
 
     def __add__(self, other: KeptMeasurements) -> KeptMeasurements:
         return KeptMeasurements(self.stored + other.stored, self.has_covariances or other.has_covariances)
 
-    @staticmethod
-    def copied(raw: Measurements) -> KeptMeasurements:
-        """A copy, since the caller's arrays may change, with one sigma and one kappa for each measurement."""
-        sigma, kappa = (np.broadcast_to(value, len(raw.A)) for value in (raw.sigma, raw.kappa))
-        copy = replace(raw, A=raw.A.copy(), B=raw.B.copy(), sigma=sigma, kappa=kappa)
-        return KeptMeasurements((copy,), raw.covariances is not None)
-
     @property
     def batches(self) -> tuple[Measurements, ...]:
         """The measurements of each batch, without a copy."""
-        return tuple(each.measurements if isinstance(each, Section) else each for each in self.stored)
+        return tuple(each.measurements for each in self.stored)
 
     @property
     def count(self) -> int:
         """The number of measurements that are kept."""
-        return sum(each.count if isinstance(each, Section) else len(each.A) for each in self.stored)
+        return sum(each.count for each in self.stored)
 
     def joined(self) -> Measurements:
         """All batches in one, in the order in which they were added; stamps only where every batch has them."""

@@ -10,18 +10,11 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, NoiseError, StampError, UnitsWarning
+from gtsam_rwhec.errors import CountError, NoiseError, OptionError, StampError, UnitsWarning
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import (
-    Array,
-    PosesLike,
-    QuaternionOrder,
-    as_transforms,
-    checked_rows,
-    rows_to_transforms,
-)
+from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.geometry.real_numbers import real_array
-from gtsam_rwhec.problem.moments import BLOCK, Gauge
+from gtsam_rwhec.problem.moments import Gauge
 
 Value = TypeVar("Value")
 
@@ -94,16 +87,10 @@ class Measurements:
         arrays = {part.name: getattr(self, part.name) for part in fields(self)}
         return replace(self, **{name: array[mask] for name, array in arrays.items() if array is not None})
 
-    def projected(self, where: str) -> Measurements:
-        """The measurements with the rotations that the moments are made of: those that were not exact are projected.
-
-        A PoseError names a pose that is not valid.
-        """
-        A, B = (
-            rows_to_transforms(checked_rows(poses, 0, f"{name} of {where}").rows)
-            for name, poses in (("A", self.A), ("B", self.B))
-        )
-        return replace(self, A=A, B=B)
+    @property
+    def options(self) -> tuple[np.ndarray | None, Array | None, Array | None]:
+        """Stamps, covariances and pixels."""
+        return self.stamps_ns, self.covariances, self.pixels
 
 
 @dataclass(frozen=True)
@@ -119,6 +106,11 @@ class GivenMeasurements:
     covariances: ArrayLike | None
     source: str | None
     pixels: Array | None = None
+
+    def check_source(self) -> None:
+        """Raise an OptionError for a source that is no text."""
+        if self.source is not None and not isinstance(self.source, str):
+            raise OptionError(f"source is a {type(self.source).__name__}; give text: the name of a file or topic")
 
     @property
     def has_noise(self) -> bool:
@@ -267,14 +259,11 @@ class LongTranslations:
     from_corners: bool = False
 
     @staticmethod
-    def of(
-        A: Array, B: Array, gauge: Gauge, motion: bool, where: str, *, from_corners: bool = False
-    ) -> LongTranslations:
+    def of(A: Array, B: Array, gauge: Gauge, where: str, *, motion: bool, from_corners: bool) -> LongTranslations:
         """Look at a batch; A is taken about the gauge, so that a distant world origin is not too long."""
         c = gauge.sensor_carrier if motion else gauge.target_carrier
-        centred_A = A[:BLOCK, :3, 3] + A[:BLOCK, :3, :3] @ c - gauge.sensor_carrier
         # What a sensor sees (B) is never far.
-        found = {"A": centred_A, "B": B[:BLOCK, :3, 3]}
+        found = {"A": A[:, :3, 3] + A[:, :3, :3] @ c - gauge.sensor_carrier, "B": B[:, :3, 3]}
         sizes = {name: float(np.median(np.abs(t).max(axis=1))) for name, t in found.items()}
         long = {name: size for name, size in sizes.items() if size > MILLIMETRES_M}
         return LongTranslations(where, long, from_corners)

@@ -56,41 +56,23 @@ class MomentStack:
     c: Array | None = None
 
     @staticmethod
-    def empty(motion: np.ndarray, count: np.ndarray, *, with_R_B: bool) -> MomentStack:
-        """An empty stack for the sums of pairs with ``count`` measurements."""
-        E = len(count)
+    def nothing(motion: np.ndarray, *, with_R_B: bool) -> MomentStack:
+        """The sums of pairs without measurements."""
+        E = len(motion)
+        whole, back = np.zeros((3, E), dtype=int), np.zeros((E, len(BACK_ENTRIES[0]))) if with_R_B else None
         return MomentStack(
             motion=motion,
-            count=count,
-            kappa=np.empty(E),
-            front=np.empty((E, len(FRONT_ENTRIES[0]))),
-            back=np.empty((E, len(BACK_ENTRIES[0]))) if with_R_B else None,
-            rotation=np.empty((E, 81)),
-            magnitude_as_summed=np.empty((E, 25)),
-            error_as_summed=np.empty((E, 3)),
-            operations_as_summed=np.empty(E, dtype=int),
-            deviation=np.empty(E),
-            projected=np.zeros(E, dtype=int),
+            count=whole[0],
+            kappa=np.zeros(E),
+            front=np.zeros((E, len(FRONT_ENTRIES[0]))),
+            back=back,
+            rotation=np.zeros((E, 81)),
+            magnitude_as_summed=np.zeros((E, 25)),
+            error_as_summed=np.zeros((E, 3)),
+            operations_as_summed=whole[1],
+            deviation=np.zeros(E),
+            projected=whole[2],
         )
-
-    @staticmethod
-    def of(moments: Sequence[Moments], motion: Sequence[bool]) -> MomentStack:
-        """The moments of several pairs; their whole matrices are kept."""
-        stack = MomentStack.empty(np.array(motion, dtype=bool), np.zeros(len(moments), dtype=int), with_R_B=True)
-        for e, of_pair in enumerate(moments):
-            stack.fill(e, of_pair)
-        is_lacking = stack.back is not None and np.isnan(stack.back).all()
-        return replace(stack, back=None) if is_lacking and len(moments) else stack
-
-    def fill(self, e: int, moments: Moments) -> None:
-        """Write the moments of a pair."""
-        self.count[e], self.kappa[e], self.projected[e] = moments.count, moments.kappa, moments.projected
-        self.front[e] = moments.translation[FRONT_ENTRIES]
-        if self.back is not None:
-            self.back[e] = moments.translation[BACK_ENTRIES]
-        self.rotation[e], self.magnitude_as_summed[e] = moments.rotation.ravel(), moments.magnitude
-        self.error_as_summed[e], self.operations_as_summed[e] = moments.feature_error[T_A], moments.operations
-        self.deviation[e] = moments.deviation
 
     @staticmethod
     def joined(several: Sequence[MomentStack]) -> MomentStack:
@@ -123,6 +105,18 @@ class MomentStack:
             getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name))
         self.operations_as_summed[index] = np.maximum(self.operations_as_summed[index], other.operations_as_summed) + 1
         self.deviation[index] = np.maximum(self.deviation[index], other.deviation)
+
+    def as_summed(self) -> MomentStack:
+        """The same moments, as if they had been summed about the gauge that they are read about."""
+        front, back = self.front.copy(), None if self.back is None else self.back.copy()
+        for at in self.blocks():
+            G = self.translations(at)
+            front[at] = G[:, FRONT_ENTRIES[0], FRONT_ENTRIES[1]]
+            if back is not None:
+                back[at] = G[:, BACK_ENTRIES[0], BACK_ENTRIES[1]]
+        whole = replace(self, front=front, back=back, count=self.count.copy(), a=None, c=None)
+        arrays = {"magnitude_as_summed": self.magnitude.copy(), "operations_as_summed": self.operations.copy()}
+        return replace(whole, **arrays)
 
     def one(self, e: int) -> Moments:
         """The moments of one pair, as they were summed; nan in the entries of R_B where these are not kept."""

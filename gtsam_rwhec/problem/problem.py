@@ -13,7 +13,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
-from gtsam_rwhec.problem.accumulation import Accumulator, Batch
+from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.corners import (
     EachImage,
     candidates_of,
@@ -23,7 +23,7 @@ from gtsam_rwhec.problem.corners import (
     seen_corners,
 )
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
-from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section
+from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section, Sorted
 from gtsam_rwhec.problem.measurements import (
     GivenMeasurements,
     LongTranslations,
@@ -32,7 +32,7 @@ from gtsam_rwhec.problem.measurements import (
     warn_of_millimetres,
 )
 from gtsam_rwhec.problem.moment_stack import MomentStack
-from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
+from gtsam_rwhec.problem.moments import Gauge, Moments
 
 #: The roles of a pair's two names.
 SIDES: tuple[Literal["target"], Literal["sensor"]] = ("target", "sensor")
@@ -190,31 +190,11 @@ class Problem(Knowledge):
             As in ``add``, with the measurement's place in the arrays; nothing is added then.
         """
         given = GivenMany(pairs, index, GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source))
-        if source is not None and not isinstance(source, str):
-            raise OptionError(f"source is a {type(source).__name__}; give text: the name of a file or topic")
+        given.measurements.check_source()
         many = given.checked()
-        kinds: dict[str, Literal["target", "sensor"]] = {}
         for pair in many.pairs:
             self._check_names(pair, pair.label)
-            kinds |= zip(pair, SIDES, strict=True)
-        accumulator, projected = self._accumulator.added_many(many, with_R_B=self.scale != "known")
-        if projected:
-            warn_of_projected(given.where, projected, stacklevel=2)
-            many = many.projected()
-        some = many.given.argsort()[:: -(-len(many.given) // BLOCK)]
-        translations = LongTranslations.of(many.A[some], many.B[some], accumulator.gauge, False, given.where)
-        if not translations.sizes.keys() <= self._long:
-            warn_of_millimetres([translations], stacklevel=2)
-        # The problem changes only after all checks and warnings: a warning may be raised as an error.
-        self._accumulator = accumulator
-        self._long |= translations.sizes.keys()
-        self.is_relative = self.is_relative or not given.measurements.has_noise
-        self._kind |= kinds
-        has_covariances = covariances is not None
-        nothing = KeptMeasurements((), has_covariances)  # one for all pairs
-        for number, pair in enumerate(many.pairs):
-            kept = KeptMeasurements((Section(many, number),), has_covariances) if self.keep_measurements else nothing
-            self._kept[pair] = self._kept[pair] + kept if pair in self._kept else kept
+        self._add(many, given.where, given.measurements.has_noise, stacklevel=3)
 
     def add_corners(
         self,
@@ -318,34 +298,38 @@ class Problem(Knowledge):
         If ``long`` is given, translations that look like millimetres are appended to it, and the caller warns once of
         all.
         """
-        if given.source is not None and not isinstance(given.source, str):
-            raise OptionError(f"source is a {type(given.source).__name__}; give text: the name of a file or topic")
+        given.check_source()
         where = f"{pair} ({given.source})" if given.source else pair.label
         self._check_names(pair, where)
-        raw = given.checked(where)
-        batch = Batch(pair, raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, where)
-        accumulator, projected = self._accumulator.added(batch)
+        many = Sorted.of(pair, given.checked(where), f" ({given.source})" if given.source else "")
+        self._add(many, where, given.has_noise, stacklevel=4, long=long)
+
+    def _add(
+        self, many: Sorted, where: str, has_noise: bool, *, stacklevel: int, long: list[LongTranslations] | None = None
+    ) -> None:
+        # With a known scale nothing reads the sums of B's rotations; but one pair's take little memory.
+        with_R_B = self.scale != "known" or len(many.pairs) == 1
+        accumulator, projected = self._accumulator.added(many, with_R_B=with_R_B)
         if projected:
-            warn_of_projected(where, projected, stacklevel=3)
-            raw = raw.projected(where)
-        translations = LongTranslations.of(
-            raw.A, raw.B, accumulator.gauge, pair.is_motion, where, from_corners=given.pixels is not None
-        )
+            warn_of_projected(where, projected, stacklevel)
+            many = many.projected()
+        elif self.keep_measurements and many.given is None:
+            many = many.copied()
+        translations = many.long_translations(accumulator.gauge, where)
         if long is not None:
             long.append(translations)
         elif not translations.sizes.keys() <= self._long:
-            warn_of_millimetres([translations], stacklevel=3)
+            warn_of_millimetres([translations], stacklevel)
         # The problem changes only after all checks and warnings: a warning may be raised as an error.
         self._accumulator = accumulator
         self._long |= translations.sizes.keys()
-        self.is_relative = self.is_relative or not given.has_noise
-        self._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
-        kept = (
-            KeptMeasurements.copied(raw)
-            if self.keep_measurements
-            else KeptMeasurements((), raw.covariances is not None)
-        )
-        self._kept[pair] = self._kept.get(pair, KeptMeasurements()) + kept
+        self.is_relative = self.is_relative or not has_noise
+        has_covariances = many.covariances is not None
+        nothing = KeptMeasurements((), has_covariances)  # one for all pairs
+        for number, pair in enumerate(many.pairs):
+            self._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
+            kept = KeptMeasurements((Section(many, number),), has_covariances) if self.keep_measurements else nothing
+            self._kept[pair] = self._kept[pair] + kept if pair in self._kept else kept
 
     def _check_names(self, pair: Pair, where: str) -> None:
         for name, kind in zip(pair, SIDES, strict=True):
@@ -371,19 +355,16 @@ class Problem(Knowledge):
         check_measurements(measurements)
         if not measurements:
             raise CountError(f"nothing is left of {self}: keep at least one measurement")
-        moments = {
-            pair: Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, self.gauge, pair.is_motion, pair.label)
-            for pair, raw in measurements.items()
-        }
+        own = {pair: Sorted.of(pair, raw) for pair, raw in measurements.items()}
         lost_frames = self._kind.keys() - {name for pair in measurements for name in pair}
         # A scale belongs to the first name of a pair: the target, or the sensor of motions.
         lost_scales = {pair.target for pair in self.pairs} - {pair.target for pair in measurements}
         result = copy.copy(self)
         result._kind = {name: kind for name, kind in self._kind.items() if name not in lost_frames}
         result._kept = {
-            pair: KeptMeasurements((raw,), raw.covariances is not None) for pair, raw in measurements.items()
+            pair: KeptMeasurements((Section(many, 0),), many.covariances is not None) for pair, many in own.items()
         }
-        result._accumulator = Accumulator(self.gauge, dict(moments))
+        result._accumulator = Accumulator.of(own.values(), self.gauge)
         result._take_knowledge(self, frames=lost_frames, scales=lost_scales)
         return result
 
@@ -466,7 +447,7 @@ class Problem(Knowledge):
         """Raw measurements of a pair as they were added, batch by batch, without a copy; only what was kept."""
         return self._kept[self._pair(target, sensor)].batches
 
-    def stored(self, pair: Pair) -> tuple[Measurements | Section, ...]:
+    def stored(self, pair: Pair) -> tuple[Section, ...]:
         """What was kept of a pair, batch by batch, as it is stored."""
         return self._kept[pair].stored
 

@@ -16,12 +16,8 @@ from numpy.typing import ArrayLike
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.corners import candidates_of
-from gtsam_rwhec.problem.knowledge import ScaleMode
-from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
-from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.problem import Problem
 
 
@@ -33,29 +29,6 @@ class VarianceFactors(NamedTuple):
 
 
 AS_STATED = VarianceFactors(1.0, 1.0)
-
-
-def problem_of_moments(
-    moments: Mapping[Pair, Moments],
-    gauge: Gauge,
-    scale: ScaleMode = "known",
-    *,
-    is_relative: bool = False,
-    sensor_carrier: str | None = None,
-    target_carrier: str | None = None,
-) -> Problem:
-    """The problem of moments about ``gauge``, without raw measurements; the other arguments are as for ``Problem``.
-
-    A FrameError says which name is used for both a target and a sensor.
-    """
-    problem = Problem(scale, keep_measurements=False, sensor_carrier=sensor_carrier, target_carrier=target_carrier)
-    for pair in moments:
-        problem._check_names(pair, pair.label)
-        problem._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
-        problem._kept[pair] = KeptMeasurements()
-    problem._accumulator = Accumulator(gauge, dict(moments))
-    problem.is_relative = is_relative
-    return problem
 
 
 def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:

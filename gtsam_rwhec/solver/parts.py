@@ -11,10 +11,10 @@ import numpy as np
 from gtsam_rwhec.errors import FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import Prior, ScaleMode
-from gtsam_rwhec.problem.many_measurements import Section, Sorted
+from gtsam_rwhec.problem.many_measurements import Sorted
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
-from gtsam_rwhec.problem.moments import Gauge, Moments
+from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.problem import Problem
 
 #: Pairs with more measurements are evaluated one by one.
@@ -52,9 +52,7 @@ class Given:
         shared: dict[int, Shared] = {}
         for e, pair in enumerate(pairs):
             for batch in problem.stored(pair):
-                if not isinstance(batch, Section):
-                    batches.append((e, batch))
-                elif batch.count > SMALL:
+                if batch.count > SMALL or len(batch.many.pairs) == 1:
                     batches.append((e, batch.measurements))
                 else:
                     many = batch.many
@@ -240,17 +238,13 @@ def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentSt
     The formula that moves moments is exact, but a move far beyond the spread of the translations loses digits. This
     happens when the first measurements were nearly one pose. Then the raw measurements, if kept, are summed again.
     """
-    motion = [pair.is_motion for pair in pairs]
     moments = problem.moment_stack(pairs)
     a, c = moments.best_shift()
     gauge, centred = problem.gauge.moved_by(a, c), moments.shifted(a, c)
     far = float(np.hypot(np.linalg.norm(a), np.linalg.norm(c)))
     if far > FAR * centred.spread() and problem.has_measurements:
-        fresh = []
-        for pair, is_motion in zip(pairs, motion, strict=True):
-            raw = problem.measurements(*pair)
-            fresh.append(Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, gauge, is_motion, pair.label))
-        centred = MomentStack.of(fresh, motion)
+        raw = (Sorted.of(pair, problem.measurements(*pair)) for pair in pairs)
+        centred = MomentStack.joined([each.moments(gauge, with_R_B=True) for each in raw])
     return gauge, centred
 
 

@@ -73,6 +73,20 @@ def test_moments_are_those_of_a_call_for_each_pair(counts: list[int], scale: Any
             np.testing.assert_array_equal(getattr(raw, name), getattr(expected, name))
 
 
+def test_all_moments_are_about_one_gauge_that_few_measurements_began() -> None:
+    """The first measurements, fewer than fix a gauge, are at another place than those of many pairs."""
+    pairs, given_ = drawn([10, 30, 40], 3)
+    given_["A"][given_["index"] == 0, 0, 3] += 50.0
+    problem = rw.Problem()
+    one_by_one(problem, pairs[:1], given_)
+    rest = {name: values[given_["index"] > 0] for name, values in given_.items()}
+    problem.add_many(pairs[1:], **{**rest, "index": rest["index"] - 1})
+    again = problem.with_measurements({pair: problem.measurements(*pair) for pair in problem.pairs})
+    for pair in problem.pairs:
+        got, expected = problem.moments(*pair).translation[T_A, -1], again.moments(*pair).translation[T_A, -1]
+        np.testing.assert_allclose(got, expected, rtol=1e-9)
+
+
 def test_a_stack_of_several_calls_is_shifted_as_single_moments_are() -> None:
     """Pairs of several calls and of `add`, more than are made at once, one with more measurements than a block."""
     counts = [2] * (PAIRS_AT_ONCE + 50) + [BLOCK + 3]
@@ -89,7 +103,7 @@ def test_a_stack_of_several_calls_is_shifted_as_single_moments_are() -> None:
     assert stack.is_finite().all()
     shift = shift_of(a, c)
     for e in (0, 39, 40, 41, len(pairs) - 1):
-        single = problem.moments(*problem.pairs[e]).shifted(a, c)
+        single = problem.moment_stack([problem.pairs[e]]).shifted(a, c).as_summed().one(0)
         np.testing.assert_allclose(
             stack.translations(slice(e, e + 1))[0], shift @ problem.moments(*problem.pairs[e]).translation @ shift.T
         )

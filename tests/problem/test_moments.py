@@ -13,6 +13,9 @@ from naive_cost import naive_cost
 from rwhec_factors.se3 import pose
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.problem.many_measurements import Sorted
+from gtsam_rwhec.problem.measurements import Measurements, Pair
+from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
@@ -133,10 +136,14 @@ def naive_edge_form(A: np.ndarray, B: np.ndarray, sigma: np.ndarray, kappa: np.n
     return form
 
 
-def moments_of(
+def stack_of(
     A: np.ndarray, B: np.ndarray, sigma: np.ndarray, kappa: np.ndarray, gauge: Gauge | None = None
-) -> Moments:
-    return Moments.of(A, B, 1.0 / sigma**2, kappa, gauge or Gauge(), False, "test")
+) -> MomentStack:
+    return Sorted.of(Pair("t", "s"), Measurements(A, B, sigma, kappa)).moments(gauge or Gauge(), with_R_B=True)
+
+
+def moments_of(*data: Any) -> Moments:
+    return stack_of(*data).one(0)
 
 
 def random_measurements(count: int, seed: int) -> tuple[np.ndarray, ...]:
@@ -260,7 +267,9 @@ def test_moments_add(seed: int, first: int, second: int) -> None:
     data = random_measurements(first + second, seed)
     gauge = Gauge(np.array([0.3, -1.0, 2.0]), np.array([-0.5, 0.1, 0.7]))
     whole = moments_of(*data, gauge)
-    parts = moments_of(*(d[:first] for d in data), gauge) + moments_of(*(d[first:] for d in data), gauge)
+    stack = stack_of(*(d[:first] for d in data), gauge)
+    stack.add_to(np.zeros(1, dtype=int), stack_of(*(d[first:] for d in data), gauge))
+    parts = stack.one(0)
     assert parts.count == whole.count == first + second
     assert parts.kappa == pytest.approx(whole.kappa, rel=1e-14)
     close(parts.translation, whole.translation, 1e-14)
@@ -277,7 +286,7 @@ def test_blocks_lose_nothing(count: int) -> None:
     close(got.translation, (features / sigma[:, None] ** 2).T @ features, 1e-13)
     close(got.rotation, (features[:, :9] * kappa[:, None]).T @ features[:, 12:21], 1e-13)
     assert got.kappa == pytest.approx(kappa.sum())
-    one_weight = Moments.of(A, B, np.array(4.0), np.array(3.0), Gauge(), False, "test")
+    one_weight = moments_of(A, B, np.array(0.5), np.array(3.0))
     close(one_weight.translation, 4.0 * features.T @ features, 1e-13)
     assert one_weight.kappa == 3.0 * count
 
@@ -289,7 +298,7 @@ def test_shifted_moments_are_those_about_the_other_gauge(seed: int) -> None:
     generator = np.random.default_rng(seed)
     first, step = (Gauge(*generator.uniform(-3.0, 3.0, (2, 3))) for _ in range(2))
     second = first.moved_by(step.sensor_carrier, step.target_carrier)
-    shifted = moments_of(*data, first).shifted(step.sensor_carrier, step.target_carrier)
+    shifted = stack_of(*data, first).shifted(step.sensor_carrier, step.target_carrier).as_summed().one(0)
     close(shifted.translation, moments_of(*data, second).translation)
     close(shifted.rotation, moments_of(*data, second).rotation)
 
