@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,9 +23,10 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.fitting.fit_options import About, CornerOptions, Drift, PoseOptions, check_choices
+from gtsam_rwhec.fitting.fit_options import About, CornerOptions, Drift, PoseOptions, RefineOptions, check_choices
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
@@ -93,9 +94,21 @@ class CalibrateOptions(PoseOptions):
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
 
+    def refinement(self, time_offsets: bool | tuple[str, ...], **others: Any) -> RefineOptions:
+        """The options of a refinement by these, in which some clocks' offsets are estimated; ``others`` overrule."""
+        same = {name: getattr(self, name) for name in ("noise_groups", "inlier_confidence", "carrier_noise")}
+        same["noise"] = "given" if self.noise == "given" else "estimate"
+        path = self.carrier_path if time_offsets else None
+        return RefineOptions(**{**same, "time_offsets": time_offsets, "carrier_path": path, **others})
+
 
 #: Which measurements of each pair count, (N,) booleans.
 Inliers = dict[Pair, np.ndarray]
+
+
+def agreeing(problem: Problem, inliers: Inliers) -> Problem:
+    """The problem of the inliers; without a choice of inliers, or where all agree, the problem itself."""
+    return problem if all(mask.all() for mask in inliers.values()) else selected(problem, inliers)
 
 
 def offsets_of(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing, offsets_of
 from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN, NoiseFound, refined_under_its_noise
 from gtsam_rwhec.calibration.outliers import say_outliers, without_outliers
 from gtsam_rwhec.calibration.verdict import Ground
@@ -26,7 +26,6 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import WINDOW_S, LocalPaths, Trajectory
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution
 
 #: An offset whose standard deviation (s) would be larger is not estimated: a camera's frame interval is about as long.
@@ -331,8 +330,7 @@ def _with_offsets(
 def _clocks(run: Run, solution: Solution | None, inliers: Inliers) -> tuple[Clock, ...]:
     if solution is None:
         return ()
-    kept = selected(run.problem, inliers) if inliers else run.problem
-    return offsets_worth_estimating(kept, solution, run.options.carrier_path)
+    return offsets_worth_estimating(agreeing(run.problem, inliers), solution, run.options.carrier_path)
 
 
 def _evidence(clocks: tuple[Clock, ...]) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, agreeing
 from gtsam_rwhec.calibration.clock_offsets import Answer
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
@@ -463,7 +463,7 @@ def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tupl
     ``base`` is an answer from the poses of the inliers. If the corners contradict the stated intrinsics, the run starts
     again.
     """
-    kept = replace(run, problem=selected(run.problem, inliers) if inliers else run.problem)
+    kept = replace(run, problem=agreeing(run.problem, inliers))
     why = "an option says so" if run.options.observations == "poses" else _why_not(kept, base)
     if why:
         return run, ByCorners(CornersFound.none(why), base)

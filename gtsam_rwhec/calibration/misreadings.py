@@ -48,6 +48,7 @@ from gtsam_rwhec.errors import RwhecWarning, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -124,6 +125,20 @@ class Misreading:
     translation_mm: tuple[float, float]
     of_B: bool = False  #: Whether B was misread
     inverts_A: bool = False  #: Whether A, alone, is the inverse of what was meant: the carriers are exchanged
+
+    @staticmethod
+    def of(reading: OtherReading, before: Spread, after: Spread, unit: WrongUnit | None = None) -> Misreading:
+        """The record of a reading with its residuals, and of a unit that is wrong too."""
+        parts = [part for part in (reading if reading is not AS_READ else None, unit) if part]
+        return Misreading(
+            parts[0].mistake,
+            ", and ".join(part.likely for part in parts),
+            "; ".join(part.cure for part in parts),
+            (math.degrees(before.rotation_rad), math.degrees(after.rotation_rad)),
+            (1e3 * before.translation_m, 1e3 * after.translation_m / (unit.of_B if unit else 1.0)),
+            reading.of_B,
+            reading.inverts_A,
+        )
 
     def __str__(self) -> str:
         before, after = (
@@ -301,14 +316,12 @@ class _Trial:
 
     def found(self, readings: Iterable[OtherReading], mode: ScaleMode | None = None) -> tuple[Misreading, ...]:
         """The readings that fit best, if they fit far better than the given one."""
-        promising = [reading for reading in readings if self.is_promising(reading, mode)]
         gains: list[tuple[float, Misreading, Spread]] = []
-        for reading in promising:
+        for reading in filter(lambda reading: self.is_promising(reading, mode), readings):
             fit = fitted(self.problem, self.sampled.by(reading), mode)
             if fit is None or not (gain := self.gain(reading, fit)):
                 continue
-            named = self.named(reading, fit) if mode is None else self.named_with_unit(reading, fit)
-            if named is not None:
+            if (named := self.named(reading, fit, mode)) is not None:
                 gains.append((gain, named, fit.residual))
         best = max(gains, key=lambda each: each[0], default=None)
         if best is None or explains_more(self.problem, self.sampled.as_read(), best[2]):
@@ -346,17 +359,13 @@ class _Trial:
                 return 0.0
         gain = float(np.sum(np.log(ratios)))
         chance = math.sqrt(2.0 * INEFFICIENCY_OF_MEDIANS / _degrees_of_freedom(self.sampled))
-        return (
-            gain if gain > math.log(FAR_BETTER) + BEYOND_CHANCE * chance and self.is_significant(reading, fit) else 0.0
-        )
-
-    def is_significant(self, reading: OtherReading, fit: TrialFit) -> bool:
-        """Vuong's test of two models that do not contain each other, over blocks of neighbouring measurements."""
+        if gain <= math.log(FAR_BETTER) + BEYOND_CHANCE * chance:
+            return 0.0
+        # Vuong's test of two models that do not contain each other, over blocks of neighbouring measurements.
         remains = self.sampled.remains(reading)
-        differences = fit.log_likelihoods - self.base.log_likelihoods[remains]
-        blocks = self.sampled.blocks()[remains]
-        sums = np.bincount(blocks, differences)[np.unique(blocks)]
-        return float(sums.mean()) > BEYOND_CHANCE * float(sums.std(ddof=1)) / math.sqrt(len(sums))
+        sums = _sums(fit.log_likelihoods - self.base.log_likelihoods[remains], self.sampled.blocks()[remains])
+        is_significant = float(sums.mean()) > BEYOND_CHANCE * float(sums.std(ddof=1)) / math.sqrt(len(sums))
+        return gain if is_significant else 0.0
 
     def _floored(self, spread: Spread) -> Spread:
         return Spread(
@@ -368,25 +377,20 @@ class _Trial:
         floored = self._floored(fit.residual)
         return math.log(floored.rotation_rad) + math.log(floored.translation_m)
 
-    def named(self, reading: OtherReading, fit: TrialFit, unit: WrongUnit | None = None) -> Misreading:
-        """The record of a reading that fits, and of a unit that is wrong too."""
-        before, factor = self.base.residual, unit.of_B if unit else 1.0
-        parts = [part for part in (reading if reading is not AS_READ else None, unit) if part]
-        return Misreading(
-            parts[0].mistake,
-            ", and ".join(part.likely for part in parts),
-            "; ".join(part.cure for part in parts),
-            (math.degrees(before.rotation_rad), math.degrees(fit.residual.rotation_rad)),
-            (1e3 * before.translation_m, 1e3 * fit.residual.translation_m / factor),
-            reading.of_B,
-            reading.inverts_A,
-        )
+    def named(self, reading: OtherReading, fit: TrialFit, mode: ScaleMode | None) -> Misreading | None:
+        """The record of a reading that fits; None where it fits with a free scale that is no mistake."""
+        unit = None
+        if mode is not None:
+            from_corners = all(pair.target in self.problem.boards for pair in self.problem.pairs)
+            unit = wrong_unit(fit.one_scale, *self.sampled.median_lengths, from_corners=from_corners)
+            if unit is None:
+                return None
+        return Misreading.of(reading, self.base.residual, fit.residual, unit)
 
-    def named_with_unit(self, reading: OtherReading, fit: TrialFit) -> Misreading | None:
-        """The record of a reading that fits with a free scale; None where the scale is no mistake."""
-        from_corners = all(pair.target in self.problem.boards for pair in self.problem.pairs)
-        unit = wrong_unit(fit.one_scale, *self.sampled.median_lengths, from_corners=from_corners)
-        return self.named(reading, fit, unit) if unit else None
+
+def _sums(values: Array, blocks: np.ndarray) -> Array:
+    """The sums of values (N,) over the blocks (N,) that there are."""
+    return np.asarray(np.bincount(blocks, values)[np.unique(blocks)])
 
 
 #: The exchange is reported from this logarithm of the likelihood ratio on.
@@ -420,22 +424,12 @@ def exchange_of(problem: Problem) -> Exchange:
     if given is None or inverse is None:
         return Exchange()
     gains = inverse.log_likelihoods - given.log_likelihoods
-    sums = np.bincount(sampled.blocks(), gains)[np.unique(sampled.blocks())]
+    sums = _sums(gains, sampled.blocks())
     gain, spread = float(gains.sum()), float(sums.std(ddof=1)) * math.sqrt(len(sums)) if len(sums) > 1 else math.inf
     signal = signal_of(sampled.as_read())
     is_explained = max(shares_of(inverse.residual, signal)) < EXCHANGE_EXPLAINED
     is_named = gain > EXCHANGE_SURELY and gain > EXCHANGE_SIGMAS * spread and is_explained
     if is_named and not explains_more(problem, sampled.as_read(), inverse.residual):
-        before, after = given.residual, inverse.residual
-        return Exchange(
-            Misreading(
-                A_INVERTED.mistake,
-                A_INVERTED.likely,
-                A_INVERTED.cure,
-                (math.degrees(before.rotation_rad), math.degrees(after.rotation_rad)),
-                (1e3 * before.translation_m, 1e3 * after.translation_m),
-                inverts_A=True,
-            )
-        )
+        return Exchange(Misreading.of(A_INVERTED, given.residual, inverse.residual))
     is_small = is_plain(given.residual, signal)
     return Exchange(is_open=are_too_few_to_tell(problem) and (gain > -EXCHANGE_OPEN or not is_small))

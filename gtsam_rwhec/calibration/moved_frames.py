@@ -9,7 +9,7 @@ are left out as outliers, and agree with one another in the axes of the frame th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
@@ -57,31 +57,65 @@ class TwoPoses:
         )
 
 
-def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndarray]) -> TwoPoses | None:
-    """The frame of an answer that was at two poses, the one whose groups are farthest apart; None where none was.
+@dataclass(frozen=True)
+class Measured:
+    """All measurements of a pair in their order: A and B (N, 4, 4), and which are kept (N,)."""
+
+    A: Array
+    B: Array
+    kept: np.ndarray
+
+
+def measured_of(problem: Problem, inliers: Mapping[Pair, np.ndarray]) -> dict[Pair, Measured]:
+    """The measurements of a problem, and which are kept: all without ``inliers``; empty without measurements."""
+    raw = {pair: problem.measurements(*pair) for pair in problem.pairs} if problem.has_measurements else {}
+    return {pair: Measured(of.A, of.B, inliers.get(pair, np.ones(len(of.A), dtype=bool))) for pair, of in raw.items()}
+
+
+@dataclass(frozen=True)
+class AtStations:
+    """The kept measurements of one pair at each station of the carriers: an arm has one error at a station."""
+
+    twists: tuple[Array, Array]  #: The mean residuals (S, 6), in the target's axes and in the sensor's
+    A: Array  #: (S, 12)
+    visits: np.ndarray
+    rows: np.ndarray  #: The first measurement at each, among all of the pair
+
+
+def residuals_at_stations(refined: Refined, measured: Mapping[Pair, Measured]) -> dict[Pair, AtStations]:
+    """The residuals of an answer, by pair and station; without pairs of frames that it lacks."""
+    found = {}
+    for pair, one in measured.items():
+        A = one.A[one.kept]
+        twists = _residual_twists(refined, pair, A, one.B[one.kept])
+        if len(twists[0]):
+            station = stations_of(A)
+            first, visits = np.unique(station, return_index=True)[1], np.bincount(station)
+            means = [np.stack([np.bincount(station, column) / visits for column in of.T], axis=1) for of in twists]
+            rows = np.flatnonzero(one.kept)[first]
+            found[pair] = AtStations((means[0], means[1]), A[first, :3].reshape(-1, 12), visits, rows)
+    return found
+
+
+def stations_of(A: Array) -> np.ndarray:
+    """The station (N,) of each pose."""
+    return stations(A[:, :3].reshape(-1, 12)) if len(A) else np.zeros(0, dtype=np.int64)
+
+
+def two_poses(at: Mapping[Pair, AtStations]) -> TwoPoses | None:
+    """The frame that was at two poses, the one whose groups of residuals are farthest apart; None where none was.
 
     A frame that moved also splits the residuals of the frames measured with it, so only one frame is named.
-
-    Parameters
-    ----------
-    problem : Problem
-    refined : Refined
-        The answer from the ``inliers``, by pair (N,) booleans; empty: from all measurements.
     """
-    if not problem.has_measurements:
-        return None
-    in_frame: dict[str, list[_Stations]] = {}
-    for pair in problem.pairs:
-        raw = problem.measurements(*pair)
-        kept = inliers.get(pair, np.ones(len(raw.A), dtype=bool))
-        for name, twists in zip(pair, residual_twists(refined, pair, raw.A[kept], raw.B[kept]), strict=True):
-            in_frame.setdefault(name, []).append(_Stations.of(twists, raw.A[kept], np.flatnonzero(kept)))
-    found = [_groups(name, parts, is_sensor=name in refined.Y) for name, parts in in_frame.items()]
-    apart, groups = max(found, key=lambda one: one[0], default=(0.0, None))
-    return groups if apart > GROUPS_APART else None
+    names = dict.fromkeys((name, side) for pair in at for side, name in enumerate(pair))
+    found = [
+        _groups(name, [(one, one.twists[side]) for pair, one in at.items() if pair[side] == name], is_sensor=side == 1)
+        for name, side in names
+    ]
+    return max(found, key=lambda one: one[0], default=(0.0, None))[1]
 
 
-def residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
+def _residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
     """Residuals (N, 6) of some measurements, in the target's axes and in the sensor's; lengths are true ones."""
     X, Y = refined.X.get(pair.target), refined.Y.get(pair.sensor)
     if X is None or Y is None or not len(A):
@@ -93,48 +127,13 @@ def residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[A
     return se3.logmap(se3.inverse(measured) @ predicted), se3.logmap(measured @ se3.inverse(predicted))
 
 
-def by_station(A: Array) -> tuple[np.ndarray, Array]:
-    """The station (N,) of each pose, and a pose (S, 12) of each station: an arm has one error at a station."""
-    rows = A[:, :3].reshape(-1, 12)
-    station = stations(rows) if len(rows) else np.zeros(0, dtype=np.int64)
-    return station, rows[np.unique(station, return_index=True)[1]]
-
-
-def means_of(twists: Array, station: np.ndarray) -> Array:
-    """The mean residual (S, 6) at each station."""
-    if not len(twists):
-        return twists
-    visits = np.bincount(station)
-    return np.stack([np.bincount(station, column) / visits for column in twists.T], axis=1)
-
-
-@dataclass(frozen=True)
-class _Stations:
-    """Of one pair: the mean residual (S, 6), a pose (S, 12), the number of visits and the first row of each station."""
-
-    twists: Array
-    A: Array
-    visits: np.ndarray
-    rows: np.ndarray
-
-    @staticmethod
-    def of(twists: Array, A: Array, rows: np.ndarray) -> _Stations:
-        station, poses = by_station(A)
-        first = np.unique(station, return_index=True)[1]
-        count = len(first) if len(twists) else 0
-        return _Stations(
-            means_of(twists, station), poses[:count], np.bincount(station, minlength=count)[:count], rows[first][:count]
-        )
-
-
-def _groups(name: str, parts: list[_Stations], *, is_sensor: bool) -> tuple[float, TwoPoses | None]:
+def _groups(name: str, parts: list[tuple[AtStations, Array]], *, is_sensor: bool) -> tuple[float, TwoPoses | None]:
     """How far apart the best two groups of the residuals of a frame's pairs are, in their own spread, and the groups.
 
-    Groups that come with the carriers' poses, and not one after the other in time, are an arm's error, or views of a
-    board.
+    None where they are not apart. Groups that come with the carriers' poses, and not one after the other in time, are
+    an arm's error, or views of a board.
     """
-    twists, A = np.concatenate([part.twists for part in parts]), np.concatenate([part.A for part in parts])
-    visits = np.concatenate([part.visits for part in parts])
+    twists, visits = np.concatenate([of for _, of in parts]), np.concatenate([one.visits for one, _ in parts])
     n = len(twists)
     if n < FEWEST_OF_GROUPS:
         return 0.0, None
@@ -150,21 +149,26 @@ def _groups(name: str, parts: list[_Stations], *, is_sensor: bool) -> tuple[floa
     within = np.maximum(squares[-1] - k * low**2 - (n - k) * high**2, 1e-12) / (n - 2)
     apart = np.where(np.minimum(k, n - k) >= SMALLEST_GROUP * n, (high - low) / np.sqrt(within), 0.0)
     best = int(np.argmax(apart))
+    if apart[best] <= GROUPS_APART:
+        return 0.0, None
     is_high = np.zeros(n, dtype=bool)
     is_high[order[best + 1 :]] = True
     if is_high[0]:
         is_high = ~is_high  # the first group is that of the first measurement
-    step = twists[is_high].mean(axis=0) - twists[~is_high].mean(axis=0)
     changes = np.flatnonzero(np.diff(is_high))
-    if len(changes) > 1 and (is_high[np.asarray(cKDTree(A).query(A, k=2)[1])[:, 1]] == is_high).mean() > SAME_GROUP:
-        return 0.0, None
+    if len(changes) > 1:
+        nearest = cKDTree(np.concatenate([one.A for one, _ in parts]))
+        neighbours = np.asarray(nearest.query(nearest.data, k=2)[1])[:, 1]
+        if (is_high[neighbours] == is_high).mean() > SAME_GROUP:
+            return 0.0, None
+    step = twists[is_high].mean(axis=0) - twists[~is_high].mean(axis=0)
     groups = TwoPoses(
         frame=name,
         first=int(visits[~is_high].sum()),
         second=int(visits[is_high].sum()),
         angle_rad=float(np.linalg.norm(step[:3])),
         distance_m=float(np.linalg.norm(step[3:])),
-        from_row=int(parts[0].rows[changes[0] + 1]) + 1 if len(changes) == 1 and len(parts) == 1 else None,
+        from_row=int(parts[0][0].rows[changes[0] + 1]) + 1 if len(changes) == 1 and len(parts) == 1 else None,
         is_sensor=is_sensor,
     )
     return float(apart[best]), groups
@@ -185,14 +189,10 @@ STEP_APART = 5.0
 TRIAL_ROUNDS, HALVINGS = 2, 5
 
 
-def moved_frame(problem: Problem, sample: Sample) -> TwoPoses | None:
-    """The frame that moved once, from some measurement of its pairs on; None where none did: see `step_of`."""
-    found = step_of(problem, sample)
-    return None if found is None else found[0]
-
-
 def step_of(problem: Problem, sample: Sample) -> tuple[TwoPoses, Spread] | None:
-    """The frame that moved once, and the residuals that remain with its two poses; None where none did.
+    """The frame that moved once, from some measurement of its pairs on, and the residuals that remain with two poses.
+
+    None where none did.
 
     Parameters
     ----------
@@ -201,22 +201,40 @@ def step_of(problem: Problem, sample: Sample) -> tuple[TwoPoses, Spread] | None:
     sample : dict of Pair to (A, B)
         Its measurements in their order, (N, 4, 4) each.
     """
-    frames = [name for pair in sample for name in pair.frames]
-    names = [name for name in dict.fromkeys(frames) if name not in problem.fixed]
-    number = sum(len(by_station(A)[1]) for A, _ in sample.values())
-    if not names or len(set(frames)) > MOST_FRAMES or number < 2 * FEWEST_POSES:
+    frames = {name for pair in sample for name in pair.frames}
+    names = sorted(frames - set(problem.fixed))
+    station = {pair: stations_of(A) for pair, (A, _) in sample.items()}
+    number = sum(len(np.unique(of_pair)) for of_pair in station.values())
+    if not names or len(frames) > MOST_FRAMES or number < 2 * FEWEST_POSES:
         return None
     plain = fitted(problem, sample, rounds=TRIAL_ROUNDS)
     if plain is None:
         return None
-    best: tuple[float, str, float] | None = None
-    for name in names:
-        tried = [(_volume(_split(problem, sample, name, cut)), name, cut) for cut in CUTS]
-        best = min(tried if best is None else [best, *tried])
-    if best is None or best[0] * STEP_BETTER > _volume(plain):
+
+    def split(name: str, cut: float) -> TrialFit | None:
+        """The fit with another name for a frame from a share of each of its pairs' rows on."""
+        parts, poses = dict(sample), np.zeros(2, dtype=int)
+        for pair, (A, B) in sample.items():
+            if name in pair.frames:
+                del parts[pair]
+                row, then = round(cut * len(B)), Pair(*(_second(name) if of == name else of for of in pair))
+                for side, (of, rows) in enumerate(((pair, slice(0, row)), (then, slice(row, None)))):
+                    poses[side] += len(np.unique(station[pair][rows]))
+                    if len(B[rows]):
+                        parts[of] = (A[rows], B[rows])
+        return fitted(problem, parts, rounds=TRIAL_ROUNDS) if poses.min() >= FEWEST_POSES else None
+
+    def volume(name: str, cut: float) -> float:
+        fit = split(name, cut)
+        return np.inf if fit is None else _product(fit.residual)
+
+    best, name, cut = min((volume(name, cut), name, cut) for name in names for cut in CUTS)
+    if best * STEP_BETTER > _product(plain.residual):
         return None
-    name, cut = best[1], _refined_cut(problem, sample, best)
-    fit = _split(problem, sample, name, cut)
+    for halving in range(HALVINGS):
+        away = 2.0 ** -(4 + halving)
+        best, cut = min((best, cut), *((volume(name, at), at) for at in (cut - away, cut + away)))
+    fit = split(name, cut)
     step = None if fit is None else _step(name, sample, cut, fit)
     return None if fit is None or step is None else (step, fit.residual)
 
@@ -234,47 +252,8 @@ def _second(name: str) -> str:
     return f"{name} after it moved"
 
 
-def _cut_sample(sample: Sample, name: str, cut: float) -> dict[Pair, tuple[Array, Array]]:
-    """The sample with another name for a frame from a share of each of its pairs' rows on."""
-    found: dict[Pair, tuple[Array, Array]] = {}
-    for pair, (A, B) in sample.items():
-        if name not in pair.frames:
-            found[pair] = (A, B)
-            continue
-        row = round(cut * len(B))
-        second = Pair(*(_second(frame) if frame == name else frame for frame in (pair.target, pair.sensor)))
-        for of, rows in ((pair, slice(0, row)), (second, slice(row, None))):
-            if len(B[rows]):
-                found[of] = (A[rows], B[rows])
-    return found
-
-
-def _split(problem: Problem, sample: Sample, name: str, cut: float) -> TrialFit | None:
-    parts = _cut_sample(sample, name, cut)
-    sides = [
-        sum(len(by_station(A)[1]) for pair, (A, _) in parts.items() if of in pair.frames)
-        for of in (name, _second(name))
-    ]
-    return fitted(problem, parts, rounds=TRIAL_ROUNDS) if min(sides) >= FEWEST_POSES else None
-
-
-def _volume(fit: TrialFit | None) -> float:
-    return np.inf if fit is None else _product(fit.residual)
-
-
 def _product(residual: Spread) -> float:
     return residual.rotation_rad * residual.translation_m
-
-
-def _refined_cut(problem: Problem, sample: Sample, best: tuple[float, str, float]) -> float:
-    """The cut with the smallest residuals, by halving the steps about the best so far."""
-    volume, name, cut = best
-    step = 1.0 / 16.0
-    for _ in range(HALVINGS):
-        tried = [(_volume(_split(problem, sample, name, at)), at) for at in (cut - step, cut + step)]
-        volume, cut = min((volume, cut), *tried)
-        step *= 0.5
-    return cut
 
 
 def _step(name: str, sample: Sample, cut: float, fit: TrialFit) -> TwoPoses | None:
@@ -310,37 +289,6 @@ LEAST = np.array([5e-5, 1e-5])
 MISPLACED = 0.2
 
 
-@dataclass(frozen=True)
-class Measured:
-    """All measurements of a pair in their order: A and B (N, 4, 4), and which are kept (N,)."""
-
-    A: Array
-    B: Array
-    kept: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Step:
-    """How the outliers of a frame lie from the answer: their median (6,), and how they spread about it."""
-
-    frame: str
-    is_sensor: bool
-    middle: Array
-    spread: Array
-    kept: int
-    agreeing: int
-
-    @property
-    def volume(self) -> float:
-        """The product of the spreads in rotation and in translation."""
-        return float(self.spread.prod())
-
-    @property
-    def size(self) -> Array:
-        """The angle (rad) and the distance (m)."""
-        return np.array([np.linalg.norm(self.middle[:3]), np.linalg.norm(self.middle[3:])])
-
-
 def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPoses | None:
     """The frame that was elsewhere when the measurements that were left out were taken; None where none was.
 
@@ -351,42 +299,41 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
     measured : dict of Pair to Measured
         Without those that were removed for other reasons.
     """
+    if all(one.kept.all() for one in measured.values()):
+        return None
+    twists = {pair: _residual_twists(refined, pair, one.A, one.B) for pair, one in measured.items()}
     frames = dict.fromkeys(name for pair in measured for name in pair.frames)
-    steps = [step for name in frames if (step := _step_with_outliers(refined, measured, name)) is not None]
-    if not steps:
+    steps = []
+    for name in frames:
+        of_frame = [
+            (of[pair.frames.index(name)], measured[pair].kept)
+            for pair, of in twists.items()
+            if name in pair.frames and len(of[0])
+        ]
+        if of_frame and (step := _step_with_outliers(name, of_frame, is_sensor=name in refined.Y)) is not None:
+            steps.append(step)
+    steps.sort(key=lambda step: step[0])
+    if not steps or any(volume < OUTLIERS_BETTER * steps[0][0] for volume, _ in steps[1:]):
         return None
-    best = min(steps, key=lambda step: step.volume)
-    rivals = [step for step in steps if step is not best and step.volume < OUTLIERS_BETTER * best.volume]
-    if rivals:
+    found = steps[0][1]
+    kept = [one.kept for pair, one in measured.items() if found.frame in pair.frames]
+    fewer = sum(min(int(of.sum()), int((~of).sum())) for of in kept)
+    if sum(_moment(of)[1] for of in kept) > MISPLACED * fewer:
         return None
-    of_frame = [one for pair, one in measured.items() if best.frame in pair.frames]
-    fewer = sum(min(int(one.kept.sum()), int((~one.kept).sum())) for one in of_frame)
-    if sum(_moment(one.kept)[1] for one in of_frame) > MISPLACED * fewer:
-        return None
-    return TwoPoses(
-        frame=best.frame,
-        first=best.kept,
-        second=best.agreeing,
-        angle_rad=float(best.size[0]),
-        distance_m=float(best.size[1]),
-        from_row=_moment(of_frame[0].kept)[0] if len(of_frame) == 1 else None,
-        is_sensor=best.is_sensor,
-    )
+    return replace(found, from_row=_moment(kept[0])[0] if len(kept) == 1 else None)
 
 
-def _step_with_outliers(refined: Refined, measured: Mapping[Pair, Measured], name: str) -> _Step | None:
-    """The step that the outliers of a frame agree on; None where they do not, or where they are few."""
-    kept, left_out = [], []
-    for pair, one in measured.items():
-        if name in pair.frames:
-            twists = residual_twists(refined, pair, one.A, one.B)[pair.frames.index(name)]
-            if len(twists):
-                kept.append(twists[one.kept])
-                left_out.append(twists[~one.kept])
-    away = np.concatenate(left_out) if left_out else np.zeros((0, 6))
+def _step_with_outliers(
+    name: str, of_frame: list[tuple[Array, np.ndarray]], *, is_sensor: bool
+) -> tuple[float, TwoPoses] | None:
+    """The step that the outliers of a frame agree on, after the product of their spreads about it in both parts.
+
+    ``of_frame`` has the residuals (N, 6) of its pairs, and which are kept. None where outliers disagree, or are few.
+    """
+    kept, away = (np.concatenate([twists[of == is_kept] for twists, of in of_frame]) for is_kept in (True, False))
     if len(away) < FEWEST:
         return None
-    of_kept = np.maximum(np.median(_sizes(np.concatenate(kept)), axis=0), LEAST)
+    of_kept = np.maximum(np.median(_sizes(kept), axis=0), LEAST)
     middle = np.median(away, axis=0)
     for _ in range(3):  # the median of those that agree
         off = _sizes(away - middle)
@@ -395,10 +342,11 @@ def _step_with_outliers(refined: Refined, measured: Mapping[Pair, Measured], nam
             return None
         middle = np.median(away[agree], axis=0)
     spread = np.maximum(np.median(_sizes(away[agree] - middle), axis=0), LEAST)
-    step = _Step(name, name in refined.Y, middle, spread, sum(map(len, kept)), int(agree.sum()))
-    if agree.sum() < MOST_OF_THEM * len(away) or (step.size < OUTLIERS_APART * spread).all():
+    angle, distance = size = _sizes(middle[None])[0]
+    if agree.sum() < MOST_OF_THEM * len(away) or (size < OUTLIERS_APART * spread).all():
         return None
-    return step
+    found = TwoPoses(name, len(kept), int(agree.sum()), float(angle), float(distance), None, is_sensor)
+    return float(spread.prod()), found
 
 
 def _sizes(twists: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, offsets_of
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, agreeing, offsets_of
 from gtsam_rwhec.calibration.outliers import spare_equations
 from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
@@ -20,7 +20,6 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by, solve
 
 
@@ -83,15 +82,9 @@ def estimated(
     NoiseError, CountError
         The measurements are too few for the noise.
     """
-    kept = selected(problem, inliers) if inliers else problem
-    how = RefineOptions(
-        noise="given" if options.noise == "given" else "estimate",
-        noise_groups=options.noise_groups,
-        residual="geodesic" if problem.has_measurements else "chordal",
-        carrier_noise=options.carrier_noise,
-        time_offsets=offsets_of(kept, options),
-        carrier_path=options.carrier_path if offsets_of(kept, options) else None,
-    )
+    kept = agreeing(problem, inliers)
+    residual = "geodesic" if problem.has_measurements else "chordal"
+    how = options.refinement(offsets_of(kept, options), residual=residual)
     why, failed = "a model of all noise was not asked for", False
     if not problem.has_measurements:
         why = "the raw measurements were not kept"
@@ -139,8 +132,7 @@ def _by_the_whole_model(
     how = replace(how, carrier_noise=None)
     before, choices = None, 0
     while True:
-        kept = selected(problem, inliers) if inliers else problem
-        found = under_noise(kept, solution, how, noise, before=before, progress=progress)
+        found = under_noise(agreeing(problem, inliers), solution, how, noise, before=before, progress=progress)
         choices += 1
         if not inliers or choices == MAX_CHOICES:
             break
@@ -149,7 +141,7 @@ def _by_the_whole_model(
         if all(np.array_equal(mask, inliers[pair]) for pair, mask in again.items()):
             break
         inliers, before = again, found.settled
-        solution = solve(selected(problem, inliers), options=options.solve, progress=progress)
+        solution = solve(agreeing(problem, inliers), options=options.solve, progress=progress)
     progress("covariances")
     refined, noise_found = found.refined(inliers)
     return refined, _noise_of(refined, options, noise_found, ""), inliers
@@ -182,8 +174,7 @@ def refined_under_its_noise(
     run.tell("refining")
     try:
         if run.agreed is not None and inliers:  # a log's were chosen under each detection's own noise, and stay
-            kept = selected(run.problem, inliers)
-            refined, noise, _ = estimated(kept, solution, {}, run.options, run.tell)
+            refined, noise, _ = estimated(agreeing(run.problem, inliers), solution, {}, run.options, run.tell)
             refined = replace(refined, inliers=inliers)
         else:
             refined, noise, inliers = estimated(run.problem, solution, inliers, run.options, run.tell)
@@ -215,8 +206,7 @@ def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
     """Record a finding if the noise is larger than stated: standard deviations are too small by this factor."""
     if refined.options.robust not in ("none", "gnc"):
         return  # the cost of another loss is no chi-square
-    kept = selected(run.problem, inliers) if inliers else run.problem
-    ratio = contradicted_by(refined.cost, spare_equations(kept))
+    ratio = contradicted_by(refined.cost, spare_equations(agreeing(run.problem, inliers)))
     if ratio is not None:
         words = f"the residuals are {rounded(math.sqrt(ratio))} times as large as the stated noise allows"
         run.record.find(Ground.NOISE_UNDERSTATED, words)
@@ -238,8 +228,7 @@ def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers)
 
 def _doubt_noise_of_A(run: Run, refined: Refined, inliers: Inliers) -> None:
     """Record a finding if the noise stated for A is far larger than the residuals: deviations are then too large."""
-    kept = selected(run.problem, inliers) if inliers else run.problem
-    ratio = overstated_by(refined.cost, spare_equations(kept))
+    ratio = overstated_by(refined.cost, spare_equations(agreeing(run.problem, inliers)))
     if ratio is not None:
         factor = rounded(1.0 / math.sqrt(ratio))
         words = f"the residuals are far smaller ({factor} times) than the noise that you stated for A makes them"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -21,6 +21,7 @@ from gtsam_rwhec.geometry.quaternions import of_rows, to_rotations
 from gtsam_rwhec.problem.measurements import Pair
 
 Rows = tuple[Array, Array]
+Change = Callable[[Array], Array]
 
 
 class Mistake(StrEnum):
@@ -79,14 +80,6 @@ class OtherReading:
         return Pair(pair.sensor, pair.target) if self.exchanges_roles else pair
 
 
-def _unchanged(T: Array) -> Array:
-    return T
-
-
-def _inverted(T: Array) -> Array:
-    return inverse(T)
-
-
 def _transposed(T: Array) -> Array:
     return pose(T[:, :3, :3].transpose(0, 2, 1), T[:, :3, 3])
 
@@ -99,7 +92,7 @@ def mirrored(T: Array) -> Array:
     return pose(T[:, :3, :3], -T[:, :3, 3])
 
 
-def _reordered(columns: list[int]) -> Callable[[Array], Array]:
+def _reordered(columns: list[int]) -> Change:
     def reordered(T: Array) -> Array:
         xyzw = of_rows(T[:, :3, :3].transpose(2, 1, 0).reshape(9, -1)).T
         return pose(to_rotations(xyzw[:, columns]), T[:, :3, 3])
@@ -107,58 +100,40 @@ def _reordered(columns: list[int]) -> Callable[[Array], Array]:
     return reordered
 
 
-#: Rows x, y, z, w were read as w first: what was taken for w is x, and so on. In xyzw, the right ones.
-_XYZW_READ_AS_WXYZ = _reordered([3, 0, 1, 2])
-#: Rows w, x, y, z were read as x first.
-_WXYZ_READ_AS_XYZW = _reordered([1, 2, 3, 0])
-
-_SIDES = (("A",), ("B",), ("A", "B"))
+def _of(sides: str, change: Change) -> Callable[[Array, Array], Rows]:
+    """The change of "A", of "B" or of "A and B"."""
+    return lambda A, B: (change(A) if "A" in sides else A, change(B) if "B" in sides else B)
 
 
-def _of_sides(sides: tuple[str, ...], change: Callable[[Array], Array]) -> Callable[[Array, Array], Rows]:
-    of_A, of_B = (change if side in sides else _unchanged for side in "AB")
-    return lambda A, B: (of_A(A), of_B(B))
-
-
-def _quaternions() -> list[OtherReading]:
-    found = []
-    for given, read, change in (("xyzw", "wxyz", _XYZW_READ_AS_WXYZ), ("wxyz", "xyzw", _WXYZ_READ_AS_XYZW)):
-        for sides in _SIDES:
-            found.append(
-                OtherReading(
-                    Mistake.QUATERNION_ORDER,
-                    f"the quaternions of {' and '.join(sides)} are {given}, and were read as {read}",
-                    f"read {' and '.join(sides)} with order={given!r} (CSV files have w first)",
-                    _of_sides(sides, change),
-                    of_B="B" in sides,
-                )
-            )
-    return found
-
-
-A_INVERTED = OtherReading(
-    Mistake.INVERTED,
-    "A is inverted (the poses of the base and the hand are exchanged)",
-    "give A = T_sensorcarrier_targetcarrier: the inverse of each pose in A",
-    _of_sides(("A",), _inverted),
-    inverts_A=True,
-)
-_INVERTED = [
-    A_INVERTED,
+#: In xyzw, the right columns of rows x, y, z, w that were read as w first (what was taken for w is x, and so on), and
+#: of rows w, x, y, z that were read as x first.
+_REORDERED = (("xyzw", "wxyz", [3, 0, 1, 2]), ("wxyz", "xyzw", [1, 2, 3, 0]))
+_QUATERNIONS = [
     OtherReading(
-        Mistake.INVERTED,
-        "B is inverted",
-        "give B = T_sensor_target, the target's pose in the sensor's frame: the inverse of each pose in B",
-        _of_sides(("B",), _inverted),
-        of_B=True,
-    ),
+        Mistake.QUATERNION_ORDER,
+        f"the quaternions of {sides} are {given}, and were read as {read}",
+        f"read {sides} with order={given!r} (CSV files have w first)",
+        _of(sides, _reordered(columns)),
+        of_B="B" in sides,
+    )
+    for given, read, columns in _REORDERED
+    for sides in ("A", "B", "A and B")
 ]
-_BOTH_INVERTED = OtherReading(
-    Mistake.INVERTED,
-    "A and B are both inverted",
-    "give the inverse of each pose in A and in B",
-    _of_sides(("A", "B"), _inverted),
-    of_B=True,
+A_INVERTED, _B_INVERTED, _BOTH_INVERTED = (
+    OtherReading(Mistake.INVERTED, likely, cure, _of(sides, inverse), of_B="B" in sides, inverts_A=sides == "A")
+    for sides, likely, cure in (
+        (
+            "A",
+            "A is inverted (the poses of the base and the hand are exchanged)",
+            "give A = T_sensorcarrier_targetcarrier: the inverse of each pose in A",
+        ),
+        (
+            "B",
+            "B is inverted",
+            "give B = T_sensor_target, the target's pose in the sensor's frame: the inverse of each pose in B",
+        ),
+        ("A and B", "A and B are both inverted", "give the inverse of each pose in A and in B"),
+    )
 )
 #: The poses as they are; with a free scale it tells a wrong unit.
 AS_READ = OtherReading(Mistake.UNIT, "", "", lambda A, B: (A, B))
@@ -174,7 +149,7 @@ _TRANSPOSED = [
         Mistake.TRANSPOSED,
         f"the rotations of {side} are transposed (rows for columns, or quaternions of the JPL convention)",
         f"transpose the rotation matrices of {side}, and keep its translations",
-        _of_sides((side,), _transposed),
+        _of(side, _transposed),
         of_B=side == "B",
     )
     for side in "AB"
@@ -183,7 +158,7 @@ HANDEDNESS = OtherReading(
     Mistake.HANDEDNESS,
     "one of A and B is from a left-handed frame",
     "mirror the poses of the one that is left-handed: M T M with M = diag(1, -1, 1, 1)",
-    _of_sides(("A",), mirrored),
+    _of("A", mirrored),
 )
 
 
@@ -202,28 +177,24 @@ def shifted(shift: int) -> OtherReading:
 
 
 #: The simple mistakes, the more common first.
-SINGLE: tuple[OtherReading, ...] = (*_quaternions(), *_INVERTED, _ROLES, _BOTH_INVERTED, *_TRANSPOSED, HANDEDNESS)
+SINGLE: tuple[OtherReading, ...] = (
+    *_QUATERNIONS, A_INVERTED, _B_INVERTED, _ROLES, _BOTH_INVERTED, *_TRANSPOSED, HANDEDNESS,
+)  # fmt: skip
 
 
 def _joined(first: OtherReading, second: OtherReading) -> OtherReading:
-    def changed(A: Array, B: Array) -> Rows:
-        return second.changed(*first.changed(A, B))
-
-    return OtherReading(
-        first.mistake,
-        f"{first.likely}, and {second.likely}",
-        f"{first.cure}; {second.cure}",
-        changed,
+    return replace(
+        second,
+        mistake=first.mistake,
+        likely=f"{first.likely}, and {second.likely}",
+        cure=f"{first.cure}; {second.cure}",
+        changed=lambda A, B: second.changed(*first.changed(A, B)),
         of_B=first.of_B or second.of_B,
-        inverts_A=first.inverts_A or second.inverts_A,
-        exchanges_roles=second.exchanges_roles,
     )
 
 
 #: Two mistakes at once: the order of quaternions and a direction.
-DOUBLE: tuple[OtherReading, ...] = tuple(
-    _joined(first, second) for first in _quaternions() for second in (*_INVERTED, _ROLES)
-)
+DOUBLE = tuple(_joined(first, second) for first in _QUATERNIONS for second in (A_INVERTED, _B_INVERTED, _ROLES))
 
 
 #: Rotations of less than half a turn in degrees that were taken for radians, about one axis: 180 / 57.3 degrees.
@@ -245,7 +216,7 @@ def stretched(T: Array) -> Array:
     return pose(_rotations(np.degrees(so3_logmap(T[:, :3, :3]))), T[:, :3, 3])
 
 
-def stretched_euler(order: tuple[int, ...]) -> Callable[[Array], Array]:
+def stretched_euler(order: tuple[int, ...]) -> Change:
     """The same for Euler angles about three axes (0, 1, 2 for x, y, z), each about the axes as turned before."""
     i, j, k = order
     sign = 1.0 if order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else -1.0
@@ -292,31 +263,27 @@ def readings_of_angles(A: Array, B: Array) -> Iterator[OtherReading]:
     """The readings that angles in the wrong unit leave to try, for poses (N, 4, 4) of all pairs."""
     for side, T in (("A", A), ("B", B)):
         largest = float(np.linalg.norm(so3_logmap(T[:, :3, :3]), axis=1).max())
-        likely = f"the angles of {side} are in radians, and were read as degrees"
+        small: list[tuple[str, Change]] = []
         if largest <= SMALL_RAD * (1.0 + 1e-6):
-            cure = f"do not convert the rotation vectors of {side}: they are in radians"
-            yield OtherReading(
-                Mistake.ANGLE_UNIT, likely, cure, _of_side(side, _alone(stretched)), of_small_angles=True
-            )
+            small.append((f"do not convert the rotation vectors of {side}: they are in radians", stretched))
         if largest <= SMALL_EULER_RAD:
             for order in itertools.permutations(range(3)):
                 letters = "".join("XYZ"[axis] for axis in order)
                 cure = f"do not convert the Euler angles of {side}: they are in radians (intrinsic {letters})"
-                change = _of_side(side, _alone(stretched_euler(order)))
-                yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, change, of_B=side == "B", of_small_angles=True)
-        elif largest > SMALL_RAD:
-            likely = f"the rotation vectors of {side} are in degrees, and were read as radians"
-            cure = f"convert the rotation vectors of {side} to radians"
-            yield OtherReading(Mistake.ANGLE_UNIT, likely, cure, _of_side(side, unwound), of_B=side == "B")
-
-
-def _alone(change: Callable[[Array], Array]) -> Callable[[Array, Array], Array]:
-    """A change that needs nothing of the other side."""
-    return lambda T, other: change(T)
-
-
-def _of_side(side: str, change: Callable[[Array, Array], Array]) -> Callable[[Array, Array], Rows]:
-    return (lambda A, B: (change(A, B), B)) if side == "A" else (lambda A, B: (A, change(B, A)))
+                small.append((cure, stretched_euler(order)))
+        likely = f"the angles of {side} are in radians, and were read as degrees"
+        for cure, change in small:
+            yield OtherReading(
+                Mistake.ANGLE_UNIT, likely, cure, _of(side, change), of_B=side == "B", of_small_angles=True
+            )
+        if not small:
+            yield OtherReading(
+                Mistake.ANGLE_UNIT,
+                f"the rotation vectors of {side} are in degrees, and were read as radians",
+                f"convert the rotation vectors of {side} to radians",
+                (lambda A, B: (unwound(A, B), B)) if side == "A" else (lambda A, B: (A, unwound(B, A))),
+                of_B=side == "B",
+            )
 
 
 #: The number of each unit in a metre.
@@ -347,25 +314,23 @@ def wrong_unit(scale: float, median_A: float, median_B: float, *, from_corners: 
     """
     if not scale > 0.0 or abs(scale - 1.0) < NO_MISREADING:
         return None
-    longer, shorter = ("B", "A") if scale > 1.0 else ("A", "B")
+    longer, shorter, median = ("B", "A", median_B) if scale > 1.0 else ("A", "B", median_A)
     ratio = max(scale, 1.0 / scale)
-    for unit, number in UNITS.items():
-        if abs(ratio / number - 1.0) > UNIT_SHARE:
-            continue
-        lengths = f"lengths in {longer} are {rounded(ratio, 4)} times those in {shorter}"
-        if (median_B if longer == "B" else median_A) > LONG_M or number < 1000.0:
-            of_B = number if longer == "B" else 1.0
-            if from_corners and longer == "B":
-                cure = f"give board_points in metres: divide them by {rounded(number, 4)}"
-                return WrongUnit(Mistake.UNIT, f"{lengths}: board_points are in {unit}", cure, of_B)
-            cure = f"give metres: divide the translations of {longer} by {rounded(number, 4)}"
-            return WrongUnit(Mistake.UNIT, f"{lengths}: {longer} is in {unit}", cure, of_B)
-        of_B = 1.0 / number if shorter == "B" else 1.0
+    unit, number = min(UNITS.items(), key=lambda item: abs(ratio / item[1] - 1.0))
+    if abs(ratio / number - 1.0) > UNIT_SHARE:
+        return WrongUnit(
+            Mistake.SCALE,
+            f"lengths in B are {rounded(scale, 4)} times the true ones, and were said to be true (scale='known')",
+            "measure the targets again and state their true sizes, or let the scale be estimated (scale='shared')",
+            scale,
+        )
+    likely = f"lengths in {longer} are {rounded(ratio, 4)} times those in {shorter}: "
+    if not (median > LONG_M or number < 1000.0):
         cure = f"give metres: multiply the translations of {shorter} by {rounded(number, 4)}"
-        return WrongUnit(Mistake.UNIT, f"{lengths}: those of {shorter} are too small", cure, of_B)
-    return WrongUnit(
-        Mistake.SCALE,
-        f"lengths in B are {rounded(scale, 4)} times the true ones, and were said to be true (scale='known')",
-        "measure the targets again and state their true sizes, or let the scale be estimated (scale='shared')",
-        scale,
-    )
+        of_B = 1.0 / number if shorter == "B" else 1.0
+        return WrongUnit(Mistake.UNIT, f"{likely}those of {shorter} are too small", cure, of_B)
+    likely += f"board_points are in {unit}" if from_corners and longer == "B" else f"{longer} is in {unit}"
+    cure = f"give metres: divide the translations of {longer} by {rounded(number, 4)}"
+    if from_corners and longer == "B":
+        cure = f"give board_points in metres: divide them by {rounded(number, 4)}"
+    return WrongUnit(Mistake.UNIT, likely, cure, number if longer == "B" else 1.0)

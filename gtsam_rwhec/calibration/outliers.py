@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -18,10 +17,9 @@ from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Sampled, TrialFit, fitted, implausible, residuals
 from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
-from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.robust_solution import robust_solution
+from gtsam_rwhec.fitting.robust_solution import NoiseScale, robust_solution
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -353,7 +351,7 @@ def _share_kept(inliers: Inliers) -> float:
 
 
 def _agreeing_under(
-    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
+    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: NoiseScale
 ) -> tuple[Solution, Inliers]:
     problem, options = run.problem, run.options
     has_more = problem.has_covariances or options.carrier_noise is not None or bool(offsets)
@@ -365,24 +363,14 @@ def _agreeing_under(
 
 
 def refined_with_outliers(
-    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
+    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: NoiseScale
 ) -> Refined:
     """The refinement with inliers chosen again by ``refine``, under noise that sigma and kappa cannot express."""
-    options = run.options
-    how = RefineOptions(
-        noise=noise,
-        noise_groups=options.noise_groups,
-        robust="gnc",
-        inlier_confidence=options.inlier_confidence,
-        carrier_noise=options.carrier_noise,
-        carrier_model="propagated",
-        time_offsets=offsets,
-        carrier_path=options.carrier_path if offsets else None,
-    )
+    how = run.options.refinement(offsets, noise=noise, robust="gnc", carrier_model="propagated")
     try:
         return refine(run.problem, first, how, progress=run.tell)
     except NoiseError:
-        if options.carrier_noise is None:
+        if how.carrier_noise is None:
             raise
         # The noise stated for A is larger than the residuals show. Inliers are judged by the residuals' own noise, and
         # again under the noise that is found.

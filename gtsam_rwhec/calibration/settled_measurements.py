@@ -10,11 +10,10 @@ import copy
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of, with_sizes_of
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing, offsets_of, with_sizes_of
 from gtsam_rwhec.calibration.from_corners import ByCorners, with_estimated_intrinsics
 from gtsam_rwhec.calibration.outliers import refined_with_outliers
 from gtsam_rwhec.calibration.sizes import TargetSize, sizes_in
@@ -27,13 +26,12 @@ from gtsam_rwhec.errors import (
     ScaleError,
     UnderdeterminedError,
 )
-from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
+from gtsam_rwhec.fitting.robust_solution import NoiseScale
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution, solve
 
 #: A is taken again at new offsets at most so many times.
@@ -101,16 +99,9 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorne
 
 def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
     """Sizes that count as known, estimated from the measurements that agree; empty if none is determined."""
-    kept = selected(run.problem, inliers) if inliers else run.problem
+    kept = agreeing(run.problem, inliers)
     free = with_free_sizes(kept, kept.targets)
-    asked = _asked(kept, run)
-    how = RefineOptions(
-        noise="given" if run.options.noise == "given" else "estimate",
-        carrier_noise=run.options.carrier_noise,
-        carrier_model="propagated",
-        time_offsets=asked,
-        carrier_path=run.options.carrier_path if asked else None,
-    )
+    how = run.options.refinement(_asked(kept, run), noise_groups="all", carrier_model="propagated")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # the answer takes the stated sizes
@@ -123,21 +114,15 @@ def _agreed(run: Run, inliers: Inliers) -> tuple[Solution, Inliers] | None:
     """The measurements that agree and their certified solution; None where they are to be looked for again."""
     if run.options.robust == "none" or run.options.noise == "given" or not inliers:
         return None
-    return solve(selected(run.problem, inliers), options=run.options.solve, progress=run.tell), inliers
+    return solve(agreeing(run.problem, inliers), options=run.options.solve, progress=run.tell), inliers
 
 
 def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled | None:
     """A at offsets that have converged, without outliers; None if no answer determines the offsets."""
     path, asked = run.options.carrier_path, _asked(problem, run)
     total = dict(moved_s)
-    noise: Literal["given", "estimate"] = "given" if run.options.noise == "given" else "estimate"
-    how = RefineOptions(
-        noise=noise,
-        carrier_noise=run.options.carrier_noise,
-        carrier_model="propagated",
-        time_offsets=asked,
-        carrier_path=path if asked else None,
-    )
+    noise: NoiseScale = "given" if run.options.noise == "given" else "estimate"
+    how = run.options.refinement(asked, noise_groups="all", carrier_model="propagated")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
@@ -149,8 +134,7 @@ def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled 
                     beside = () if run.recording is not None else asked
                     agree = refined_with_outliers(replace(run, problem=problem), solution, beside, noise)
                     solution, inliers = agree.solution, agree.inliers
-                kept = selected(problem, inliers) if inliers else problem
-                refined = refine(kept, solution, how, progress=run.tell)
+                refined = refine(agreeing(problem, inliers), solution, how, progress=run.tell)
                 moved = refined.time_offsets_s
                 if path is None or max(map(abs, moved.values()), default=0.0) < SAME_S:
                     break

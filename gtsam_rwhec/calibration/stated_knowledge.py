@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import Inliers, Run
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing
 from gtsam_rwhec.calibration.moved_frames import (
+    AtStations,
     Measured,
     TwoPoses,
-    by_station,
-    means_of,
-    moved_frame,
+    measured_of,
     moved_with_outliers,
-    residual_twists,
+    residuals_at_stations,
+    step_of,
     two_poses,
 )
 from gtsam_rwhec.calibration.noise_choice import estimated
@@ -32,7 +31,6 @@ from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
 from gtsam_rwhec.fitting.refined import Refined
@@ -41,7 +39,6 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS, Prior
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import solve
 
 #: The probability that a correct stated pose is contradicted.
@@ -158,8 +155,7 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     def answer(without: Problem) -> Refined | None:
         try:
             agree = robust_solution(without, noise_scale="estimate").inliers if with_outliers else {}
-            kept = selected(without, agree) if agree else without
-            return estimated(without, solve(kept, options=options.solve), agree, options, silent)[0]
+            return estimated(without, solve(agreeing(without, agree), options=options.solve), agree, options, silent)[0]
         except (RwhecError, np.linalg.LinAlgError):
             return None  # without what was stated there is no answer to compare with
 
@@ -175,35 +171,24 @@ def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
     """Record a finding for a frame that was at two poses."""
     if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
         return  # a late clock makes such groups
-    found = two_poses(run.problem, refined, inliers) or _moved(run, refined, inliers)
-    found = found or moved_with_outliers(refined, _with_outliers(run.problem, inliers))
+    measured = measured_of(run.problem, inliers)
+    at = residuals_at_stations(refined, measured)
+    found = two_poses(at) or _moved(run, at, measured) or moved_with_outliers(refined, measured)
     if found is not None:
         run.record.find(Ground.MOVED, str(found))
 
 
-def _with_outliers(problem: Problem, inliers: Inliers) -> dict[Pair, Measured]:
-    """All measurements of the pairs of which some were left out, and of the others."""
-    if not problem.has_measurements or not inliers:
-        return {}
-    raw = {pair: problem.measurements(*pair) for pair in inliers}
-    return {pair: Measured(of.A, of.B, inliers[pair]) for pair, of in raw.items()}
-
-
-def _moved(run: Run, refined: Refined, inliers: Inliers) -> TwoPoses | None:
+def _moved(run: Run, at: Mapping[Pair, AtStations], measured: Mapping[Pair, Measured]) -> TwoPoses | None:
     """A frame that moved once, where residuals of neighbours are alike."""
-    if not run.problem.has_measurements:
-        return None
-    problem = selected(run.problem, inliers) if inliers else run.problem
-    raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
-    tracks = [means_of(residual_twists(refined, pair, of.A, of.B)[0], by_station(of.A)[0]) for pair, of in raw.items()]
-    if likeness_of_neighbours(tracks) < CORRELATED:
+    if likeness_of_neighbours([one.twists[0] for one in at.values()]) < CORRELATED:
         return None
     run.tell("looking for a frame that moved")
-    found = moved_frame(run.problem, {pair: (of.A, of.B) for pair, of in raw.items()})
-    if found is None or found.from_row is None or not inliers:
-        return found
-    (mask,) = (mask for pair, mask in inliers.items() if found.frame in pair.frames)
-    return replace(found, from_row=int(np.flatnonzero(mask)[found.from_row - 1]) + 1)
+    kept = {pair: one for pair, one in measured.items() if one.kept.any()}
+    found = step_of(run.problem, {pair: (one.A[one.kept], one.B[one.kept]) for pair, one in kept.items()})
+    if found is None or found[0].from_row is None:
+        return None if found is None else found[0]
+    (mask,) = (one.kept for pair, one in kept.items() if found[0].frame in pair.frames)
+    return replace(found[0], from_row=int(np.flatnonzero(mask)[found[0].from_row - 1]) + 1)
 
 
 def doubt_stated_sizes(
@@ -216,18 +201,10 @@ def doubt_stated_sizes(
     if options.sizes == "known":
         record.choose(what, "as stated", run.says_so)
         return ()
-    noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
-    late = tuple(refined.time_offsets_s)
-    how = RefineOptions(
-        noise=noise,
-        noise_groups=options.noise_groups,
-        carrier_noise=options.carrier_noise,
-        time_offsets=late,
-        carrier_path=options.carrier_path if late else None,
-    )
+    how = options.refinement(tuple(refined.time_offsets_s))
     # The measurements of a target with a wrong size may be outliers: then all of them are used, not only inliers.
     kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
-    found = sizes(selected(problem, kept) if kept else problem, how, like=like, progress=run.tell)
+    found = sizes(agreeing(problem, kept), how, like=like, progress=run.tell)
     doubted = [size for size in found if size.is_doubted]
     together = common_factor(found)
     uncertain = [size for size in found if size.is_uncertain]

@@ -33,11 +33,12 @@ class Verdict(StrEnum):
         }[self]
 
     def __str__(self) -> str:
-        return {
-            Verdict.USE: "Use these poses.",
-            Verdict.CARE: "Use these poses with care: read the reason and do what it says before you rely on them.",
-            Verdict.DO_NOT_USE: "Do not use these poses: do what the reason says, and calibrate again.",
+        more = {
+            Verdict.USE: "",
+            Verdict.CARE: ": read the reason and do what it says before you rely on them",
+            Verdict.DO_NOT_USE: ": do what the reason says, and calibrate again",
         }[self]
+        return f"{self.words}{more}."
 
     def __format__(self, spec: str) -> str:
         return format(str(self), spec)
@@ -119,8 +120,8 @@ class Ground(StrEnum):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict to which this ground leads."""
-        return Verdict.CARE if self in _CARE else Verdict.DO_NOT_USE
+        """The verdict to which this ground leads: the grounds from `TARGET_CONTRADICTED` on ask for care only."""
+        return Verdict.DO_NOT_USE if _rank(self) < _rank(Ground.TARGET_CONTRADICTED) else Verdict.CARE
 
     @property
     def advice(self) -> str:
@@ -128,58 +129,30 @@ class Ground(StrEnum):
         return _ADVICE[self]
 
 
-_CARE = (
-    Ground.TARGET_CONTRADICTED,
-    Ground.INTRINSICS_UNCERTAIN,
-    Ground.SHAPE_UNCERTAIN,
-    Ground.SIZE_UNCERTAIN,
-    Ground.POSE_UNCERTAIN,
-    Ground.IMAGE_TURNED,
-    Ground.IMAGES_BLURRED,
-    Ground.LITTLE_ROTATION,
-    Ground.FEW_MEASUREMENTS,
-    Ground.SIZE_ESTIMATED,
-    Ground.INTRINSICS_ESTIMATED,
-    Ground.CORNERS_DOUBTED,
-    Ground.CORRELATED,
-    Ground.SYSTEMATIC,
-    Ground.OUTLIERS_KEPT,
-    Ground.MANY_OUTLIERS,
-    Ground.NOISE_UNDERSTATED,
-    Ground.NOISE_OVERSTATED,
-    Ground.COVARIANCE_DOUBTED,
-)
+def _rank(ground: Ground) -> int:
+    return list(Ground).index(ground)
+
+
 _MISREAD = frozenset({Ground.MISREAD, Ground.IMPLAUSIBLE})
-#: A wrong reading of A and B makes all of these, so they are no facts of their own beside it.
-_MADE_BY_A_MISREADING = frozenset({
-    Ground.NO_BOUND,
-    Ground.NOT_CERTIFIED,
-    Ground.NOT_UNIQUE,
-    Ground.NO_COVARIANCE,
-    Ground.LITTLE_ROTATION,
-    Ground.CORNERS_DOUBTED,
-    Ground.CORRELATED,
-    Ground.SYSTEMATIC,
-})  # fmt: skip
 #: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
-_MISTAKES = frozenset({
-    Ground.POSE_DOUBTED, Ground.MOVED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED
-})  # fmt: skip
-#: If a frame moved, all its later measurements are outliers.
-_MADE_BY_A_MOVE = frozenset({Ground.CONTRADICTED, Ground.TARGET_CONTRADICTED, Ground.MANY_OUTLIERS})
 _MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
-#: Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
-_MADE_BY_INTRINSICS = frozenset({
-    Ground.NOT_UNIQUE,
-    Ground.NO_COVARIANCE,
-    Ground.SIZE_DOUBTED,
-    Ground.NO_SIZE_FITS,
-    Ground.SIZE_ESTIMATED,
-    Ground.SIZE_UNCERTAIN,
-    Ground.CORNERS_DOUBTED,
-    Ground.CORRELATED,
-    Ground.SYSTEMATIC,
-})  # fmt: skip
+_NOT_DETERMINED = frozenset({Ground.NOT_UNIQUE, Ground.NO_COVARIANCE})
+_OF_SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED, Ground.SIZE_UNCERTAIN})
+#: What each ground makes too, which is then no fact of its own beside it.
+_MADE_BY = {
+    **dict.fromkeys(
+        _MISREAD, _MADE_BY_A_MISTAKE | _NOT_DETERMINED | {Ground.NO_BOUND, Ground.NOT_CERTIFIED, Ground.LITTLE_ROTATION}
+    ),
+    **dict.fromkeys(
+        (Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED), _MADE_BY_A_MISTAKE
+    ),
+    # If a frame moved, all its later measurements are outliers.
+    Ground.MOVED: _MADE_BY_A_MISTAKE | {Ground.CONTRADICTED, Ground.TARGET_CONTRADICTED, Ground.MANY_OUTLIERS},
+    # Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
+    Ground.INTRINSICS_DOUBTED: _MADE_BY_A_MISTAKE | _NOT_DETERMINED | _OF_SIZES,
+    # How well poses are known that are not determined is no question.
+    Ground.NOT_UNIQUE: frozenset({Ground.NO_COVARIANCE}),
+}
 _CALIBRATE_INTRINSICS = (
     "calibrate the intrinsics of the named sensor with its distortion (cv2.calibrateCamera, Kalibr, ROS's "
     "camera_calibration) at this resolution, and state them in place of the stated ones, or let the images tell them "
@@ -311,28 +284,17 @@ class Judgement:
         What a mistake makes is no ground beside it: what a misreading leaves undetermined says nothing of the motion,
         and errors that a wrong size, wrong intrinsics or a late clock make say nothing of the arm.
         """
-        found = frozenset(finding.ground for finding in findings)
-        made: frozenset[Ground] = frozenset()
-        if found & _MISREAD:
-            made |= _MADE_BY_A_MISREADING
-        if found & _MISTAKES:
-            made |= _MADE_BY_A_MISTAKE
-        if Ground.MOVED in found:
-            made |= _MADE_BY_A_MOVE
-        if Ground.INTRINSICS_DOUBTED in found:
-            made |= _MADE_BY_INTRINSICS
-        if Ground.NOT_UNIQUE in found:  # how well poses are known that are not determined is no question
-            made |= {Ground.NO_COVARIANCE}
+        made = frozenset[Ground]().union(*(_MADE_BY.get(finding.ground, ()) for finding in findings))
         findings = [finding for finding in findings if finding.ground not in made]
         if not findings:
             return Judgement(Verdict.USE, (), praise)
         by_ground: dict[Ground, list[str]] = {}
-        for finding in sorted(findings, key=lambda finding: list(Ground).index(finding.ground)):
+        for finding in sorted(findings, key=lambda finding: _rank(finding.ground)):
             words = by_ground.setdefault(finding.ground, [])
             if finding.words not in words:
                 words.append(finding.words)
         grounds = tuple(by_ground)
-        worst = max((ground.verdict for ground in grounds), key=list(Verdict).index)
+        worst = grounds[0].verdict
         facts = "; ".join(words for group in by_ground.values() for words in group)
         # The ground that makes poses useless comes first; the others may disappear with it.
         what_to_do = [(advice_on or {}).get(ground, ground.advice) for ground in grounds]
@@ -361,18 +323,13 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
     """
     if solution is None:
         return []
-    certificate: Mapping[Status, Finding] = {
-        Status.FAILED: Finding(
-            Ground.NO_BOUND, "no lower bound of the cost was found, so a much better answer may exist"
-        ),
-        Status.GAP: Finding(
-            Ground.NOT_CERTIFIED,
-            "a better answer may exist; its cost would be lower by at most "
-            f"{rounded(100.0 * solution.certificate.relative_gap)} %",
-        ),
-    }
-    status = solution.certificate.status
-    found = [certificate[status]] if status in certificate else []
+    status, found = solution.certificate.status, []
+    if status is Status.FAILED:
+        found = [Finding(Ground.NO_BOUND, "no lower bound of the cost was found, so a much better answer may exist")]
+    elif status is Status.GAP:
+        gap = rounded(100.0 * solution.certificate.relative_gap)
+        words = f"a better answer may exist; its cost would be lower by at most {gap} %"
+        found = [Finding(Ground.NOT_CERTIFIED, words)]
     is_unique = solution.identifiability.is_unique and status is not Status.CERTIFIED_NOT_UNIQUE
     if not is_unique or (refined is not None and refined.free_directions):
         most = max((residual.number_of_measurements for residual in solution.residuals.values()), default=0)

@@ -7,7 +7,7 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.moved_frames import moved_frame
+from gtsam_rwhec.calibration.moved_frames import step_of
 from gtsam_rwhec.calibration.trial_fits import Sample
 from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
 
@@ -50,8 +50,7 @@ def test_a_step_in_a_stream_is_no_drift() -> None:
 @pytest.mark.parametrize("step_m", [0.1, 1.0])
 def test_the_row_and_the_distance_are_found(step_m: float) -> None:
     problem = stream(step_m)
-    found = moved_frame(problem, sample_of(problem))
-    assert found is not None
+    found, _ = step_of(problem, sample_of(problem)) or pytest.fail("no step")
     assert found.frame == "board"
     assert found.distance_m == pytest.approx(step_m, rel=0.1)
     assert found.from_row == pytest.approx(61, abs=2)
@@ -61,7 +60,7 @@ def test_the_row_and_the_distance_are_found(step_m: float) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_walk_and_good_data_have_not_moved(seed: int) -> None:
     for problem in (stream(0.0, seed, walk=1e-3), stream(0.0, seed)):
-        assert moved_frame(problem, sample_of(problem)) is None
+        assert step_of(problem, sample_of(problem)) is None
 
 
 def test_few_poses_hold_no_step() -> None:
@@ -71,7 +70,7 @@ def test_few_poses_hold_no_step() -> None:
     B = np.linalg.inv(Y) @ A @ np.repeat(poses(chance, 5, 4e-3, 4e-3), 10, axis=0) @ X @ poses(chance, 50, 1e-4, 1e-4)
     problem = rw.Problem()
     problem.add("board", "camera", A, B)
-    assert moved_frame(problem, sample_of(problem)) is None
+    assert step_of(problem, sample_of(problem)) is None
     calibration = rw.calibrate(problem)
     assert calibration.verdict is rw.Verdict.CARE
     assert "poses of the carriers, and each pose has one error" in calibration.verdict_reason

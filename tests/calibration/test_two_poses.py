@@ -7,7 +7,8 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.moved_frames import two_poses
+from gtsam_rwhec.calibration.moved_frames import TwoPoses, measured_of, residuals_at_stations, two_poses
+from gtsam_rwhec.problem.measurements import Pair
 
 COUNT = 60
 MOVED = se3.expmap(np.array([[0.03, 0.0, 0.04, 0.03, 0.0, 0.02]]))[0]
@@ -28,6 +29,12 @@ def problem_of(seed: int, is_moved: np.ndarray, frame: str = "board", noise: flo
     return problem
 
 
+def found_in(
+    problem: rw.Problem, refined: rw.Refined, inliers: dict[Pair, np.ndarray] | None = None
+) -> TwoPoses | None:
+    return two_poses(residuals_at_stations(refined, measured_of(problem, inliers or {})))
+
+
 @pytest.mark.parametrize("frame", ["board", "camera"])
 def test_a_frame_that_moved_half_way_is_named(frame: str) -> None:
     """Least squares and outlier rejection alike put the answer between the two poses, and said USE."""
@@ -39,7 +46,7 @@ def test_a_frame_that_moved_half_way_is_named(frame: str) -> None:
 def test_the_sentence_says_how_far_and_from_when() -> None:
     problem = problem_of(2, np.arange(COUNT) >= 31)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
-    found = two_poses(problem, refined, {})
+    found = found_in(problem, refined)
     assert found is not None
     assert (found.frame, found.first, found.second, found.from_row) == ("board", 31, 29, 32)
     assert found.angle_rad == pytest.approx(0.05, rel=0.05)
@@ -51,7 +58,7 @@ def test_the_sentence_says_how_far_and_from_when() -> None:
 def test_two_poses_that_alternate_have_no_first_row() -> None:
     problem = problem_of(3, np.arange(COUNT) % 2 == 1)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
-    found = two_poses(problem, refined, {})
+    found = found_in(problem, refined)
     assert found is not None
     assert found.from_row is None
     assert "board was at two poses: its" in str(found)
@@ -61,16 +68,16 @@ def test_two_poses_that_alternate_have_no_first_row() -> None:
 def test_one_pose_is_not_accused(seed: int) -> None:
     problem = problem_of(seed, np.zeros(COUNT, dtype=bool), noise=3e-3)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
-    assert two_poses(problem, refined, {}) is None
+    assert found_in(problem, refined) is None
     few = {pair: np.arange(COUNT) < 12 for pair in problem.pairs}
-    assert two_poses(problem, refined, few) is None
+    assert found_in(problem, refined, few) is None
 
 
 def test_the_row_is_that_of_all_measurements_with_those_that_were_left_out() -> None:
     problem = problem_of(2, np.arange(COUNT) >= 31)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     kept = np.arange(COUNT) % 10 != 3
-    found = two_poses(problem, refined, {pair: kept for pair in problem.pairs})
+    found = found_in(problem, refined, {pair: kept for pair in problem.pairs})
     assert found is not None
     assert found.from_row == 32
     assert found.first + found.second == kept.sum()
