@@ -66,12 +66,8 @@ class LinearModel:
             scale = refined.scale if isinstance(refined.scale, float) else refined.scale[pair.target]
             X, Y = calibration.X[pair.target].matrix(), calibration.Y[pair.sensor].matrix()
             P = np.linalg.inv(Y) @ of.A @ X
-            as_measured = np.repeat([1.0, scale], 3)
-            J = np.zeros((count, 6, OWN))
-            J[:, :, :6] = np.diag(as_measured)
-            J[:, :, 6:12] = -as_measured[:, None] * se3.adjoint(se3.inverse(P))
-            J[:, 3:, 12] = np.einsum("nji,nj->ni", P[:, :3, :3], P[:, :3, 3])
-            noise = _noise_of_B(of, refined.noise[pair]) + _noise_of_A(calibration.noise_of_A, of.A, X, as_measured)
+            noise = _noise_of_B(of, refined.noise[pair]) + noise_of_A(calibration.noise_of_A, of.A, X, scale)
+            J = derivatives(P, scale)
             P[:, :3, 3] *= scale
             own = next((i for i, one in enumerate(scales) if one.owner in ("", pair.target)), None)
             at = np.r_[
@@ -165,12 +161,22 @@ def _noise_of_B(of: MeasuredRows, typical: PairNoise) -> Array:
     return scaled
 
 
-def _noise_of_A(noise: CarrierNoise | None, A: Array, X: Array, as_measured: Array) -> Array:
+def derivatives(P: Array, scale: float = 1.0) -> Array:
+    """Those (N, 6, 13) of predictions (N, 4, 4), in true lengths, by target, sensor and scale."""
+    as_measured = np.repeat([1.0, scale], 3)
+    J = np.zeros((len(P), 6, OWN))
+    J[:, :, :6] = np.diag(as_measured)
+    J[:, :, 6:12] = -as_measured[:, None] * se3.adjoint(se3.inverse(P))
+    J[:, 3:, 12] = np.einsum("nji,nj->ni", P[:, :3, :3], P[:, :3, 3])
+    return J
+
+
+def noise_of_A(noise: CarrierNoise | None, A: Array, X: Array, scale: float = 1.0) -> Array:
     """A's covariance in the prediction's axes (N, 6, 6); zero where A counts as exact."""
     if noise is None:
         return np.zeros((len(A), 6, 6))
     frame = X if noise.about == "targetcarrier" else A @ X
-    E = as_measured[:, None] * se3.adjoint(se3.inverse(np.broadcast_to(frame, A.shape)))
+    E = np.repeat([1.0, scale], 3)[:, None] * se3.adjoint(se3.inverse(np.broadcast_to(frame, A.shape)))
     E = E * np.repeat([noise.rotation_rad, noise.translation_m], 3)
     moved: Array = E @ E.transpose(0, 2, 1)
     return moved
