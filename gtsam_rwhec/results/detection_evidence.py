@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict
 
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.fitting.pair_data import local_paths
@@ -16,7 +16,7 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount
 from gtsam_rwhec.results.image_errors import (
     SeenCamera,
     SeenView,
@@ -37,55 +37,53 @@ MOST_ROWS = 24
 MOST_LISTED = 200
 
 
-class SeenTrack(EvidenceRecord):
+class SeenTrack(FileRecord):
     """Measurements of a pair, or of all targets by a sensor, over time."""
 
-    sensor: str = Field(description="the sensor's name")
-    target: str | None = Field(description="the target's name; null: all targets together")
-    used: int = Field(description="measurements in the answer", ge=0)
-    removed: int = Field(description="measurements that are not", ge=0)
-    used_at: tuple[tuple[int, int], ...] = Field(
-        description="pieces of time with measurements in the answer, and how many"
-    )
-    removed_at: dict[str, tuple[tuple[int, int], ...]] = Field(description="the same of removed measurements, by stage")
+    sensor: str
+    target: str | None  #: The target's name; null: all targets together
+    used: Count  #: Measurements in the answer
+    removed: Count  #: Measurements that are not
+    used_at: tuple[tuple[int, int], ...]  #: Pieces of time with measurements in the answer, and how many
+    removed_at: dict[str, tuple[tuple[int, int], ...]]  #: The same of removed measurements, by stage
 
 
-class RemovedCount(EvidenceRecord):
+class RemovedCount(FileRecord):
     """How many measurements of a pair were removed for a reason."""
 
-    target: str = Field(description="the target's name")
-    sensor: str = Field(description="the sensor's name")
-    stage: str = Field(description="which stage removed them")
-    reason: str = Field(description="why")
-    count: int = Field(description="how many", gt=0)
+    target: str
+    sensor: str
+    stage: str  #: Which stage removed them
+    reason: str  #: Why
+    count: PositiveCount  #: How many
 
 
-class RemovedMeasurement(EvidenceRecord):
+class RemovedMeasurement(FileRecord):
     """A measurement that was removed."""
 
-    target: str = Field(description="the target's name")
-    sensor: str = Field(description="the sensor's name")
-    reason: str = Field(description="why")
-    image: str = Field(description="name of the image's file; else its stamp in nanoseconds, or its place in the pair")
-    time_s: float | None = Field(description="since the first measurement; null without stamps")
+    target: str
+    sensor: str
+    reason: str  #: Why
+    image: str  #: Name of the image's file; else its stamp in nanoseconds, or its place in the pair
+    time_s: float | None  #: Since the first measurement; null without stamps
 
 
-class SeenEvidence(EvidenceRecord):
+class SeenEvidence(FileRecord):
     """What was seen."""
 
     model_config = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 
-    span_s: float | None = Field(description="from the first measurement to the last; null: no stamps")
-    pieces: int = Field(description="pieces that the time, or without stamps the order, is divided into", gt=0)
-    tracks: tuple[SeenTrack, ...] = Field(description="a row each of the figure over time")
-    used: int = Field(description="measurements in the answer", ge=0)
-    removed: int = Field(description="measurements that are not", ge=0)
-    removed_counts: tuple[RemovedCount, ...] = Field(description="all that was removed, by pair, stage and reason")
-    removed_list: tuple[RemovedMeasurement, ...] = Field(description="the first that were removed")
-    cameras: tuple[SeenCamera, ...] = Field(default=(), description="cameras with corners")
-    worst: tuple[WorstImage, ...] = Field(default=(), description="images whose corners are farthest off, worst first")
-    sheet: bytes | None = Field(default=None, description="contact sheet, JPEG, base64")
-    no_pictures: str = Field(default="", description="why there are no images; empty where there are some")
+    span_s: float | None  #: From the first measurement to the last; null: no stamps
+    pieces: PositiveCount  #: Pieces that the time, or without stamps the order, is divided into
+    tracks: tuple[SeenTrack, ...]  #: A row each of the figure over time
+    used: Count  #: Measurements in the answer
+    removed: Count  #: Measurements that are not
+    removed_counts: tuple[RemovedCount, ...]  #: All that was removed, by pair, stage and reason
+    removed_list: tuple[RemovedMeasurement, ...]  #: The first that were removed
+    cameras: tuple[SeenCamera, ...] = ()  #: Cameras with corners
+    worst: tuple[WorstImage, ...] = ()  #: Images whose corners are farthest off, worst first
+    sheet: bytes | None = None  #: Contact sheet, JPEG, base64
+    no_pictures: str = ""  #: Why there are no images; empty where there are some
 
 
 class Marked(Protocol):

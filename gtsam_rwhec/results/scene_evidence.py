@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import gtsam
 import numpy as np
-from pydantic import Field
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
@@ -31,7 +30,7 @@ from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Rows
+from gtsam_rwhec.results.file_record import Count, FileRecord, Rows
 from gtsam_rwhec.results.linear_model import MeasuredRows
 
 #: The path is thinned to this many poses.
@@ -62,37 +61,36 @@ MOVING = frozenset(
 _PARTS = re.compile(r"[^a-z0-9]+")
 
 
-class SensorScene(EvidenceRecord):
+class SensorScene(FileRecord):
     """A sensor in space, and where it saw its targets. Angles are between its z axis and the targets' origins."""
 
-    rim: Rows = Field(description="unit vectors to the image's border, clockwise from the top left; empty: not known")
-    measurements: int = Field(description="measurements in the answer", ge=0)
-    behind: int = Field(description="measurements whose target is not in front, z <= 0", ge=0)
-    distance_m: tuple[float, float, float] | None = Field(description="nearest, median, farthest; m")
-    off_axis_deg: tuple[float, float] | None = Field(description="median and largest, as measured; degrees")
-    off_axis_by_poses_deg: tuple[float, float] | None = Field(description="the same by the calibrated poses; degrees")
+    rim: Rows  #: Unit vectors to the image's border, clockwise from the top left; empty: not known
+    measurements: Count  #: Measurements in the answer
+    behind: Count  #: Measurements whose target is not in front, z <= 0
+    distance_m: tuple[float, float, float] | None  #: Nearest, median, farthest; m
+    off_axis_deg: tuple[float, float] | None  #: Median and largest, as measured; degrees
+    off_axis_by_poses_deg: tuple[float, float] | None  #: The same by the calibrated poses; degrees
 
 
-class TargetScene(EvidenceRecord):
+class TargetScene(FileRecord):
     """A target in space, and from where it was seen."""
 
-    board: DrawnBoard | None = Field(description="as drawn; null where its shape is not known")
-    measurements: int = Field(description="measurements in the answer", ge=0)
-    tilt_deg: float = Field(description="angle between its z axis and that of its carrier; degrees")
-    oblique_deg: tuple[float, float] | None = Field(
-        description="angle between its z axis and the direction to the sensor, by the poses: median, largest; degrees"
-    )
+    board: DrawnBoard | None  #: As drawn; null where its shape is not known
+    measurements: Count  #: Measurements in the answer
+    tilt_deg: float  #: Angle between its z axis and that of its carrier; degrees
+    #: Angle between its z axis and the direction to the sensor, by the poses: median, largest; degrees
+    oblique_deg: tuple[float, float] | None
 
 
-class SceneEvidence(EvidenceRecord):
+class SceneEvidence(FileRecord):
     """What is needed to draw the rig."""
 
-    standing: Literal["targets", "sensors"] = Field(description="whose carrier is drawn as standing still")
-    why: str = Field(description="why this one")
-    poses: Rows = Field(description="pose of the other carrier in it: x, y, z (m), qw, qx, qy, qz; in order of time")
-    of: int = Field(description="of so many poses these are a choice, evenly spread", ge=0)
-    seconds: tuple[float, ...] | None = Field(description="time of each pose after the first; null without stamps")
-    typical: int = Field(description="which of the poses is nearest to all others", ge=0)
+    standing: Literal["targets", "sensors"]  #: Whose carrier is drawn as standing still
+    why: str  #: Why this one
+    poses: Rows  #: Pose of the other carrier in it: x, y, z (m), qw, qx, qy, qz; in order of time
+    of: Count  #: Of so many poses these are a choice, evenly spread
+    seconds: tuple[float, ...] | None  #: Time of each pose after the first; null without stamps
+    typical: Count  #: Which of the poses is nearest to all others
     sensors: dict[str, SensorScene]
     targets: dict[str, TargetScene]
 
@@ -311,12 +309,12 @@ CIRCLE, RADIUS = 8, 0.25
 BEHIND = 0.004
 
 
-class DrawnBoard(EvidenceRecord):
+class DrawnBoard(FileRecord):
     """A target as it is drawn."""
 
-    words: str = Field(description="what it is, and its size as found")
-    paper: Rows = Field(description="the corners of the paper in the target's frame, m; empty where it is not known")
-    dark: tuple[Rows, ...] = Field(description="the dark parts, each a convex polygon, m")
+    words: str  #: What it is, and its size as found
+    paper: Rows  #: The corners of the paper in the target's frame, m; empty where it is not known
+    dark: tuple[Rows, ...]  #: The dark parts, each a convex polygon, m
 
 
 def drawn_board(

@@ -19,7 +19,6 @@ from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
@@ -27,7 +26,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import PairNoise, Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.file_record import FileRecord, NotNegative
 from gtsam_rwhec.results.linear_model import MeasuredRows, derivatives, noise_of_A
 
 Triple = tuple[float, float, float]
@@ -40,23 +39,21 @@ WEAK = 3.0
 BETTER = 0.9
 
 
-class WeakDirection(EvidenceRecord):
+class WeakDirection(FileRecord):
     """The least known direction of a frame, along which or about which its pose is most uncertain."""
 
-    frame: str = Field(description="sensor or target")
-    kind: Kind = Field(description="along the direction, or about it")
-    carrier: str = Field(description="name of the frame's carrier")
-    axis: Triple = Field(description="the direction, a unit vector in the frame's own axes; its sign is arbitrary")
-    axis_in_carrier: Triple = Field(description="the same in the carrier's axes")
-    deviation: float = Field(description="one standard deviation, millimetres or degrees", ge=0.0)
-    least: float = Field(description="the deviation along, or about, the frame's best known direction", ge=0.0)
-    is_weak: bool = Field(description=f"whether it is more than {WEAK:g} times the median of all directions")
-    partner: str | None = Field(default=None, description="the frame with which it was measured most often")
-    turn: Triple | None = Field(
-        default=None, description="the best axis to turn about, in the axes of the sensors' carrier; null: none is"
-    )
-    after_turning: float | None = Field(default=None, description="the deviation after ten such measurements")
-    after_more: float | None = Field(default=None, description="the deviation after ten more like those there are")
+    frame: str  #: Sensor or target
+    kind: Kind  #: Along the direction, or about it
+    carrier: str  #: Name of the frame's carrier
+    axis: Triple  #: The direction, a unit vector in the frame's own axes; its sign is arbitrary
+    axis_in_carrier: Triple  #: The same in the carrier's axes
+    deviation: NotNegative  #: One standard deviation, millimetres or degrees
+    least: NotNegative  #: The deviation along, or about, the frame's best known direction
+    is_weak: bool  #: Whether it is more than ``WEAK`` times the median of all directions
+    partner: str | None = None  #: The frame with which it was measured most often
+    turn: Triple | None = None  #: The best axis to turn about, in the axes of the sensors' carrier; null: none is
+    after_turning: float | None = None  #: The deviation after ten such measurements
+    after_more: float | None = None  #: The deviation after ten more like those there are
 
 
 def weak_directions(calibration: Calibration, rows: Mapping[Pair, MeasuredRows]) -> tuple[WeakDirection, ...]:
