@@ -289,19 +289,13 @@ class Line:
     pieces: tuple[Array, ...]  #: Lines to be drawn: the direction itself first
 
 
-def free_directions(shown: ShownResult) -> tuple[FreeDirection, ...]:
-    """The free directions of the poses that the page shows."""
-    assert shown.result is not None
-    refined = shown.result.refined
-    return shown.result.solution.identifiability.free_directions if refined is None else refined.free_directions
-
-
 def lines_of(shown: ShownResult, scene: Scene) -> tuple[Line, ...]:
     """Free directions, then weak ones, then positions that are too uncertain for an ellipsoid."""
+    assert shown.result is not None
     frames = {frame.name: frame for frame in scene.frames}
     lines = [
         line
-        for number, direction in enumerate(free_directions(shown), start=1)
+        for number, direction in enumerate(shown.result.free_directions, start=1)
         for line in _free(direction, f"free {number}", frames, scene.extent)
     ]
     weak = () if shown.evidence is None else tuple(one for one in shown.evidence.weak if one.is_weak)

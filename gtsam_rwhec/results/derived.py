@@ -86,7 +86,7 @@ def derived_of(calibration: Calibration) -> Derived:
         return Derived(angles=angles)
     return Derived(
         angles=angles,
-        scalars=tuple(_scalars(refined)),
+        scalars=tuple(scalars_of(refined)),
         level=calibration.options.level,
         points=tuple(_points(calibration)),
         relative=tuple(_relative(refined)),
@@ -94,7 +94,7 @@ def derived_of(calibration: Calibration) -> Derived:
     )
 
 
-def _scalars(refined: RefinedPoses) -> Iterator[Scalar]:
+def scalars_of(refined: RefinedPoses) -> Iterator[Scalar]:
     """Scales and clock offsets with their deviations."""
     for unknown in refined.unknowns:
         deviation = _finite(math.sqrt(refined.covariance(unknown)[0, 0]))
