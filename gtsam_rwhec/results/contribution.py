@@ -98,7 +98,8 @@ def _images(model: LinearModel, which: np.ndarray) -> list[np.ndarray]:
     """The measurements of each image."""
     if model.stamps_ns is None:
         return [np.array([i]) for i in which]
-    keys = np.column_stack([model.sensor[which], model.stamps_ns[which] - model.stamps_ns.min()])
+    sensor = np.sum([i * mine for i, mine in enumerate(model.by_sensor.values())], axis=0)
+    keys = np.column_stack([sensor[which], model.stamps_ns[which] - model.stamps_ns.min()])
     _, image = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(image.ravel(), kind="stable")
     return np.split(which[order], np.flatnonzero(np.diff(image.ravel()[order])) + 1)

@@ -14,9 +14,8 @@ from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
-from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Positive
+from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Positive, Triple, triple
 
-Triple = tuple[float, float, float]
 Deviations = tuple[float | None, float | None, float | None]
 #: Metres from a sensor at which points are tested, beside the distance at which it saw its targets.
 DISTANCES_M = (0.5, 1.0, 2.0)
@@ -81,7 +80,8 @@ class Derived(FileRecord):
 
 def derived_of(calibration: Calibration) -> Derived:
     """What follows from a calibration's poses and covariances."""
-    angles, refined = tuple(_angles(calibration.Y | calibration.X)), calibration.refined
+    poses, refined = calibration.Y | calibration.X, calibration.refined
+    angles = tuple(FrameAngles(frame=name, rpy_deg=_rpy_deg(poses[name])) for name in sorted(poses, key=natural_key))
     if refined is None:
         return Derived(angles=angles)
     return Derived(
@@ -134,8 +134,8 @@ def _relative(refined: RefinedPoses) -> Iterator[RelativePose]:
         yield RelativePose(
             first=first,
             second=second,
-            translation_m=_triple(pose.translation()),
-            rpy_deg=_triple(np.degrees(pose.rotation().rpy())),
+            translation_m=triple(pose.translation()),
+            rpy_deg=_rpy_deg(pose),
             deviations_mm=_deviations(millimetres),
             deviations_deg=_deviations(degrees),
         )
@@ -160,14 +160,8 @@ def clock_effects(refined: RefinedPoses) -> Iterator[ClockEffect]:
             )
 
 
-def _angles(poses: Mapping[str, gtsam.Pose3]) -> Iterator[FrameAngles]:
-    for name in sorted(poses, key=natural_key):
-        yield FrameAngles(frame=name, rpy_deg=_triple(np.degrees(poses[name].rotation().rpy())))
-
-
-def _triple(values: np.ndarray) -> Triple:
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
+def _rpy_deg(pose: gtsam.Pose3) -> Triple:
+    return triple(np.degrees(pose.rotation().rpy()))
 
 
 def _deviations(values: np.ndarray) -> Deviations:

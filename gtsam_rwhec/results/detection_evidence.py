@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -98,16 +97,6 @@ class Marked(Protocol):
         """The reason of each measurement."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """A row of the figure: where its measurements are in time, and the stage that removed each (empty: it is used)."""
-
-    sensor: str
-    target: str | None
-    piece: np.ndarray
-    stage: np.ndarray
-
-
 def span_of(pairs: Iterable[Marked]) -> tuple[int, float | None]:
     """The first stamp, and seconds to the last one; None where measurements have no stamps."""
     stamps = [measured.stamps_ns for measured in pairs if len(measured.reasons)]
@@ -121,47 +110,44 @@ def span_of(pairs: Iterable[Marked]) -> tuple[int, float | None]:
 def tracks_of(pairs: Mapping[Pair, Marked], stage_of: Callable[[str], str]) -> tuple[SeenTrack, ...]:
     """A row for each pair, sensor by sensor; with many pairs one for each sensor, those with the most removed first."""
     first, span = span_of(pairs.values())
-    rows = [_row(pair, measured, first, span, stage_of) for pair, measured in pairs.items()]
-    rows.sort(key=lambda row: row.sensor)
-    if len(rows) > MOST_ROWS:
-        of_sensor: dict[str, list[_Row]] = defaultdict(list)
-        for row in rows:
-            of_sensor[row.sensor].append(row)
-        rows = [
-            _Row(sensor, None, np.concatenate([r.piece for r in of]), np.concatenate([r.stage for r in of]))
-            for sensor, of in of_sensor.items()
-        ]
-        rows.sort(key=lambda row: -int((row.stage != "").sum()))
-    return tuple(_track(row) for row in rows[:MOST_ROWS])
+    are_many = len(pairs) > MOST_ROWS
+    counts: dict[tuple[str, str | None], Counter[tuple[str, int]]] = defaultdict(Counter)
+    for pair, measured in sorted(pairs.items(), key=lambda item: item[0].sensor):
+        stages = {reason: stage_of(reason) if reason else "" for reason in set(measured.reasons)}
+        places = zip(measured.reasons, _pieces(measured, first, span), strict=True)
+        counts[pair.sensor, None if are_many else pair.target].update((stages[why], piece) for why, piece in places)
+    tracks = [_track(sensor, target, count) for (sensor, target), count in counts.items()]
+    if are_many:
+        tracks.sort(key=lambda track: -track.removed)
+    return tuple(tracks[:MOST_ROWS])
 
 
-def _row(pair: Pair, measured: Marked, first: int, span: float | None, stage_of: Callable[[str], str]) -> _Row:
-    number = len(measured.reasons)
+def _pieces(measured: Marked, first: int, span: float | None) -> list[int]:
+    """The piece of time of each measurement."""
     if span is None or measured.stamps_ns is None:
-        share = np.arange(number) / max(number, 1)
+        share = np.arange(len(measured.reasons)) / max(len(measured.reasons), 1)
     else:
         share = 1e-9 * (measured.stamps_ns - first) / (span or 1.0)
-    stages = {reason: stage_of(reason) if reason else "" for reason in set(measured.reasons)}
-    stage = np.array([stages[reason] for reason in measured.reasons], dtype="U20")
-    return _Row(pair.sensor, pair.target, np.minimum((PIECES * share).astype(int), PIECES - 1), stage)
+    pieces: list[int] = np.minimum((PIECES * share).astype(int), PIECES - 1).tolist()
+    return pieces
 
 
-def _track(row: _Row) -> SeenTrack:
-    is_used = row.stage == ""
-    stages = np.unique(row.stage[~is_used]).tolist()
+def _track(sensor: str, target: str | None, count: Counter[tuple[str, int]]) -> SeenTrack:
+    """A row of the figure, of how many measurements each stage removed in each piece; no stage: they are used."""
+    at: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for (stage, piece), number in sorted(count.items()):
+        at[stage].append((piece, number))
+    used_at = at.pop("", [])
+    used = sum(number for _, number in used_at)
+    removed_at = {stage: tuple(pieces) for stage, pieces in at.items()}
     return SeenTrack(
-        sensor=row.sensor,
-        target=row.target,
-        used=int(is_used.sum()),
-        removed=int((~is_used).sum()),
-        used_at=_counted(row.piece[is_used]),
-        removed_at={stage: _counted(row.piece[row.stage == stage]) for stage in stages},
+        sensor=sensor,
+        target=target,
+        used=used,
+        removed=count.total() - used,
+        used_at=tuple(used_at),
+        removed_at=removed_at,
     )
-
-
-def _counted(pieces: np.ndarray) -> tuple[tuple[int, int], ...]:
-    at, count = np.unique(pieces, return_counts=True)
-    return tuple(zip(at.tolist(), count.tolist(), strict=True))
 
 
 def counts_of(

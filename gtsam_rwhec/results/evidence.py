@@ -29,7 +29,7 @@ from gtsam_rwhec.results.json_tree import in_words
 from gtsam_rwhec.results.linear_model import LinearModel, measured_rows
 from gtsam_rwhec.results.proof_spectrum import Proof, proof_of
 from gtsam_rwhec.results.residual_evidence import ResidualsEvidence, residuals_of
-from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of_problem
+from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
 from gtsam_rwhec.results.weak_poses import WeakDirection, weak_directions
 
 FORMAT: Final = "gtsam-rwhec evidence"
@@ -199,21 +199,16 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
     inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
     rows = measured_rows(problem, calibration)
     model = LinearModel.of(rows, calibration)
+    carriers = problem.sensor_carrier, problem.target_carrier
+    inliers = calibration.outliers.inliers
+    proven = selected(problem, inliers) if inliers else problem
     return Evidence(
         derived=derived_of(calibration),
-        proof=_proof(problem, calibration),
+        proof=None if calibration.solution is None else proof_of(calibration.solution, proven),
         weak=weak_directions(calibration, rows),
-        scene=scene_of_problem(problem, calibration, rows),
+        scene=scene_of(calibration, rows, carriers, problem.cameras, problem.boards),
         seen=seen_in_problem(problem, calibration.refined, rows, calibration.options.carrier_path),
         residuals=None if model is None else residuals_of(model, calibration),
         contribution=None if model is None else contribution_of(model),
         inputs=inputs.with_options(calibration.options),
     )
-
-
-def _proof(problem: Problem, calibration: Calibration) -> Proof | None:
-    """The proof of the certified solution, with the measurements that it is of."""
-    if calibration.solution is None:
-        return None
-    inliers = calibration.outliers.inliers
-    return proof_of(calibration.solution, selected(problem, inliers) if inliers else problem)

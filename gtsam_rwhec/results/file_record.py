@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, TypeAlias
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 Count: TypeAlias = Annotated[int, Field(ge=0)]
@@ -15,6 +16,13 @@ Bounded: TypeAlias = Annotated[float, Field(ge=-1e60, le=1e60)]
 #: Rows of numbers: an array as JSON has it.
 Row: TypeAlias = tuple[Bounded, ...]
 Rows: TypeAlias = tuple[Row, ...]
+Triple: TypeAlias = tuple[float, float, float]
+
+
+def triple(values: np.ndarray) -> Triple:
+    """Three numbers, none of which is -0."""
+    x, y, z = (float(value) + 0.0 for value in values)
+    return x, y, z
 
 
 class FileRecord(BaseModel):

@@ -239,11 +239,9 @@ def _seen_camera(
 def cells_with_corners(pixels: Array, size: tuple[int, int]) -> np.ndarray:
     """How many corners (n, 2) are in each cell of an image of a (width, height), rows from the top."""
     columns, rows = CELLS if size[0] >= size[1] else CELLS[::-1]
-    cells = np.zeros((rows, columns), dtype=int)
-    good = pixels[np.isfinite(pixels).all(axis=1)]
-    at = np.clip(((good + 0.5) / size * [columns, rows]).astype(int), 0, [columns - 1, rows - 1])
-    np.add.at(cells, (at[:, 1], at[:, 0]), 1)
-    return cells
+    good = np.clip(pixels[np.isfinite(pixels).all(axis=1)] + 0.5, 0.0, size)
+    cells, *_ = np.histogram2d(good[:, 1], good[:, 0], (rows, columns), ((0.0, size[1]), (0.0, size[0])))
+    return cells.astype(int)
 
 
 def worst_views(rated: Iterable[RatedView], most: int = MOST_WORST) -> list[RatedView]:

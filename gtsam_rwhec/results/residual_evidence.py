@@ -10,7 +10,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row, Rows
-from gtsam_rwhec.results.linear_model import LinearModel, inverse_of
+from gtsam_rwhec.results.linear_model import LinearModel, equilibrated, inverse_of
 
 #: So many measurements are kept one by one; of more, every so-many-th.
 MOST_KEPT = 5_000
@@ -158,13 +158,12 @@ def _hold_out(model: LinearModel, r: Array, J: Array) -> Iterator[HoldOut]:
         if not mine.any():
             continue
         left = whole - model.information(J, mine)
-        if np.linalg.matrix_rank(_scaled(left), tol=1e-9, hermitian=True) < len(left):
+        if np.linalg.matrix_rank(equilibrated(left)[0], tol=1e-9, hermitian=True) < len(left):
             continue
         step = np.append(inverse_of(left) @ (pull - model.gradient(J, r, mine)), 0.0)
         predicted[mine] = model.residual[mine] - np.einsum("nij,nj->ni", model.J[mine], step[model.places[mine]])
-    sensors = list(dict.fromkeys(pair.sensor for pair in model.pairs))
-    for number, sensor in enumerate(sensors):
-        known = (model.sensor == number) & np.isfinite(predicted[:, 0])
+    for sensor, of_sensor in model.by_sensor.items():
+        known = of_sensor & np.isfinite(predicted[:, 0])
         if known.any():
             held, fitted = sizes(predicted[known]), sizes(model.residual[known])
             yield HoldOut(
@@ -177,18 +176,11 @@ def _hold_out(model: LinearModel, r: Array, J: Array) -> Iterator[HoldOut]:
             )
 
 
-def _scaled(information: Array) -> Array:
-    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
-    scaled: Array = information * unit[:, None] * unit
-    return scaled
-
-
 def _dependence(model: LinearModel, r: Array) -> Dependence | None:
     """The strongest correlation of a residual with a coordinate of A, over sensors, residuals and coordinates."""
-    best: tuple[float, Dependence] | None = None
-    sensors = list(dict.fromkeys(pair.sensor for pair in model.pairs))
-    for number, sensor in enumerate(sensors):
-        mine = model.used & (model.sensor == number)
+    found: list[Dependence] = []
+    for sensor, of_sensor in model.by_sensor.items():
+        mine = model.used & of_sensor
         if mine.sum() < FEWEST:
             continue
         coordinates, names = _coordinates(model.A[mine])
@@ -196,23 +188,19 @@ def _dependence(model: LinearModel, r: Array) -> Dependence | None:
         spread = np.outer(values.std(axis=0), coordinates.std(axis=0)) * len(values)
         correlation = np.divide(values.T @ coordinates, spread, out=np.zeros(spread.shape), where=spread > 0.0)
         row, column = np.unravel_index(int(np.abs(correlation).argmax()), correlation.shape)
-        by_chance = min(CHANCE_OF_MANY / np.sqrt(len(values)), 1.0)
-        found = float(correlation[row, column])
-        if best is None or abs(found) / by_chance > best[0]:
-            every = slice(None, None, -(-len(values) // 1000))
-            best = (
-                abs(found) / by_chance,
-                Dependence(
-                    sensor=sensor,
-                    component=COMPONENTS[row],
-                    by=names[column],
-                    correlation=found,
-                    by_chance=by_chance,
-                    x=_rounded(coordinates[every, column]),
-                    y=_rounded(r[mine][every, row]),
-                ),
+        every = slice(None, None, -(-len(values) // 1000))
+        found.append(
+            Dependence(
+                sensor=sensor,
+                component=COMPONENTS[row],
+                by=names[column],
+                correlation=float(correlation[row, column]),
+                by_chance=min(CHANCE_OF_MANY / np.sqrt(len(values)), 1.0),
+                x=_rounded(coordinates[every, column]),
+                y=_rounded(r[mine][every, row]),
             )
-    return None if best is None else best[1]
+        )
+    return max(found, key=lambda one: abs(one.correlation) / one.by_chance, default=None)
 
 
 def _coordinates(A: Array) -> tuple[Array, tuple[str, ...]]:

@@ -26,10 +26,9 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import PairNoise, Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.results.file_record import FileRecord, NotNegative
+from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Triple, triple
 from gtsam_rwhec.results.linear_model import MeasuredRows, derivatives, noise_of_A
 
-Triple = tuple[float, float, float]
 Kind = Literal["translation", "rotation"]
 #: The turn of the thought experiment, and how many measurements it has, half of them to each side.
 TURN_RAD, MORE = np.radians(30.0), 10
@@ -93,8 +92,8 @@ def _directions(
                 frame=frame,
                 kind=kind,
                 carrier=names[0] if is_sensor else names[1],
-                axis=_triple(axis),
-                axis_in_carrier=_triple(R @ axis),
+                axis=triple(axis),
+                axis_in_carrier=triple(R @ axis),
                 deviation=float(sizes[-1]),
                 least=float(sizes[0]),
                 is_weak=False,
@@ -139,7 +138,7 @@ def _tried(
         turns = np.tile([TURN_RAD, -TURN_RAD], MORE // 2)[:, None] * axis
         turned = se3.expmap(np.hstack([turns, np.zeros_like(turns)]))
         turned[:, :3, 3] = place - turned[:, :3, :3] @ place
-        motions.append((_triple(axis), turned @ middle))
+        motions.append((triple(axis), turned @ middle))
     result = []
     for turn, poses in motions:
         added = root.T @ (_information(poses, *of_pair) / max(share, 1.0)) @ root
@@ -167,8 +166,3 @@ def _best(
     if left[best] < BETTER * more:
         found |= {"turn": tried[best][0], "after_turning": left[best]}
     return found
-
-
-def _triple(values: Array) -> Triple:
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
