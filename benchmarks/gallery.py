@@ -30,7 +30,7 @@ from rich.console import Console
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.report.advice import Advice
+from gtsam_rwhec.report.advice import advice_of
 from gtsam_rwhec.report.terminal_report import print_sentence
 from gtsam_rwhec.rig import read_rig
 
@@ -70,8 +70,8 @@ def paragraph(calibrated: rw.runs.Calibrated) -> str:
     free = calibrated.refined.free_directions
     if not free:
         free = calibrated.solution.identifiability.free_directions
-    for words, style in Advice.of(free, calibrated.log, calibration.judgement).items:
-        print_sentence(console, words, style)
+    for words, style in advice_of(free, calibrated.log, calibration.judgement):
+        print_sentence(console, f"  - {words}", style)
     return f"{calibration.judgement}\n{stream.getvalue()}".strip()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from gtsam_rwhec.solver.certificate import Basis, Certificate, Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.solver.solution import Solution
 
-#: A sentence as it is printed, and its style.
+#: A sentence, and its style on a terminal.
 Styled = tuple[str, str]
 #: An estimated size is named if it differs from the stated size by more than this many standard deviations.
 SIZE_SIGMAS = 3.0
@@ -27,39 +26,23 @@ MOST_NAMED = 10
 SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED})
 
 
-@dataclass(frozen=True)
-class Advice:
-    """What to do about a calibration, in sentences."""
+def advice_of(
+    free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None
+) -> tuple[Styled, ...]:
+    """What to do about a calibration that the ``judgement``, which stands above it, does not say.
 
-    undetermined: tuple[str, ...]  #: What the measurements leave free
-    cures: tuple[str, ...]  #: What settles it
-    doubts: tuple[str, ...]  #: What is odd about the log or its rig file
+    What the measurements leave free, with the cure, and what is odd about the log or its rig file. What a misreading
+    leaves free is no fault of the motion, so its cure is the only one.
+    """
+    said: list[Styled] = []
+    if free and not (judgement is not None and judgement.is_of_the_reading):
+        said += [(words, "bold red") for words in _not_determined(free)]
+        said.append((MEASURE_AGAIN, ""))
+    doubts = [] if log is None else log_advice(log, judgement)
+    return (*said, *((words, "bold yellow") for words in doubts))
 
-    @staticmethod
-    def of(free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None) -> Advice:
-        """What the ``judgement``, which stands above it, does not say.
 
-        What a misreading leaves free is no fault of the motion, so its cure is the only one.
-        """
-        if judgement is not None and judgement.is_of_the_reading:
-            free = ()
-        help_ = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
-        return Advice(
-            undetermined=tuple(_not_determined(free)),
-            cures=(help_,) if free else (),
-            doubts=() if log is None else tuple(log_advice(log, judgement)),
-        )
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """All of them, in order."""
-        return (*self.undetermined, *self.cures, *self.doubts)
-
-    @property
-    def items(self) -> tuple[Styled, ...]:
-        """All of them as items of a list, each with its style."""
-        groups = ((self.undetermined, "bold red"), (self.cures, ""), (self.doubts, "bold yellow"))
-        return tuple((f"  - {words}", style) for said, style in groups for words in said)
+MEASURE_AGAIN = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
 
 
 def _not_determined(free: Sequence[FreeDirection]) -> list[str]:
@@ -82,7 +65,6 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
     ]
     if judgement is None or Ground.NO_ANSWER not in judgement.grounds:  # which says it with the counts
         advice += log.detection.likely
-    advice += _without_answer(log)
     contradicted = {counts.frame for counts in log.contradicted}
     given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in contradicted]
     if given and (judgement is None or Ground.MOVED not in judgement.grounds):
@@ -99,23 +81,6 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
         names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
         advice.append(f"The images show tags that the rig file does not name: {', '.join(names)}.")
     return advice
-
-
-def _without_answer(log: LogFields) -> list[str]:
-    """Sensors and targets of the rig file that the answer lacks."""
-    advice = []
-    used = {name for count in log.outliers if count.used for name in count.pair}
-    for sensor, count in log.detection.images.items():
-        if sensor not in used:
-            seen = sum(track.used for track in log.detection.tracks if track.sensor == sensor)
-            why = f"all of its {seen} detections were left out" if seen else f"its {count} images show no target"
-            advice.append(f"{sensor} has no pose: {why}.")
-    if log.detection.unseen:
-        advice.append(f"No sensor saw {', '.join(log.detection.unseen)}.")
-    targets = dict.fromkeys(track.target for track in log.detection.tracks)
-    return advice + [
-        f"{name} has no pose: all of its detections were left out." for name in targets if name not in used
-    ]
 
 
 def _sizes(log: LogFields, reason: str) -> list[str]:

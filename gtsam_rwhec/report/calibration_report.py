@@ -16,10 +16,9 @@ from gtsam_rwhec.calibration.verdict import Finding, Verdict
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.advice import Advice, certificate_sentence, scale_sentence
+from gtsam_rwhec.report.advice import advice_of, certificate_sentence, scale_sentence
 from gtsam_rwhec.report.report_blocks import Paragraph, Section, Table, Words, is_absent
 from gtsam_rwhec.report.report_page import sections_of
 from gtsam_rwhec.report.residual_section import RESIDUAL_HEADINGS, residual_cells
@@ -27,6 +26,7 @@ from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.report.terminal_report import STYLES, print_blocks, print_sections, report_console
 from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, MARK, NO_NOISE_STATED, POSE_HEADINGS
+from gtsam_rwhec.results.derived import scalars_of
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_judgement import contradicted, contradicted_names, judge
 from gtsam_rwhec.solver.free_directions import FreeDirection
@@ -82,7 +82,7 @@ def print_calibration(
         free = solution.identifiability.free_directions
     report = ShortReport(
         calibration.judgement,
-        Advice.of(free, log, calibration.judgement).items,
+        advice_of(free, log, calibration.judgement),
         tuple(calibration.points.values()),
         sentences=tuple((note, "yellow") for note in calibration.notes),
     )
@@ -139,8 +139,8 @@ def print_solution(
     if verbose:
         _print_everything(console, ShownResult.of_answer(solution, findings=findings))
         return
-    advice = [(f"  - {NO_NOISE_STATED}", STYLES[Verdict.CARE])] if solution.is_relative else []
-    advice += Advice.of(solution.identifiability.free_directions, judgement=judgement).items
+    advice = [(NO_NOISE_STATED, STYLES[Verdict.CARE])] if solution.is_relative else []
+    advice += advice_of(solution.identifiability.free_directions, judgement=judgement)
     scale = () if solution.scale_mode == "known" else (scale_sentence(solution),)
     sentences = tuple((words, "") for words in (*scale, certificate_sentence(solution.certificate)))
     report = ShortReport(judgement, tuple(advice), (), (_solved_poses(solution),), sentences)
@@ -228,8 +228,8 @@ def deviation_cells(covariance: Array) -> tuple[str, ...]:
     return *(_cell(value, 2) for value in millimetres), *(_cell(value, 3) for value in degrees)
 
 
-def _cell(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if np.isfinite(value) else "free"
+def _cell(value: float | None, decimals: int) -> str:
+    return "free" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"
 
 
 def _label(name: str, wrong: Collection[str]) -> str:
@@ -240,17 +240,14 @@ def _label(name: str, wrong: Collection[str]) -> str:
 def scales_and_clocks(refined: Refined) -> list[str]:
     """The scales and time offsets, with their standard deviations, in a sentence each."""
     sentences = []
-    for unknown in refined.unknowns:
-        if unknown.kind not in (UnknownKind.SCALE, UnknownKind.TIME_OFFSET):
-            continue
-        deviation, owner = math.sqrt(refined.covariance(unknown)[0, 0]), unknown.owner
-        if unknown.kind is UnknownKind.SCALE:
-            value = refined.scale[owner] if isinstance(refined.scale, Mapping) else refined.scale
-            of = f" of {owner}" if owner else ""
-            sentences.append(f"Scale{of} (measured / true length): {value:.6f} ± {_cell(deviation, 6)}.")
+    for one in scalars_of(refined):
+        if one.kind == "scale":
+            of = f" of {one.owner}" if one.owner else ""
+            words = f"Scale{of} (measured / true length): {one.value:.6f} ± {_cell(one.deviation, 6)}."
         else:
-            offset = 1e3 * refined.time_offsets_s[owner]
-            sentences.append(f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms.")
+            deviation_ms = None if one.deviation is None else 1e3 * one.deviation
+            words = f"Time offset of {one.owner}: {1e3 * one.value:+.3f} ± {_cell(deviation_ms, 3)} ms."
+        sentences.append(words)
     return sentences
 
 

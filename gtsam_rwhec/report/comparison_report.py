@@ -10,7 +10,7 @@ from rich.console import Console
 from gtsam_rwhec.calibration.cross_validation import CrossValidation, HoldOutError
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.methods.comparison import Compared, Comparison
-from gtsam_rwhec.report.advice import Advice, certificate_sentence
+from gtsam_rwhec.report.advice import advice_of, certificate_sentence
 from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Table, Words
 from gtsam_rwhec.report.terminal_report import print_blocks, report_console
 
@@ -63,9 +63,9 @@ def comparison_blocks(comparison: Comparison) -> Iterator[Block]:
         tone = "good" if certificate.is_certified else "bad"
         yield Paragraph(certificate_sentence(certificate, "the certified answer"), tone)  # type: ignore[arg-type]
     if comparison.solution is not None:
-        said = Advice.of(comparison.solution.identifiability.free_directions).sentences
+        said = advice_of(comparison.solution.identifiability.free_directions)
         if said:
-            yield Listing(said, "bad")
+            yield Listing(tuple(words for words, _ in said), "bad")
     rows: dict[str, tuple[Words, ...]] = {
         row.method.name: _cells(comparison, row) for row in comparison.rows if row.estimate is not None
     }

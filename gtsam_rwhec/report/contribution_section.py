@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gtsam_rwhec.report.figures import SvgFigure, svg_figure
+from gtsam_rwhec.report.figures import LIGHT_BLUE, SvgFigure, svg_figure
 from gtsam_rwhec.report.report_blocks import Block, Chart, Paragraph, Section, Table, Words, significant
-from gtsam_rwhec.report.residual_section import BLUE
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.contribution import ContributionEvidence, ImageContribution
 
@@ -84,7 +83,7 @@ def _curve(found: ContributionEvidence, what: str) -> SvgFigure:
         growth = 100.0 * np.array(found.curve)
         at = np.arange(1, len(growth) + 1)
         low = growth <= 200.0
-        axes.plot(at[low], growth[low], color=BLUE, lw=2)
+        axes.plot(at[low], growth[low], color=LIGHT_BLUE, lw=2)
         axes.set_xlabel(f"{what} used, of {found.bundles}")
         axes.set_ylabel("worst deviation larger by (%)")
         axes.set_ylim(0.0, 200.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ from gtsam_rwhec.report.choices_section import log_blocks
 from gtsam_rwhec.report.figures import (
     GREY,
     INK,
+    LIGHT_BLUE,
     ORANGE,
     PURPLE,
     VERMILLION,
@@ -127,8 +128,7 @@ def _removed(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     order = sorted(range(len(seen.removed_counts)), key=lambda i: -seen.removed_counts[i].count)
     rows: list[tuple[Words, ...]] = []
     for i in order:
-        one = seen.removed_counts[i]
-        count = shown.evident("seen", "removed_counts", i, "count", spec=",.0f")
+        one, count = seen.removed_counts[i], shown.evident("seen", "removed_counts", i, "count", spec=",.0f")
         rows.append((one.reason, count, one.stage, one.target, one.sensor))
     headings = ("reason", "removed", "by", "target", "sensor")
     table = Table("Removed measurements", headings, tuple(rows[:MOST_ROWS]))
@@ -139,16 +139,9 @@ def _removed(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     if seen.removed_list:
         where = "the topics /calibration/SENSOR/pairs of calibration.mcap have them" if "log" in shown.tree else ""
         more = seen.removed - len(seen.removed_list) if len(seen.removed_list) == MOST_LISTED else 0
-        blocks: list[Block] = [
-            Table(
-                "Removed, one by one",
-                ("image", "time, s", "target", "sensor", "reason"),
-                tuple(map(_row, seen.removed_list)),
-            )
-        ]
-        blocks += [Paragraph(words, "note") for words in _and_more(more, where)]
+        notes = (Paragraph(words, "note") for words in _and_more(more, where))
         title = f"The first {MOST_LISTED} of them, one by one" if more else "All of them, one by one"
-        yield Folded(title, tuple(blocks))
+        yield Folded(title, (Table("Removed, one by one", ONE_BY_ONE, tuple(map(_row, seen.removed_list))), *notes))
 
 
 def _row(one: RemovedMeasurement) -> tuple[Words, ...]:
@@ -182,17 +175,11 @@ def _coverage(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     yield Listing(tuple(f"{camera.sensor}: {empty_in_words(camera.cells)}" for camera in seen.cameras))
     rows: list[tuple[Words, ...]] = []
     for i, camera in enumerate(seen.cameras):
-        noise = "" if camera.noise_px is None else shown.evident("seen", "cameras", i, "noise_px", spec=".3f")
-        rows.append(
-            (
-                camera.sensor,
-                shown.evident("seen", "cameras", i, "images", spec=",.0f"),
-                shown.evident("seen", "cameras", i, "corners", spec=",.0f"),
-                shown.evident("seen", "cameras", i, "share", times=100.0, spec=".0f"),
-                shown.evident("seen", "cameras", i, "rms_px", spec=".3f"),
-                noise,
-            )
-        )
+        at = ("seen", "cameras", i)
+        counts = (shown.evident(*at, field, spec=",.0f") for field in ("images", "corners"))
+        share, rms = shown.evident(*at, "share", times=100.0, spec=".0f"), shown.evident(*at, "rms_px", spec=".3f")
+        noise = "" if camera.noise_px is None else shown.evident(*at, "noise_px", spec=".3f")
+        rows.append((camera.sensor, *counts, share, rms, noise))
     yield Table(
         "Corners of the images in the answer",
         ("camera", "targets in images", "corners", "cells with corners, %", "rms error, px", "a corner's noise, px"),
@@ -212,18 +199,11 @@ def _worst(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
         return
     rows: list[tuple[Words, ...]] = []
     for i, one in enumerate(seen.worst):
-        times = "" if one.times_noise is None else shown.evident("seen", "worst", i, "times_noise", spec=".1f")
-        rows.append(
-            (
-                f"{i + 1}. {one.image}",
-                one.sensor,
-                one.target,
-                shown.evident("seen", "worst", i, "rms_px", spec=".3f"),
-                times,
-                shown.evident("seen", "worst", i, "largest_px", spec=".3f"),
-                "in the answer" if one.is_used else "left out",
-            )
-        )
+        at = ("seen", "worst", i)
+        rms, largest = (shown.evident(*at, field, spec=".3f") for field in ("rms_px", "largest_px"))
+        times = "" if one.times_noise is None else shown.evident(*at, "times_noise", spec=".1f")
+        use = "in the answer" if one.is_used else "left out"
+        rows.append((f"{i + 1}. {one.image}", one.sensor, one.target, rms, times, largest, use))
     yield Table(
         "The images whose corners are farthest off",
         ("image", "camera", "target", "rms, px", "times the noise", "largest, px", ""),
@@ -271,24 +251,6 @@ def _sheet(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
 
 #: A part with corners in at most this share of its cells has hardly any.
 HARDLY = 0.17
-#: By name: the rows and columns of a part, as shares of the image. Parts of parts that are named are not named again.
-PARTS = {
-    "left half": ((0.0, 1.0), (0.0, 0.5)),
-    "right half": ((0.0, 1.0), (0.5, 1.0)),
-    "upper half": ((0.0, 0.5), (0.0, 1.0)),
-    "lower half": ((0.5, 1.0), (0.0, 1.0)),
-    "upper left quarter": ((0.0, 0.5), (0.0, 0.5)),
-    "upper right quarter": ((0.0, 0.5), (0.5, 1.0)),
-    "lower left quarter": ((0.5, 1.0), (0.0, 0.5)),
-    "lower right quarter": ((0.5, 1.0), (0.5, 1.0)),
-}
-#: The outermost cells of each side.
-EDGES: Mapping[str, tuple[slice, slice]] = {
-    "left edge": (slice(None), slice(0, 1)),
-    "right edge": (slice(None), slice(-1, None)),
-    "upper edge": (slice(0, 1), slice(None)),
-    "lower edge": (slice(-1, None), slice(None)),
-}
 
 
 def empty_in_words(cells: Sequence[Sequence[int]]) -> str:
@@ -301,19 +263,13 @@ def empty_in_words(cells: Sequence[Sequence[int]]) -> str:
     told = np.zeros(has.shape, dtype=bool)
     nothing: list[str] = []
     hardly: list[str] = []
-    for name, (rows, columns) in PARTS.items():
-        part = np.zeros(has.shape, dtype=bool)
-        (top, bottom), (left, right) = (
-            [round(share * n) for share in shares] for shares, n in zip((rows, columns), has.shape, strict=True)
-        )
-        part[top:bottom, left:right] = True
-        if told[part].all() or has[part].mean() > HARDLY:
-            continue
-        (hardly if has[part].any() else nothing).append(f"in the {name}")
-        told |= part
+    for name, part in _parts(has.shape).items():
+        if not told[part].all() and has[part].mean() <= HARDLY:
+            (hardly if has[part].any() else nothing).append(f"in the {name}")
+            told[part] = True
     for name, edge in EDGES.items():
         if not has[edge].any() and not told[edge].all():
-            nothing.append(f"along the {name}")
+            nothing.append(f"along the {name} edge")
     said = [f"{words} was seen {_and(where)}" for words, where in (("nothing", nothing), ("hardly anything", hardly))
             if where]  # fmt: skip
     if said:
@@ -321,12 +277,23 @@ def empty_in_words(cells: Sequence[Sequence[int]]) -> str:
     return f"{int((~has).sum())} of {has.size} cells have no corner, none of them a whole side or quarter."
 
 
+#: The outermost cells of each side.
+EDGES = {"left": np.s_[:, :1], "right": np.s_[:, -1:], "upper": np.s_[:1, :], "lower": np.s_[-1:, :]}
+
+
+def _parts(shape: tuple[int, ...]) -> dict[str, tuple[slice, slice]]:
+    """Halves, then quarters, which are not named again where halves are."""
+    i, j = (round(0.5 * n) for n in shape)
+    down, across = {"upper": np.s_[:i], "lower": np.s_[i:]}, {"left": np.s_[:j], "right": np.s_[j:]}
+    halves = {f"{x} half": (np.s_[:], columns) for x, columns in across.items()}
+    halves |= {f"{y} half": (rows, np.s_[:]) for y, rows in down.items()}
+    return halves | {f"{y} {x} quarter": (down[y], across[x]) for y in down for x in across}
+
+
 def _and(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-#: Ticks and corners: Okabe and Ito's blue, a little lighter, to be seen on dark as well as on light.
-USED = "#2C8CC9"
 #: Signs of what was removed, by stage.
 SIGNS = {"detection": ("^", ORANGE), "cleaning": ("x", VERMILLION), "robust estimation": ("s", PURPLE)}
 OTHER = ("+", GREY)
@@ -364,7 +331,7 @@ def detections_figure(seen: SeenEvidence) -> SvgFigure:
             axes.set_xlabel("measurement, in the order given")
         else:
             axes.set_xlabel("time (s)")
-        handles = [_handle("used", "|", USED)] + [
+        handles = [_handle("used", "|", LIGHT_BLUE)] + [
             _handle(f"removed by {stage}", *sign) for stage, sign in signs.items()
         ]
         figure.legend(handles=handles, loc="outside upper left", ncols=2, handletextpad=0.2, columnspacing=1.0)
@@ -385,10 +352,10 @@ def _draw_track(axes: Axes, row: int, track: SeenTrack, step: float, signs: dict
     alone = step * (first[first == last] + 0.5)
     gap = np.full(len(alone), np.nan)
     ends = np.column_stack([np.full(len(alone), row - TICK), np.full(len(alone), row + TICK), gap])
-    axes.plot(np.column_stack([alone, alone, gap]).ravel(), ends.ravel(), color=USED, lw=1.0)
+    axes.plot(np.column_stack([alone, alone, gap]).ravel(), ends.ravel(), color=LIGHT_BLUE, lw=1.0)
     wide = first != last
     areas = list(zip(step * first[wide], step * (last - first + 1)[wide], strict=True))
-    axes.broken_barh(areas, (row - TICK, 2.0 * TICK), facecolor=USED, lw=0.0)
+    axes.broken_barh(areas, (row - TICK, 2.0 * TICK), facecolor=LIGHT_BLUE, lw=0.0)
     for stage, pieces in track.removed_at.items():
         marker, colour = signs[stage]
         at = np.array(pieces)[:, 0]
@@ -436,5 +403,5 @@ def _draw_camera(axes: Axes, camera: SeenCamera) -> None:
     )
     size = 2.6 if len(camera.x) > MANY_CORNERS else 3.6
     # As a picture in the figure: thousands of marks would be most of the page.
-    axes.plot(camera.x, camera.y, ".", color=USED, markersize=size, markeredgewidth=0, zorder=2, rasterized=True)
+    axes.plot(camera.x, camera.y, ".", color=LIGHT_BLUE, markersize=size, markeredgewidth=0, zorder=2, rasterized=True)
     axes.set_title(f"{shortened(camera.sensor)}: {camera.share:.0%}")

@@ -21,7 +21,7 @@ from gtsam_rwhec.report.report_blocks import (
 )
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
-from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
+from gtsam_rwhec.solver.free_directions import FreeReason
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10
@@ -63,11 +63,10 @@ def determines_section(shown: ShownResult) -> Section:
         return Section("determines", title, missing=NO_ANSWER)
     known = shown.result.solution.identifiability
     blocks: list[Block] = [Paragraph(_what_was_measured(shown)), Paragraph(str(known)), *_grid(shown), *_motions(shown)]
-    refined = shown.result.refined
-    free = (refined.free_directions if refined is not None else ()) or known.free_directions
+    free = shown.result.free_directions
     if free:
         blocks.append(Paragraph("Free directions: the poses can move along them and fit as well.", "bad"))
-        blocks.append(Listing(tuple(f"Not determined: {one}. {cure_of(one)}" for one in free)))
+        blocks.append(Listing(tuple(f"Not determined: {one}. {CURES[one.reason]}" for one in free)))
     else:
         blocks.append(Paragraph(ALL_DETERMINED))
         blocks += _distance_to_free(shown)
@@ -104,11 +103,6 @@ def _distance_to_free(shown: ShownResult) -> Iterator[Block]:
     )
 
 
-def cure_of(free: FreeDirection) -> str:
-    """The motion that settles a free direction."""
-    return CURES[free.reason]
-
-
 def _grid(shown: ShownResult) -> Iterator[Block]:
     """The grid: in each cell a sign, and the measurements that are used."""
     assert shown.result is not None
@@ -124,7 +118,7 @@ def _grid(shown: ShownResult) -> Iterator[Block]:
         pair = Pair(target, sensor)
         found = alone.get(pair)
         sign = NOT_OBSERVED if found is None else DETERMINED if found.is_unique else NOT_DETERMINED
-        return _cell(sign, counts.get(pair))
+        return (f"{sign}{TOGETHER}", *counts[pair]) if pair in counts else sign
 
     by_targets = len(targets) > MOST_COLUMNS and len(targets) > len(sensors)
     across, down = (sensors, targets) if by_targets else (targets, sensors)
@@ -139,10 +133,6 @@ def _legend(has_outliers: bool) -> str:
     signs = "; ".join(f"{sign} {meaning}" for sign, meaning in SIGNS.items())
     more = ", out of how many where some were left out" if has_outliers else ""
     return f"{signs}. The number beside a sign is that of the measurements in the answer{more}."
-
-
-def _cell(sign: str, count: Count | None) -> Words:
-    return sign if count is None else (f"{sign}{TOGETHER}", *count)
 
 
 def _counts(shown: ShownResult) -> dict[Pair, Count]:

@@ -15,6 +15,7 @@ from gtsam_rwhec.report.figures import (
     GREEN,
     GREY,
     INK,
+    LIGHT_BLUE,
     ORANGE,
     PURPLE,
     VERMILLION,
@@ -234,12 +235,8 @@ def _against_noise(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Blo
 
 
 def _neighbours(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]:
-    beyond = sum(
-        1
-        for pair in found.pairs
-        if pair.neighbours is not None and pair.band is not None and abs(pair.neighbours) > pair.band
-    )
-    judged = sum(1 for pair in found.pairs if pair.neighbours is not None)
+    known = [(pair.neighbours, pair.band) for pair in found.pairs if pair.neighbours is not None]
+    judged, beyond = len(known), sum(band is not None and abs(own) > band for own, band in known)
     words: list[str] = []
     if judged:
         words.append(
@@ -286,10 +283,8 @@ def _pairs(shown: ShownResult, found: ResidualsEvidence) -> Block:
     )
 
 
-#: Blue that is seen on dark as well as on light.
-BLUE = "#2C8CC9"
 #: Sensors are told apart by colour and by sign, up to this number; more are drawn alike.
-SIGNS = ((BLUE, "o"), (VERMILLION, "^"), (GREEN, "s"), (ORANGE, "D"), (PURPLE, "v"), (GREY, "P"))
+SIGNS = ((LIGHT_BLUE, "o"), (VERMILLION, "^"), (GREEN, "s"), (ORANGE, "D"), (PURPLE, "v"), (GREY, "P"))
 #: With more pairs there is one box a sensor.
 MOST_BOXES = 14
 #: More signs than this become pixels.
@@ -319,7 +314,7 @@ def boxes_figure(found: ResidualsEvidence) -> SvgFigure:
             line = {"color": INK, "linewidth": 0.8}
             axes.boxplot(
                 values, orientation="horizontal", widths=0.6, flierprops={"marker": ".", "markersize": 3,
-                "markeredgecolor": BLUE}, medianprops={"color": VERMILLION, "linewidth": 1.6}, boxprops=line,
+                "markeredgecolor": LIGHT_BLUE}, medianprops={"color": VERMILLION, "linewidth": 1.6}, boxprops=line,
                 whiskerprops=line, capprops=line,
             )  # fmt: skip
             axes.set_xlabel(f"residual ({unit})")
@@ -397,18 +392,14 @@ def image_figure(cameras: tuple[SeenCamera, ...]) -> SvgFigure:
 def _means(camera: SeenCamera) -> tuple[Array, Array]:
     """Middles (n, 2) of cells with corners, and their mean errors (n, 2)."""
     across, down = CELLS if camera.width >= camera.height else CELLS[::-1]
-    x, y = np.array(camera.x), np.array(camera.y)
-    column = np.clip((x / camera.width * across).astype(int), 0, across - 1)
-    row = np.clip((y / camera.height * down).astype(int), 0, down - 1)
-    cell, number = row * across + column, across * down
-    count = np.bincount(cell, minlength=number)
-    kept = count >= FEWEST_CORNERS
-    sums = np.column_stack([np.bincount(cell, weights=np.array(d), minlength=number) for d in (camera.dx, camera.dy)])
-    cells = np.arange(number)
-    middles = np.column_stack(
-        [(cells % across + 0.5) * camera.width / across, (cells // across + 0.5) * camera.height / down]
+    x, y = np.clip(camera.x, 0.0, camera.width), np.clip(camera.y, 0.0, camera.height)
+    count, *errors = (
+        np.histogram2d(y, x, (down, across), ((0.0, camera.height), (0.0, camera.width)), weights=weights)[0]
+        for weights in (None, camera.dx, camera.dy)
     )
-    return middles[kept], sums[kept] / count[kept, None]
+    kept = count >= FEWEST_CORNERS
+    middles = (np.argwhere(kept)[:, ::-1] + 0.5) * [camera.width / across, camera.height / down]
+    return middles, np.stack(errors, axis=2)[kept] / count[kept, None]
 
 
 def dependence_figure(found: Dependence) -> SvgFigure:
@@ -417,7 +408,7 @@ def dependence_figure(found: Dependence) -> SvgFigure:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         x, y = np.array(found.x), np.array(found.y)
-        axes.plot(x, y, ".", color=BLUE, markersize=4, markeredgewidth=0, rasterized=len(x) > MANY)
+        axes.plot(x, y, ".", color=LIGHT_BLUE, markersize=4, markeredgewidth=0, rasterized=len(x) > MANY)
         pieces = np.array_split(np.argsort(x), min(10, max(len(x) // 4, 1)))
         axes.plot([x[p].mean() for p in pieces], [y[p].mean() for p in pieces], "-", color=VERMILLION, lw=2)
         axes.set_xlabel(found.by)
@@ -433,7 +424,7 @@ def normal_figure(found: ResidualsEvidence) -> SvgFigure:
     def draw(figure: Figure) -> None:
         left, right = figure.subplots(1, 2)
         edges = np.linspace(-4.0, 4.0, 41)
-        left.hist(np.clip(values, -4.0, 4.0), edges, density=True, color=BLUE, alpha=0.7)
+        left.hist(np.clip(values, -4.0, 4.0), edges, density=True, color=LIGHT_BLUE, alpha=0.7)
         at = np.linspace(-4.0, 4.0, 161)
         left.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=VERMILLION, lw=1.8)
         left.set_xlabel("residual / noise")
@@ -443,7 +434,7 @@ def normal_figure(found: ResidualsEvidence) -> SvgFigure:
         expected = ndtri((np.searchsorted(values, shown) + 0.5) / len(values))
         limit = 1.05 * float(max(np.abs(shown).max(initial=1.0), np.abs(expected).max(initial=1.0)))
         right.plot([-limit, limit], [-limit, limit], color=VERMILLION, lw=1.2)
-        right.plot(expected, shown, ".", color=BLUE, markersize=4, markeredgewidth=0)
+        right.plot(expected, shown, ".", color=LIGHT_BLUE, markersize=4, markeredgewidth=0)
         right.set_xlabel("normal quantile")
         right.set_ylabel("found quantile")
         right.set_title("on the line: as normal noise", size=9)

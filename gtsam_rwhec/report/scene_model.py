@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import gtsam
@@ -16,6 +16,7 @@ from gtsam_rwhec.results.scene_evidence import SceneEvidence
 from gtsam_rwhec.solver.free_directions import SHARE, FreeDirection
 
 Kind = Literal["carrier", "sensor", "target"]
+Side = Literal["sensors", "targets"]
 #: Axes of frames have at most and at least this share of the scene, and this share of the distance between neighbours.
 AXIS, LEAST_AXIS, OF_NEIGHBOURS = 0.06, 0.01, 0.6
 #: The largest ellipsoid has a half axis of this share of the scene.
@@ -53,6 +54,12 @@ class View:
     apex: Array
     rim: Array
 
+    @property
+    def edges(self) -> tuple[Array, ...]:
+        """The border, and the lines from the place to its corners."""
+        corners = self.rim[:: len(self.rim) // 4]
+        return np.vstack([self.rim, self.rim[:1]]), *(np.stack([self.apex, corner]) for corner in corners)
+
 
 @dataclass(frozen=True, eq=False)
 class PlacedBoard:
@@ -86,7 +93,18 @@ class Scene:
         return float((self.high - self.low).max())
 
     @property
-    def axes_m(self) -> dict[Kind, float]:
+    def has_many(self) -> bool:
+        """Whether targets are drawn as points."""
+        return len(self.frames) > MANY
+
+    def axes(self, k: int) -> list[Array]:
+        """The k-th axis of each frame as a line (2, 3)."""
+        lengths = self._axes_m
+        drawn = (frame for frame in self.frames if not (self.has_many and frame.kind == "target"))
+        return [f.T[:3, 3] + np.outer([0.0, lengths[f.kind]], f.T[:3, k]) for f in drawn]
+
+    @property
+    def _axes_m(self) -> dict[Kind, float]:
         """Length of the axes of frames of each kind: shorter where frames are near to each other."""
         found: dict[Kind, float] = {"carrier": 1.6 * AXIS * self.extent}
         for kind in ("sensor", "target"):
@@ -100,9 +118,11 @@ class Scene:
     def ellipsoids(self) -> dict[str, Array]:
         """The shape matrix (3, 3) of each ellipsoid that is drawn, as large as it is drawn: a a' of its half axes."""
         factor = (self.times * self.radius) ** 2
-        many = len(self.frames) > MANY
-        known = {f.name: f for f in self.frames if f.covariance is not None and not (many and f.kind == "target")}
-        shapes = {name: factor * frame.covariance for name, frame in known.items() if frame.covariance is not None}
+        shapes = {
+            frame.name: factor * frame.covariance
+            for frame in self.frames
+            if frame.covariance is not None and not (self.has_many and frame.kind == "target")
+        }
         return {name: shape for name, shape in shapes.items() if np.linalg.norm(shape, 2) ** 0.5 <= 0.5 * self.extent}
 
 
@@ -110,7 +130,10 @@ def scene_of_rig(shown: ShownResult, evidence: SceneEvidence) -> Scene:
     """Both carriers, the moving one at its typical pose."""
     typical = _pose(evidence.poses[evidence.typical])
     stands = evidence.standing == "targets"
-    placed = {"targets": np.eye(4) if stands else typical, "sensors": typical if stands else np.eye(4)}
+    placed: dict[Side, Array] = {
+        "targets": np.eye(4) if stands else typical,
+        "sensors": typical if stands else np.eye(4),
+    }
     world, moving = (carrier(shown, kind) for kind in (("targets", "sensors") if stands else ("sensors", "targets")))
     rpy = np.degrees([gtsam.Rot3.Quaternion(*row[3:]).rpy() for row in evidence.poses])
     seconds = evidence.seconds or (np.nan,) * len(evidence.poses)
@@ -118,9 +141,9 @@ def scene_of_rig(shown: ShownResult, evidence: SceneEvidence) -> Scene:
     return _scene(shown, evidence, placed, world, path, moving)
 
 
-def scene_of_carrier(shown: ShownResult, kind: Literal["sensors", "targets"]) -> Scene:
+def scene_of_carrier(shown: ShownResult, side: Side) -> Scene:
     """The frames on one carrier, in its axes: all that a result alone tells."""
-    return _scene(shown, None, {kind: np.eye(4)}, carrier(shown, kind), np.zeros((0, 7)), "")
+    return _scene(shown, None, {side: np.eye(4)}, carrier(shown, side), np.zeros((0, 7)), "")
 
 
 def carrier(shown: ShownResult, kind: str) -> str:
@@ -132,16 +155,14 @@ def carrier(shown: ShownResult, kind: str) -> str:
 def _scene(
     shown: ShownResult,
     evidence: SceneEvidence | None,
-    placed: Mapping[str, Array],
+    placed: Mapping[Side, Array],
     world: str,
     path: Array,
     moving: str,
 ) -> Scene:
     assert shown.result is not None
     refined = shown.result.refined
-    frames = [
-        frame for kind, T in placed.items() for frame in _frames(shown, "sensor" if kind == "sensors" else "target", T)
-    ]
+    frames = [frame for kind, T in placed.items() for frame in _frames(shown, kind, T)]
     origins = [Frame(carrier(shown, kind), "carrier", T, _words(T, world)) for kind, T in placed.items()]
     views = () if evidence is None else tuple(_views(frames, evidence))
     extent = np.concatenate([path[:, :3], *(f.T[None, :3, 3] for f in frames), *(v.rim for v in views)])
@@ -168,10 +189,11 @@ def _scene(
     )
 
 
-def _frames(shown: ShownResult, kind: Literal["sensor", "target"], placed: Array) -> Iterator[Frame]:
+def _frames(shown: ShownResult, side: Side, placed: Array) -> Iterator[Frame]:
     """The frames on a carrier that is placed in the scene."""
     parts = shown.tree.get("refined", {}).get("frames", {})
-    for row in shown.tree[f"{kind}s"]:
+    kind: Kind = "sensor" if side == "sensors" else "target"
+    for row in shown.tree[side]:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = row["rotation_matrix"], row["translation_m"]
         name, known = row["child"], parts.get(row["child"])
@@ -265,42 +287,31 @@ class Line:
     words: str  #: The sentence
     is_free: bool
     pieces: tuple[Array, ...]  #: Lines to be drawn: the direction itself first
-    #: (3,): the unit vector in the scene along which it moves, or about which it turns
-    moves: Array | None = field(default=None)
-    about: Array | None = field(default=None)
-
-
-def free_directions(shown: ShownResult) -> tuple[FreeDirection, ...]:
-    """The free directions of the poses that the page shows."""
-    assert shown.result is not None
-    refined = shown.result.refined
-    return shown.result.solution.identifiability.free_directions if refined is None else refined.free_directions
 
 
 def lines_of(shown: ShownResult, scene: Scene) -> tuple[Line, ...]:
     """Free directions, then weak ones, then positions that are too uncertain for an ellipsoid."""
+    assert shown.result is not None
     frames = {frame.name: frame for frame in scene.frames}
     lines = [
         line
-        for number, direction in enumerate(free_directions(shown), start=1)
+        for number, direction in enumerate(shown.result.free_directions, start=1)
         for line in _free(direction, f"free {number}", frames, scene.extent)
     ]
-    weak = () if shown.evidence is None else shown.evidence.weak
-    number = 0
-    for one in weak:
-        if not one.is_weak:
-            continue
-        number += 1
+    weak = () if shown.evidence is None else tuple(one for one in shown.evidence.weak if one.is_weak)
+    for number, one in enumerate(weak, start=1):
         if (frame := frames.get(one.frame)) is None:
             continue
-        along = frame.T[:3, :3] @ np.array(one.axis)
-        what, unit = ("along", "mm") if one.kind == "translation" else ("about", "°")
+        what, unit, draw = ("along", "mm", _shift) if one.kind == "translation" else ("about", "°", _turn)
         words = f"{one.frame}: ± {one.deviation:.2g} {unit} {what} this line"
-        draw = _shift if one.kind == "translation" else _turn
-        yield_at = {"moves" if one.kind == "translation" else "about": along}
-        pieces = draw(frame.T[:3, 3], along, 0.5 * scene.extent)
-        lines.append(Line(one.frame, f"weak {number}", words, False, pieces, **yield_at))
+        pieces = draw(frame.T[:3, 3], frame.T[:3, :3] @ np.array(one.axis), 0.5 * scene.extent)
+        lines.append(Line(one.frame, f"weak {number}", words, False, pieces))
     return (*lines, *_too_large(scene))[:MOST_LINES]
+
+
+def labels_of(lines: Sequence[Line]) -> dict[str, Array]:
+    """Where the label of each direction stands: at the first frame that has it."""
+    return {line.label: line.pieces[0][1] for line in reversed(lines) if line.label != line.frame}
 
 
 def _free(direction: FreeDirection, label: str, frames: dict[str, Frame], extent: float) -> Iterator[Line]:
@@ -316,10 +327,10 @@ def _free(direction: FreeDirection, label: str, frames: dict[str, Frame], extent
             foot = np.cross(omega, v) / turn**2
             # An axis far off turns the frame as a shift does; it is drawn at the frame then.
             at = t + foot if np.linalg.norm(foot) <= 0.5 * extent else t
-            yield Line(name, label, words, True, _turn(at, axis, extent), about=axis)
+            yield Line(name, label, words, True, _turn(at, axis, extent))
         else:
             along = v / np.linalg.norm(v)
-            yield Line(name, label, words, True, _shift(t, along, extent), moves=along)
+            yield Line(name, label, words, True, _shift(t, along, extent))
 
 
 def _too_large(scene: Scene) -> Iterator[Line]:
@@ -334,7 +345,7 @@ def _too_large(scene: Scene) -> Iterator[Line]:
             continue  # one of many, without an ellipsoid
         words = f"{frame.name}: 95 % within ± {1e3 * half:.3g} mm along this line"
         pieces = _shift(frame.T[:3, 3], vectors[:, -1], scene.extent)
-        yield Line(frame.name, frame.name, words, False, pieces, moves=vectors[:, -1])
+        yield Line(frame.name, frame.name, words, False, pieces)
 
 
 def _shift(at: Array, along: Array, extent: float) -> tuple[Array, ...]:

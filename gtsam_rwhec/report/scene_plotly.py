@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from gtsam_rwhec.files.terminal_text import printable
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, shortened
-from gtsam_rwhec.report.scene_model import MANY, Line, Scene
+from gtsam_rwhec.report.scene_model import Line, Scene, labels_of
 
 #: With more names than this, they are seen on request only.
 MOST_NAMES = 16
@@ -33,18 +34,9 @@ Trace = dict[str, Any]
 
 def traces_of(scene: Scene, lines: Sequence[Line]) -> tuple[Trace, ...]:
     """The traces; ``meta`` has the group of each."""
-    return tuple(
-        [
-            *_boards(scene),
-            *_views(scene),
-            *_path(scene),
-            *_ellipsoids(scene),
-            *_axes(scene),
-            *_origins(scene),
-            *_lines(scene, lines),
-            *_names(scene, lines),
-        ]
-    )
+    of_scene = (_boards, _views, _path, _ellipsoids, _axes, _origins)
+    traces = [trace for made in of_scene for trace in made(scene)]
+    return (*traces, *_lines(scene, lines), *_names(scene, lines))
 
 
 def _boards(scene: Scene) -> Iterator[Trace]:
@@ -53,20 +45,15 @@ def _boards(scene: Scene) -> Iterator[Trace]:
     for name, polygons, colour in (("boards", paper, PAPER), ("boards, dark", dark, DARK)):
         if polygons:
             yield _mesh("boards", name, *_fans(polygons), scene, colour=colour, lighting=FLAT, showlegend=False)
-    if len(scene.frames) <= MANY:
+    if paper and not scene.has_many:
         closed = [np.vstack([polygon, polygon[:1]]) for polygon in paper]
-        if closed:
-            yield {**_strokes("boards", "boards, edges", closed, scene, colour=GREY, width=2), "showlegend": False}
+        yield _strokes("boards", "boards, edges", closed, scene, colour=GREY, width=2, showlegend=False)
 
 
 def _views(scene: Scene) -> Iterator[Trace]:
     if not scene.views:
         return
-    pieces = []
-    for view in scene.views:
-        quarter = len(view.rim) // 4
-        pieces += [np.vstack([view.rim, view.rim[:1]])]
-        pieces += [np.array([view.apex, view.rim[k * quarter]]) for k in range(4)]
+    pieces = [edge for view in scene.views for edge in view.edges]
     yield _strokes("views", "views", pieces, scene, colour=SKY, width=2)
     fans = [(np.vstack([v.apex, v.rim]), _around(len(v.rim))) for v in scene.views]
     yield _mesh(
@@ -77,7 +64,6 @@ def _views(scene: Scene) -> Iterator[Trace]:
 def _path(scene: Scene) -> Iterator[Trace]:
     if not len(scene.path):
         return
-    x, y, z = _columns(scene.path[:, :3], scene)
     has_time = bool(np.isfinite(scene.path[:, 6]).all())
     when = scene.path[:, 6] if has_time else np.arange(len(scene.path), dtype=float)
     said = [
@@ -86,19 +72,11 @@ def _path(scene: Scene) -> Iterator[Trace]:
         for i, row in enumerate(scene.path)
     ]
     colours = {"color": np.round(when, 3).tolist(), "colorscale": [[0.0, EARLY], [1.0, LATE]], "showscale": False}
-    yield {
-        "type": "scatter3d",
-        "meta": "path",
-        "name": "path",
-        "mode": "lines+markers" if has_time else "markers",
-        "x": x,
-        "y": y,
-        "z": z,
-        "text": said,
-        "hovertemplate": "%{text}<extra></extra>",
-        "marker": {"size": 2.5, **colours},
-        "line": {"width": 1.5, "color": GREY},
-    }
+    yield _points(
+        "path", "path", scene.path[:, :3], _decimals(scene), said,
+        mode="lines+markers" if has_time else "markers", marker={"size": 2.5, **colours},
+        line={"width": 1.5, "color": GREY},
+    )  # fmt: skip
 
 
 def _ellipsoids(scene: Scene) -> Iterator[Trace]:
@@ -117,35 +95,18 @@ def _ellipsoids(scene: Scene) -> Iterator[Trace]:
 
 
 def _axes(scene: Scene) -> Iterator[Trace]:
-    lengths = scene.axes_m
     for k, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True)):
-        pieces = []
-        for frame in scene.frames:
-            if len(scene.frames) > MANY and frame.kind == "target":
-                continue
-            pieces.append(np.array([frame.T[:3, 3], frame.T[:3, 3] + lengths[frame.kind] * frame.T[:3, k]]))
-        yield _strokes("axes", name, pieces, scene, colour=colour, width=5)
+        yield _strokes("axes", name, scene.axes(k), scene, colour=colour, width=5)
 
 
 def _origins(scene: Scene) -> Iterator[Trace]:
     for kind, symbol, size in (("carrier", "square", 5), ("sensor", "circle", 4), ("target", "diamond", 3)):
         frames = [frame for frame in scene.frames if frame.kind == kind]
-        if not frames:
-            continue
-        x, y, z = np.round([frame.T[:3, 3] for frame in frames], EXACT).T.tolist()
-        yield {
-            "type": "scatter3d",
-            "meta": "frames",
-            "name": f"{kind}s",
-            "mode": "markers",
-            "x": x,
-            "y": y,
-            "z": z,
-            "text": ["<br>".join([f"<b>{_safe(frame.name)}</b>", *map(_safe, frame.words)]) for frame in frames],
-            "hovertemplate": "%{text}<extra></extra>",
-            "marker": {"size": size, "symbol": symbol, "color": INK},
-            "showlegend": False,
-        }
+        if frames:
+            at = np.array([frame.T[:3, 3] for frame in frames])
+            said = ["<br>".join([f"<b>{_safe(frame.name)}</b>", *map(_safe, frame.words)]) for frame in frames]
+            marker = {"size": size, "symbol": symbol, "color": INK}
+            yield _points("frames", f"{kind}s", at, EXACT, said, mode="markers", marker=marker, showlegend=False)
 
 
 def _lines(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
@@ -160,84 +121,63 @@ def _lines(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
             for k, piece in enumerate(line.pieces)
             for _ in (*piece, None)
         ]
-        trace = _strokes("directions", name, pieces, scene, colour=PURPLE, width=6 if is_free else 4, dash=dash)
-        yield {**trace, "text": said, "hoverinfo": "text"}
+        yield _strokes(
+            "directions", name, pieces, scene,
+            colour=PURPLE, width=6 if is_free else 4, dash=dash, text=said, hoverinfo="text",
+        )  # fmt: skip
 
 
 def _names(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
     """Names of frames, and labels of directions at the first frame that has them."""
     few = len(scene.frames) <= MOST_NAMES
-    yield _texts("names", [(frame.T[:3, 3], frame.name) for frame in scene.frames], INK, 12, is_visible=few)
-    first = {line.label: line for line in reversed(lines) if line.label != line.frame}
-    if first:
-        at = [(line.pieces[0][1], line.label) for line in first.values()]
-        yield _texts("directions", at, PURPLE, 12, is_visible=True)
+    yield _texts("names", [(frame.name, frame.T[:3, 3]) for frame in scene.frames], INK, is_visible=few)
+    labels = labels_of(lines)
+    if labels:
+        yield _texts("directions", list(labels.items()), PURPLE, is_visible=True)
 
 
-def _texts(group: str, words: Iterable[tuple[Array, str]], colour: str, size: int, *, is_visible: bool) -> Trace:
-    at, said = zip(*words, strict=True)
-    x, y, z = np.round(at, EXACT).T.tolist()
-    return {
-        "type": "scatter3d",
-        "meta": group,
-        "name": group,
-        "mode": "text",
-        "x": x,
-        "y": y,
-        "z": z,
-        "text": [_plain(name) for name in said],
-        "textposition": [TEXTS[i % len(TEXTS)] for i in range(len(said))],
-        "textfont": {"color": colour, "size": size},
-        "hoverinfo": "skip",
-        "showlegend": False,
-        "visible": is_visible,
-    }
+def _texts(group: str, words: Sequence[tuple[str, Array]], colour: str, *, is_visible: bool) -> Trace:
+    said, at = zip(*words, strict=True)
+    return _trace(
+        "scatter3d", group, group, np.array(at), EXACT, mode="text", text=[_plain(name) for name in said],
+        textposition=[TEXTS[i % len(TEXTS)] for i in range(len(said))], textfont={"color": colour, "size": 12},
+        hoverinfo="skip", showlegend=False, visible=is_visible,
+    )  # fmt: skip
+
+
+def _points(group: str, name: str, at: Array, decimals: int, said: list[str], **more: Any) -> Trace:
+    """Places (n, 3) with words beside the pointer."""
+    return _trace("scatter3d", group, name, at, decimals, text=said, hovertemplate="%{text}<extra></extra>", **more)
 
 
 def _strokes(
-    group: str, name: str, pieces: Sequence[Array], scene: Scene, *, colour: str, width: float, dash: str = "solid"
-) -> Trace:
+    group: str, name: str, pieces: Sequence[Array], scene: Scene, *, colour: str, width: float, dash: str = "solid",
+    **more: Any,
+) -> Trace:  # fmt: skip
     """Lines (n, 3) with gaps between them, as one trace."""
     gap = np.full((1, 3), np.nan)
-    x, y, z = _columns(np.concatenate([part for piece in pieces for part in (piece, gap)]), scene)
-    return {
-        "type": "scatter3d",
-        "meta": group,
-        "name": name,
-        "mode": "lines",
-        "x": x,
-        "y": y,
-        "z": z,
-        "hoverinfo": "skip",
-        "line": {"color": colour, "width": width, "dash": dash},
-    }
+    points = np.concatenate([part for piece in pieces for part in (piece, gap)])
+    line = {"color": colour, "width": width, "dash": dash}
+    more = {"hoverinfo": "skip", "line": line, **more}
+    return _trace("scatter3d", group, name, points, _decimals(scene), mode="lines", **more)
 
 
 def _mesh(group: str, name: str, points: Array, faces: Array, scene: Scene, *, colour: str, **more: Any) -> Trace:
-    x, y, z = _columns(points, scene)
-    i, j, k = faces.T.tolist()
-    return {
-        "type": "mesh3d",
-        "meta": group,
-        "name": name,
-        "x": x,
-        "y": y,
-        "z": z,
-        "i": i,
-        "j": j,
-        "k": k,
-        "color": colour,
-        "hoverinfo": "skip",
-        "showlegend": True,
-        **more,
-    }
+    corners = dict(zip("ijk", faces.T.tolist(), strict=True))
+    more = {**corners, "color": colour, "hoverinfo": "skip", "showlegend": True, **more}
+    return _trace("mesh3d", group, name, points, _decimals(scene), **more)
 
 
-def _columns(points: Array, scene: Scene) -> tuple[list[float | None], ...]:
-    """Coordinates as JSON has them, nan as None, with as many digits as can be seen."""
-    decimals = DIGITS - int(np.floor(np.log10(scene.extent)))
-    rounded = np.round(points, decimals) + 0.0
-    return tuple([None if value != value else value for value in column] for column in rounded.T.tolist())
+def _trace(kind: str, group: str, name: str, points: Array, decimals: int, **more: Any) -> Trace:
+    """A trace of points (n, 3), whose nan are None in JSON."""
+    rounded = (np.round(points, decimals) + 0.0).T.tolist()
+    columns = ([None if value != value else value for value in column] for column in rounded)
+    return {"type": kind, "meta": group, "name": name, **dict(zip("xyz", columns, strict=True)), **more}
+
+
+def _decimals(scene: Scene) -> int:
+    """As many digits as can be seen."""
+    return DIGITS - int(np.floor(np.log10(scene.extent)))
 
 
 def _fans(polygons: Sequence[Array]) -> tuple[Array, Array]:
@@ -267,16 +207,9 @@ def _sphere() -> tuple[Array, Array]:
     points = [np.roll([0.0, a, b * g], turn) for turn in range(3) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     corners = np.array(points) / np.sqrt(1.0 + g * g)
     apart = np.linalg.norm(corners[:, None] - corners[None], axis=2)
-    side = apart[apart > 0.0].min()
-    joined = np.isclose(apart, side)
-    faces = [
-        (a, b, c)
-        for a in range(12)
-        for b in range(a + 1, 12)
-        for c in range(b + 1, 12)
-        if joined[a, b] and joined[b, c] and joined[a, c]
-    ]
-    edges = {edge: 12 + i for i, edge in enumerate(sorted({e for a, b, c in faces for e in ((a, b), (a, c), (b, c))}))}
+    joined = np.isclose(apart, apart[apart > 0.0].min())
+    faces = [(a, b, c) for a, b, c in combinations(range(12), 3) if joined[a, b] and joined[b, c] and joined[a, c]]
+    edges = {edge: 12 + i for i, edge in enumerate(sorted({e for face in faces for e in combinations(face, 2)}))}
     middles = np.array([corners[a] + corners[b] for a, b in edges])
     cut = []
     for a, b, c in faces:
@@ -313,19 +246,22 @@ BUTTONS = (
 )
 #: A pressed button of plotly is nearly white on any page, so that all have dark words.
 BUTTON = {"bgcolor": "#C3CAD2", "bordercolor": "#8A929B", "font": {"size": 11, "color": "#14181D"}}
+MENU = {"type": "buttons", "direction": "right", "xanchor": "left", "yanchor": "top", **BUTTON}
+
+
+#: The legend lies below the scene.
+LEGEND = {
+    "orientation": "h", "x": 0.0, "y": 0.0, "yanchor": "bottom", "font": {"size": 11}, "itemsizing": "constant",
+    "entrywidth": 64, "entrywidthmode": "pixels", "bgcolor": "rgba(0,0,0,0)",
+}  # fmt: skip
 
 
 def layout_of(scene: Scene, traces: Sequence[Trace]) -> dict[str, Any]:
     """The layout."""
     ranges = [[float(low), float(high)] for low, high in zip(scene.low, scene.high, strict=True)]
+    fixed = {"autorange": False, "tickfont": {"size": 10}, "nticks": 5}
     axes = {
-        f"{name}axis": {
-            "range": limits,
-            "autorange": False,
-            "title": {"text": f"{name} (m)", "font": {"size": 11}},
-            "tickfont": {"size": 10},
-            "nticks": 5,
-        }
+        f"{name}axis": {"range": limits, "title": {"text": f"{name} (m)", "font": {"size": 11}}, **fixed}
         for name, limits in zip("xyz", ranges, strict=True)
     }
     return {
@@ -336,17 +272,7 @@ def layout_of(scene: Scene, traces: Sequence[Trace]) -> dict[str, Any]:
             "camera": camera(scene, first_view(scene)),
             "dragmode": "orbit",
         },
-        "legend": {
-            "orientation": "h",
-            "x": 0.0,
-            "y": 0.0,
-            "yanchor": "bottom",
-            "font": {"size": 11},
-            "itemsizing": "constant",
-            "entrywidth": 64,
-            "entrywidthmode": "pixels",
-            "bgcolor": "rgba(0,0,0,0)",
-        },
+        "legend": LEGEND,
         "margin": {"l": 6, "r": 6, "t": 6, "b": 6},
         "showlegend": True,
         "updatemenus": [*_shown(traces), _turned(scene)],
@@ -406,12 +332,8 @@ def _shown(traces: Sequence[Trace]) -> list[dict[str, Any]]:
         if not members:
             continue
         is_seen = traces[members[0]].get("visible", True)
-        button = {
-            "method": "restyle",
-            "label": label,
-            "args": [{"visible": True}, members],
-            "args2": [{"visible": False}, members],
-        }
+        show, hide = ([{"visible": visible}, members] for visible in (True, False))
+        button = {"method": "restyle", "label": label, "args": show, "args2": hide}
         menus.append(_menu([button], x, 1.0, 0 if is_seen else -1, is_marked=True))
         x += width
     return menus
@@ -423,32 +345,18 @@ def _turned(scene: Scene) -> dict[str, Any]:
     side = np.array([*(slant[:2] / np.linalg.norm(slant[:2])), 0.0])
     front = np.array([-side[1], side[0], 0.0])
     above = camera(scene, np.array([0.0, 0.0, 1.0]), [*(-side[:2]), 0.0])
-    views: tuple[tuple[str, dict[str, Any]], ...] = (
-        ("Slant", camera(scene, slant)),
-        ("Above", above),
-        ("Front", camera(scene, side)),
-        ("Side", camera(scene, front)),
-    )
+    views = {"Slant": camera(scene, slant), "Above": above, "Front": camera(scene, side), "Side": camera(scene, front)}
     near = near_sensors(scene)
     if near is not None:
-        views = (*views, ("Sensors", near))
-    buttons = [{"method": "relayout", "label": label, "args": [{"scene.camera": view}]} for label, view in views]
+        views["Sensors"] = near
+    buttons = [
+        {"method": "relayout", "label": label, "args": [{"scene.camera": view}]} for label, view in views.items()
+    ]
     return _menu(buttons, 0.0, 0.91, 0, is_marked=False)
 
 
 def _menu(buttons: list[dict[str, Any]], x: float, y: float, active: int, *, is_marked: bool) -> dict[str, Any]:
-    return {
-        "type": "buttons",
-        "direction": "right",
-        "buttons": buttons,
-        "x": x,
-        "y": y,
-        "xanchor": "left",
-        "yanchor": "top",
-        "active": active,
-        "showactive": is_marked,
-        **BUTTON,
-    }
+    return {**MENU, "buttons": buttons, "x": x, "y": y, "active": active, "showactive": is_marked}
 
 
 def _xyz(values: Sequence[float] | Array) -> dict[str, float]:

@@ -27,12 +27,14 @@ from gtsam_rwhec.report.scene_model import (
     PlacedBoard,
     Scene,
     carrier,
+    labels_of,
     lines_of,
     scene_of_carrier,
     scene_of_rig,
 )
 from gtsam_rwhec.report.scene_plotly import DARK, EARLY, LATE, MOST_NAMES, PAPER, first_view, layout_of, traces_of
 from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.scene_evidence import SceneEvidence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,8 +58,8 @@ def scene_section(shown: ShownResult) -> Section:
     if evidence is not None:
         scene = scene_of_rig(shown, evidence)
         lines = lines_of(shown, scene)
-        blocks += [_drawing("rig", "The rig", scene, lines, _about_rig(shown, scene)), *_list_of(lines)]
-        blocks += _facts(shown)
+        blocks += [_drawing("rig", "The rig", scene, lines, _about_rig(evidence, scene, lines)), *_list_of(lines)]
+        blocks += [*_facts(shown, evidence), *_turned_away(shown, evidence), *_heights(shown)]
         return Section("scene", TITLE, tuple(blocks))
     for kind in ("targets", "sensors"):
         if not shown.tree[kind]:
@@ -76,11 +78,8 @@ def _drawing(name: str, title: str, scene: Scene, lines: tuple[Line, ...], says:
     return Drawing(f"scene-{name}", title, says, traces, layout_of(scene, traces), still_of(scene, lines))
 
 
-def _about_rig(shown: ShownResult, scene: Scene) -> str:
+def _about_rig(evidence: SceneEvidence, scene: Scene, lines: tuple[Line, ...]) -> str:
     """What is drawn, and how."""
-    assert shown.evidence is not None
-    evidence = shown.evidence.scene
-    assert evidence is not None
     poses = f"its path in {evidence.of} poses"
     if evidence.of > len(evidence.poses):
         poses += f", of which {len(evidence.poses)} are drawn"
@@ -91,7 +90,7 @@ def _about_rig(shown: ShownResult, scene: Scene) -> str:
     without = [one for one in evidence.targets.values() if one.board is None]
     if without:
         says += "Squares stand for targets whose shape the result's inputs do not state. "
-    return says + _of_ellipsoids(scene, lines_of(shown, scene))
+    return says + _of_ellipsoids(scene, lines)
 
 
 def _of_ellipsoids(scene: Scene, lines: tuple[Line, ...]) -> str:
@@ -112,7 +111,7 @@ def _of_ellipsoids(scene: Scene, lines: tuple[Line, ...]) -> str:
         says.append("Dashed lines: directions that the measurements leave free.")
     if any(not line.is_free for line in lines):
         says.append("Solid purple lines: directions known far less well than the others.")
-    if len(scene.frames) > MANY:
+    if scene.has_many:
         says.append(f"Of more than {MANY} frames, targets are drawn without axes and ellipsoids.")
     if scene.out_of_sight:
         says.append(f"The origin of {', '.join(scene.out_of_sight)} is too far away to be in sight.")
@@ -125,68 +124,48 @@ def _list_of(lines: tuple[Line, ...]) -> list[Block]:
     return [Listing(tuple(said.values()))] if said else []
 
 
-def _facts(shown: ShownResult) -> list[Block]:
-    """Where sensors saw their targets, and where targets are, in numbers."""
-    assert shown.evidence is not None
-    evidence = shown.evidence.scene
-    assert evidence is not None
+def _facts(shown: ShownResult, evidence: SceneEvidence) -> Iterator[Block]:
+    """Where sensors saw their targets, in numbers."""
     rows: list[tuple[Words, ...]] = []
     for name, seen in evidence.sensors.items():
-        if seen.distance_m is None or seen.off_axis_deg is None or seen.off_axis_by_poses_deg is None:
-            continue
-        at = ("scene", "sensors", name)
-        rows.append(
-            (
-                name,
-                shown.evident(*at, "measurements", spec=".0f"),
-                *(shown.evident(*at, "distance_m", i, spec=".2f") for i in range(3)),
-                *(shown.evident(*at, "off_axis_deg", i, spec=".1f") for i in range(2)),
-                *(shown.evident(*at, "off_axis_by_poses_deg", i, spec=".1f") for i in range(2)),
-                shown.evident(*at, "behind", spec=".0f"),
+        if seen.distance_m is not None:
+            at = ("scene", "sensors", name)
+            rows.append(
+                (
+                    name,
+                    shown.evident(*at, "measurements", spec=".0f"),
+                    *shown.evidents(*at, "distance_m", spec=".2f"),
+                    *shown.evidents(*at, "off_axis_deg", spec=".1f"),
+                    *shown.evidents(*at, "off_axis_by_poses_deg", spec=".1f"),
+                    shown.evident(*at, "behind", spec=".0f"),
+                )
             )
-        )
-    table = Table(
-        "Where each sensor saw its targets",
-        (
-            "sensor",
-            "seen",
-            "nearest m",
-            "median m",
-            "farthest m",
-            "off axis, median°",
-            "largest°",
-            "by the poses, median°",
-            "largest°",
-            "behind",
-        ),
-        tuple(rows),
-        "Off axis: the angle between the sensor's z axis, which is a camera's optical axis, and the target's origin, "
-        "as measured, and as the calibrated poses have it. Behind: targets measured at z below 0.",
-    )
-    return [*([table] if rows else []), *_turned_away(shown), *_heights(shown)]
+    if rows:
+        yield Table(
+            "Where each sensor saw its targets",
+            ("sensor", "seen", "nearest m", "median m", "farthest m", "off axis, median°", "largest°",
+             "by the poses, median°", "largest°", "behind"),
+            tuple(rows),
+            "Off axis: the angle between the sensor's z axis, which is a camera's optical axis, and the target's "
+            "origin, as measured, and as the calibrated poses have it. Behind: targets measured at z below 0.",
+        )  # fmt: skip
 
 
-def _turned_away(shown: ShownResult) -> list[Block]:
+def _turned_away(shown: ShownResult, evidence: SceneEvidence) -> Iterator[Block]:
     """Sensors for which the poses have targets elsewhere than the measurements."""
-    assert shown.evidence is not None
-    evidence = shown.evidence.scene
-    assert evidence is not None
     said: list[Words] = []
     for name, seen in evidence.sensors.items():
         if seen.off_axis_deg is None or seen.off_axis_by_poses_deg is None:
             continue
-        at = ("scene", "sensors", name)
         if seen.off_axis_by_poses_deg[1] > seen.off_axis_deg[1] + OFF_DEG:
-            said.append(
-                (
-                    f"By the poses, targets that {name} saw are up to ",
-                    shown.evident(*at, "off_axis_by_poses_deg", 1, spec=".0f"),
-                    "° off its z axis; as measured, at most ",
-                    shown.evident(*at, "off_axis_deg", 1, spec=".0f"),
-                    "°.",
-                )
+            by_poses, measured = (
+                shown.evident("scene", "sensors", name, field, 1, spec=".0f")
+                for field in ("off_axis_by_poses_deg", "off_axis_deg")
             )
-    return [Listing(tuple(said))] if said else []
+            words = (f"By the poses, targets that {name} saw are up to ", by_poses)
+            said.append((*words, "° off its z axis; as measured, at most ", measured, "°."))
+    if said:
+        yield Listing(tuple(said))
 
 
 def _heights(shown: ShownResult) -> list[Block]:
@@ -199,15 +178,14 @@ def _heights(shown: ShownResult) -> list[Block]:
     found: list[tuple[Words, ...]] = []
     for i, row in enumerate(rows):
         name = row["child"]
-        cells: list[Words] = [name]
-        cells += [shown.number("targets", i, "translation_m", k, spec=".3f") for k in range(2)]
+        cells: list[Words] = [name, *shown.numbers("targets", i, "translation_m", spec=".3f")[:2]]
         cells.append(shown.number("targets", i, "translation_m", 2, times=1e3, spec=".1f"))
         seen = None if evidence is None else evidence.targets.get(name)
         if evidence is not None:
             at = ("scene", "targets", name)
             cells.append("-" if seen is None else shown.evident(*at, "tilt_deg", spec=".1f"))
             has_view = seen is not None and seen.oblique_deg is not None
-            cells += [shown.evident(*at, "oblique_deg", k, spec=".0f") if has_view else "-" for k in range(2)]
+            cells += shown.evidents(*at, "oblique_deg", spec=".0f") if has_view else ("-", "-")
             cells.append("not known" if seen is None or seen.board is None else seen.board.words)
         found.append(tuple(cells))
     more = () if evidence is None else ("tilt°", "seen from, median°", "largest°", "what it is")
@@ -255,22 +233,14 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
         polygons, colours, widths = zip(*((p @ P.T, colour, width) for p, colour, width in parts), strict=True)
         axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=GREY, linewidths=widths, zorder=1))
     for view in scene.views:
-        step = len(view.rim) // 4
-        rim = np.vstack([view.rim, view.rim[:1]])
-        edges = [rim, *(np.array([view.apex, corner]) for corner in view.rim[::step])]
-        axes.add_collection(LineCollection([edge @ P.T for edge in edges], colors=SKY, linewidths=0.9, zorder=2))
+        axes.add_collection(LineCollection([edge @ P.T for edge in view.edges], colors=SKY, linewidths=0.9, zorder=2))
     if len(scene.path):
         shades = LinearSegmentedColormap.from_list("path", [EARLY, LATE])
         x, y = P @ scene.path[:, :3].T
         axes.scatter(x, y, c=np.arange(len(scene.path)), cmap=shades, s=5, zorder=2)
     _ellipsoids(axes, scene, P)
-    lengths = scene.axes_m
     for k, colour in enumerate(AXIS_COLOURS):
-        strokes = [
-            np.array([f.T[:3, 3], f.T[:3, 3] + lengths[f.kind] * f.T[:3, k]]) @ P.T
-            for f in scene.frames
-            if not (len(scene.frames) > MANY and f.kind == "target")
-        ]
+        strokes = [stroke @ P.T for stroke in scene.axes(k)]
         axes.add_collection(LineCollection(strokes, colors=colour, linewidths=1.6, zorder=4))
     places = np.array([frame.T[:3, 3] for frame in scene.frames]) @ P.T
     axes.plot(*places.T, "o", color=INK, markersize=2.5, zorder=5)
@@ -278,7 +248,7 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
         first, *heads = (piece @ P.T for piece in line.pieces)
         axes.plot(*first.T, color=PURPLE, lw=1.6, ls="--" if line.is_free else "-", zorder=6)
         axes.add_collection(LineCollection(heads, colors=PURPLE, linewidths=1.4, zorder=6))
-    said = {line.label: line.pieces[0][1] @ P.T for line in reversed(lines) if line.label != line.frame}
+    said = {label: at @ P.T for label, at in labels_of(lines).items()}
     named = {f.name: at for f, at in zip(scene.frames, places, strict=True)} if len(scene.frames) <= MOST_NAMES else {}
     for words, colour in ((named, INK), (said, PURPLE)):
         for name, at in words.items():

@@ -96,7 +96,7 @@ class ShortReport:
         all_poses = min((_height_of_all(room, poses) for poses in self.poses), default=0)
         poses_need = min(POSE_LINES, all_poses)
         most = max(min(ADVICE_LINES, room.left - poses_need - 2), room.left - all_poses - MOST_POINTS - 2)
-        advice = _first(room, self.advice, most - 2)
+        advice = _first(room, [(f"  - {words}", style) for words, style in self.advice], most - 2)
         room.take(*(words for words, _ in advice), more=2 if advice else 0)
         heading, points = _point_lines(self.points, MOST_POINTS)
         if room.lines_of(heading, *points) + 1 > room.left - poses_need:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import getitem
 from typing import Any
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
@@ -79,10 +80,21 @@ class ShownResult:
         """The number at a place of the evidence's JSON."""
         return _number(self.evidence_tree, "evidence.json", path, times, spec, unit)
 
+    def numbers(self, *path: str | int, times: float = 1.0, spec: str = ".4g") -> tuple[Number, ...]:
+        """The numbers of a list in the result's JSON."""
+        return _numbers(self.tree, "result.json", path, times, spec)
+
+    def evidents(self, *path: str | int, times: float = 1.0, spec: str = ".4g") -> tuple[Number, ...]:
+        """The numbers of a list in the evidence's JSON."""
+        return _numbers(self.evidence_tree, "evidence.json", path, times, spec)
+
+
+def _numbers(tree: Any, file: str, path: tuple[str | int, ...], times: float, spec: str) -> tuple[Number, ...]:
+    values = reduce(getitem, path, tree)
+    return tuple(_number(tree, file, (*path, k), times, spec, "") for k in range(len(values)))
+
 
 def _number(tree: Any, file: str, path: tuple[str | int, ...], times: float, spec: str, unit: str) -> Number:
-    value = tree
-    for step in path:
-        value = value[step]
+    value = reduce(getitem, path, tree)
     pointer = "".join(f"/{str(step).replace('~', '~0').replace('/', '~1')}" for step in path)
     return Number(f"{file}#{pointer}", value, times, spec, unit)

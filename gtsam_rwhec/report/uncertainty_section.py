@@ -102,10 +102,10 @@ def _relative(shown: ShownResult) -> Iterator[Block]:
     rows = tuple(
         (
             pose["second"],
-            *(shown.evident("derived", "relative", i, "translation_m", k, spec="z.4f") for k in range(3)),
-            *(shown.evident("derived", "relative", i, "rpy_deg", k, spec="z.2f") for k in range(3)),
-            *(shown.evident("derived", "relative", i, "deviations_mm", k, spec=".2f") for k in range(3)),
-            *(shown.evident("derived", "relative", i, "deviations_deg", k, spec=".3f") for k in range(3)),
+            *shown.evidents("derived", "relative", i, "translation_m", spec="z.4f"),
+            *shown.evidents("derived", "relative", i, "rpy_deg", spec="z.2f"),
+            *shown.evidents("derived", "relative", i, "deviations_mm", spec=".2f"),
+            *shown.evidents("derived", "relative", i, "deviations_deg", spec=".3f"),
         )
         for i, pose in enumerate(relative)
     )
@@ -180,24 +180,16 @@ def _moved(
     if len(frames) > MOST_COLUMNS:
         return
     places = {(cause, frame): at for at, cause, frame in rows}
-    tables = tuple(
-        Table(
-            f"{title}, {unit}",
-            (of, *frames),
-            tuple(
-                (
-                    cause,
-                    *(
-                        significant(number(places[cause, frame], field), 2) if (cause, frame) in places else "-"
-                        for frame in frames
-                    ),
-                )
-                for cause in causes
-            ),
-        )
-        for field, unit in fields
-    )
-    yield Folded(f"{title}: every frame", tables)
+
+    def cell(cause: str, frame: str, field: str) -> Words:
+        at = places.get((cause, frame))
+        return "-" if at is None else significant(number(at, field), 2)
+
+    tables = []
+    for field, unit in fields:
+        each = tuple((cause, *(cell(cause, frame, field) for frame in frames)) for cause in causes)
+        tables.append(Table(f"{title}, {unit}", (of, *frames), each))
+    yield Folded(f"{title}: every frame", tuple(tables))
 
 
 def _size(number: Number) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Verdict, findings_of
 from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.report.advice import Advice
+from gtsam_rwhec.report.advice import advice_of
 from gtsam_rwhec.report.report_blocks import (
     TONES,
     Block,
@@ -73,9 +73,7 @@ def _todo(shown: ShownResult, cure: str) -> Iterator[str]:
         return
     if result.calibration is None and result.solution.is_relative:
         yield NO_NOISE_STATED
-    free = () if result.refined is None else result.refined.free_directions
-    free = free or result.solution.identifiability.free_directions
-    yield from Advice.of(free, result.log, shown.judgement).sentences
+    yield from (words for words, _ in advice_of(result.free_directions, result.log, shown.judgement))
 
 
 def _findings(shown: ShownResult) -> list[Finding]:
@@ -175,15 +173,10 @@ def _scalars(shown: ShownResult) -> Iterator[Block]:
     rows: list[tuple[Words, ...]] = []
     for i, scalar in enumerate(known):
         times, spec, unit = (1.0, ".6f", "") if scalar["kind"] == "scale" else (1e3, "+.3f", "ms")
-        deviation_spec = spec.removeprefix("+")
-        rows.append(
-            (
-                SCALARS[scalar["kind"]] + (f" of {scalar['owner']}" if scalar["owner"] else ""),
-                shown.evident("derived", "scalars", i, "value", times=times, spec=spec),
-                shown.evident("derived", "scalars", i, "deviation", times=times, spec=deviation_spec),
-                unit,
-            )
-        )
+        of = f" of {scalar['owner']}" if scalar["owner"] else ""
+        value = shown.evident("derived", "scalars", i, "value", times=times, spec=spec)
+        deviation = shown.evident("derived", "scalars", i, "deviation", times=times, spec=spec.removeprefix("+"))
+        rows.append((SCALARS[scalar["kind"]] + of, value, deviation, unit))
     if not known and shown.tree.get("scale_mode") != "known":
         scale = shown.tree.get("scale")
         names = list(scale) if isinstance(scale, dict) else []
@@ -201,7 +194,7 @@ def _table(shown: ShownResult, title: str, kind: str, side: str) -> Table:
     for i in sorted(range(len(rows)), key=lambda i: natural_key(rows[i]["child"])):
         name = rows[i]["child"]
         row: list[Words] = [f"{name} {MARK}" if rows[i].get("contradicted") else name]
-        row += [shown.number(side, i, "translation_m", k, spec="z.4f") for k in range(3)]
+        row += shown.numbers(side, i, "translation_m", spec="z.4f")
         row += [f"{angle:z.2f}" for angle in np.degrees(gtsam.Rot3(np.array(rows[i]["rotation_matrix"])).rpy())]
         cells.append((*row, *(deviation_cells(shown, name) if frames else ())))
     headings = (kind, *POSE_HEADINGS, *(DEVIATION_HEADINGS if frames else ()))
@@ -213,8 +206,8 @@ def deviation_cells(shown: ShownResult, name: str) -> list[Words]:
     if name not in known_unknowns(shown):
         return [FIXED] * 6
     at = ("refined", "frames", name)
-    along: list[Words] = [shown.number(*at, "standard_deviations_mm", k, spec=".2f") for k in range(3)]
-    return along + [shown.number(*at, "standard_deviations_deg", k, spec=".3f") for k in range(3)]
+    along, about = (f"standard_deviations_{unit}" for unit in ("mm", "deg"))
+    return [*shown.numbers(*at, along, spec=".2f"), *shown.numbers(*at, about, spec=".3f")]
 
 
 def known_unknowns(shown: ShownResult) -> frozenset[str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -122,18 +122,24 @@ def change_test(
     shares = [float(np.einsum("ij,jk,ik->", W, C, W)) / max(size, 1) for C in both]
     uncertain = sum(share**2 / freedom for share, freedom in zip(shares, degrees_of_freedom, strict=True))
     freedom = 1.0 / uncertain if uncertain > 0.0 else math.inf
-    moved = {name: _span(W @ Q[rows].T) for name, rows in groups.items()}
-    squares = {name: float(((U.T @ z) ** 2).sum()) for name, U in moved.items()}
     square = float(z @ z)
     joint = float(_tail(square, size, freedom))
-    alone = {name: float(_tail(squares[name], U.shape[1], freedom)) for name, U in moved.items()}
-    own = {
-        name: _own(difference[rows], covariances[0][rows, rows] + covariances[1][rows, rows], free[rows])
-        for name, rows in groups.items()
-    }
-    chances = {name: float(_tail(squared, dimension, freedom)) for name, (squared, dimension) in own.items()}
-    corrected = _holm({name: chance for name, chance in chances.items() if own[name][1]})
-    smallest = min(joint, _family(list(alone.values()), list(moved.values())))
+    moved = {name: _span(W @ Q[rows].T) for name, rows in groups.items()}
+    found = {}
+    for name, rows in groups.items():
+        own, dimension = _own(difference[rows], covariances[0][rows, rows] + covariances[1][rows, rows], free[rows])
+        along, directions = float(((moved[name].T @ z) ** 2).sum()), moved[name].shape[1]
+        found[name] = GroupChange(
+            dimension=dimension,
+            deviations=math.sqrt(own),
+            chance=float(_tail(own, dimension, freedom)),
+            corrected=1.0,
+            alone=float(_tail(along, directions, freedom)),
+            explains=bool(directions and float(_tail(square - along, size - directions, freedom)) >= level),
+        )
+    corrected = _holm({name: group.chance for name, group in found.items() if group.dimension})
+    alone = [found[name].alone for name, U in moved.items() if U.shape[1]]
+    smallest = min(joint, len(alone) * min(alone, default=1.0) / OF_GROUPS)
     return ChangeTest(
         level=level,
         dimension=size,
@@ -141,20 +147,7 @@ def change_test(
         degrees_of_freedom=freedom,
         joint_chance=joint,
         chance=_calibrated(smallest, size, freedom, [U for U in moved.values() if U.shape[1]]),
-        groups={
-            name: GroupChange(
-                dimension=own[name][1],
-                deviations=math.sqrt(own[name][0]),
-                chance=chances[name],
-                corrected=corrected.get(name, 1.0),
-                alone=alone[name],
-                explains=bool(
-                    moved[name].shape[1]
-                    and float(_tail(square - squares[name], size - moved[name].shape[1], freedom)) >= level
-                ),
-            )
-            for name in groups
-        },
+        groups={name: replace(group, corrected=corrected.get(name, 1.0)) for name, group in found.items()},
     )
 
 
@@ -166,12 +159,6 @@ def _tail(square: Array | float, dimension: int, freedom: float) -> Array:
     if math.isinf(freedom):
         return np.asarray(chdtrc(dimension, square))
     return np.asarray(fdtrc(dimension, freedom, square / dimension))
-
-
-def _family(chances: list[float], moved: list[Array]) -> float:
-    """The smallest chance of a group, times the number of groups, divided by their weight."""
-    compared = [chance for chance, U in zip(chances, moved, strict=True) if U.shape[1]]
-    return len(compared) * min(compared, default=1.0) / OF_GROUPS
 
 
 def _calibrated(smallest: float, size: int, freedom: float, moved: list[Array]) -> float:
@@ -198,12 +185,11 @@ def _calibrated(smallest: float, size: int, freedom: float, moved: list[Array]) 
     return min(bound, below / number) if below >= FEWEST_DRAWS else bound
 
 
-def _complement(free: Array) -> Array:
-    """A basis (m, r) of all directions that are orthogonal to the columns of ``free``."""
-    if not free.shape[1] or not free.any():
-        return np.eye(len(free))
+def _complement(free: Array, least: float | None = None) -> Array:
+    """A basis (m, r) of all directions that are orthogonal to ``free``, whose lengths up to ``least`` are none."""
     U, s, _ = np.linalg.svd(free, full_matrices=True)
-    rest: Array = U[:, int((s > ROUNDING * s.max()).sum()) :]
+    least = ROUNDING * s.max(initial=0.0) if least is None else least
+    rest: Array = U[:, int((s > least).sum()) :]
     return rest
 
 
@@ -233,8 +219,7 @@ def _span(columns: Array) -> Array:
 
 def _own(difference: Array, covariance: Array, free: Array) -> tuple[float, int]:
     """The squared joint deviation of one group, without the directions that are free, and the number of directions."""
-    U, s, _ = np.linalg.svd(free, full_matrices=True)
-    Q = U[:, int((s > SHARE).sum()) :]
+    Q = _complement(free, SHARE)
     W = _whitening(Q.T @ covariance @ Q)
     return float(((W @ (Q.T @ difference)) ** 2).sum()), len(W)
 

@@ -15,9 +15,10 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
-from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
+from gtsam_rwhec.results.common_quantities import Movement, Quantities, numbers_of, quantities
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.results.schema import CalibrationFields
+from gtsam_rwhec.solver.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -69,17 +70,20 @@ class Difference:
 
     def sentence(self, name: str) -> str:
         """How one frame or number changed, in words, without a full stop."""
-        deviations = "" if self.test is None or name not in self.test.groups else _deviations(self.test, name)
         if name in self.movements:
-            moved = self.movements[name]
-            verb = "moved" if self.test is None or name in self.test.changed else "differs by"
-            return f"{shown(name)} {verb} {moved}{deviations}"
+            return movement_words(name, self.movements[name], self.test)
         said = ", ".join(f"{shown(one.name)} from {one.old:.6g} to {one.new:.6g}" for one in self.numbers[name])
-        return f"{said}{deviations}"
+        return said + _deviations(name, self.test)
 
 
-def _deviations(test: ChangeTest, name: str) -> str:
-    return f": {test.groups[name].deviations:.1f} joint deviations"
+def movement_words(name: str, moved: Movement, test: ChangeTest | None) -> str:
+    """How a frame moved, in words, without a full stop."""
+    verb = "moved" if test is None or name in test.changed else "differs by"
+    return f"{shown(name)} {verb} {moved}{_deviations(name, test)}"
+
+
+def _deviations(name: str, test: ChangeTest | None) -> str:
+    return "" if test is None or name not in test.groups else f": {test.groups[name].deviations:.1f} joint deviations"
 
 
 def share_words(chance: float) -> str:
@@ -134,13 +138,7 @@ def difference(
     first, second = (as_result(each) for each in (old, new))
     check_same_rig(first, second)
     answers = [each.refined or each.solution for each in (first, second)]
-    sides = [(answer.X, answer.Y) for answer in answers]
-    movements = {
-        name: Movement.of(pose, sides[1][side][name])
-        for side in (1, 0)
-        for name, pose in sides[0][side].items()
-        if name in sides[1][side]
-    }
+    movements = movements_of(*answers)
     unknown = [name for name in frames if name not in movements]
     if unknown:
         raise FrameError(
@@ -164,7 +162,7 @@ def difference(
         why = "both rest on the same measurements, whose errors cancel in the difference; compare with another log"
         return Difference(movements, numbers, None, why, not_compared, tuple(remarks))
     if frames:
-        common = _only(common, frames)
+        common = common.only(lambda unknown: unknown.kind is UnknownKind.FRAME and unknown.owner in frames)
     if not common.slots:
         why = "nothing is left to compare: " + "; ".join(f"{shown(name)}: {why}" for name, why in not_compared.items())
         return Difference(movements, numbers, None, why, not_compared, tuple(remarks))
@@ -182,6 +180,12 @@ def difference(
     return Difference(movements, numbers, test, "", not_compared, tuple(remarks))
 
 
+def movements_of(old: Solution | RefinedPoses, new: Solution | RefinedPoses) -> dict[str, Movement]:
+    """How the frames moved that both have, sensors first."""
+    both = ((old.Y, new.Y), (old.X, new.X))
+    return {name: Movement.of(pose, now[name]) for poses, now in both for name, pose in poses.items() if name in now}
+
+
 def as_result(given: object) -> Result:
     """The given result, or a result made of a calibration. Raises OptionError for anything else."""
     if isinstance(given, Calibration):
@@ -197,38 +201,20 @@ def as_result(given: object) -> Result:
 
 
 def _numbers(old: RefinedPoses, new: RefinedPoses, common: Quantities) -> dict[str, tuple[NumberChange, ...]]:
-    found: dict[str, tuple[NumberChange, ...]] = {}
+    found = {}
     for unknown in common.slots:
         owner = unknown.owner
-        if unknown.kind is UnknownKind.TIME_OFFSET:
-            values = [old.time_offsets_s[owner], new.time_offsets_s[owner]]
-            found[str(unknown)] = (NumberChange(f"time offset of {owner} (s)", *values),)
-        elif unknown.kind is UnknownKind.SCALE:
-            scales = [each.scale[owner] if isinstance(each.scale, dict) else each.scale for each in (old, new)]
-            found[str(unknown)] = (NumberChange(f"scale of {owner}" if owner else "scale", *scales),)
-        elif unknown.kind is UnknownKind.INTRINSICS:
-            first, second = old.intrinsics[owner], new.intrinsics[owner]
-            found[str(unknown)] = tuple(
-                NumberChange(f"{name} of {owner}", *pair)
-                for name, *pair in zip(first.names, first.values, second.values, strict=True)
-            )
+        if unknown.kind is UnknownKind.FRAME:
+            continue
+        if unknown.kind is UnknownKind.INTRINSICS:
+            names = [f"{name} of {owner}" for name in old.intrinsics[owner].names]
+        elif unknown.kind is UnknownKind.TIME_OFFSET:
+            names = [f"time offset of {owner} (s)"]
+        else:
+            names = [f"scale of {owner}" if owner else "scale"]
+        values = (numbers_of(each, unknown).tolist() for each in (old, new))
+        found[str(unknown)] = tuple(map(NumberChange, names, *values))
     return found
-
-
-def _only(common: Quantities, frames: Collection[str]) -> Quantities:
-    """The quantities of some frames; all others are unknown again."""
-    slots: dict[Unknown, slice] = {}
-    rows: list[int] = []
-    for unknown, place in common.slots.items():
-        if unknown.kind is UnknownKind.FRAME and unknown.owner in frames:
-            slots[unknown] = slice(len(rows), len(rows) + 6)
-            rows += range(place.start, place.stop)
-    first, second = common.covariances
-    at = np.ix_(rows, rows)
-    return Quantities(
-        common.difference[rows], (first[at], second[at]), common.free[rows], slots,
-        {unknown: why for unknown, why in common.not_compared.items() if unknown.owner in frames},
-    )  # fmt: skip
 
 
 #: Two numbers that differ by less than this share are the same number, computed twice.

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from rwhec_factors.se3 import right_jacobian_inverse
 
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.joint_covariance import SHARE, JointCovariance
-from gtsam_rwhec.fitting.reprojection_record import Intrinsics
+from gtsam_rwhec.fitting.joint_covariance import SHARE
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.geometry.poses import Array
@@ -59,73 +59,59 @@ class Quantities:
         """The rows of each group of quantities by its name."""
         return {str(unknown): rows for unknown, rows in self.slots.items()}
 
-
-class Answer(Protocol):
-    """Poses and numbers with their joint covariance: ``Refined``, or what a new log says near an old answer."""
-
-    @property
-    def X(self) -> Mapping[str, gtsam.Pose3]:
-        """T_targetcarrier_target."""
-
-    @property
-    def Y(self) -> Mapping[str, gtsam.Pose3]:
-        """T_sensorcarrier_sensor."""
-
-    @property
-    def scale(self) -> float | Mapping[str, float]:
-        """Measured length / true length."""
-
-    @property
-    def time_offsets_s(self) -> Mapping[str, float]:
-        """By sensor."""
-
-    @property
-    def intrinsics(self) -> Mapping[str, Intrinsics]:
-        """By sensor, where they were estimated."""
-
-    @property
-    def joint(self) -> JointCovariance:
-        """Of all unknowns."""
+    def only(self, wanted: Callable[[Unknown], bool]) -> Quantities:
+        """Those that are wanted; all others are unknown again."""
+        kept = {unknown: rows for unknown, rows in self.slots.items() if wanted(unknown)}
+        places = [np.arange(rows.start, rows.stop) for rows in kept.values()]
+        rows = np.concatenate([np.zeros(0, int), *places])
+        first, second = (covariance[np.ix_(rows, rows)] for covariance in self.covariances)
+        not_compared = {unknown: why for unknown, why in self.not_compared.items() if wanted(unknown)}
+        slots = _in_a_row({unknown: len(place) for unknown, place in zip(kept, places, strict=True)})
+        return Quantities(self.difference[rows], (first, second), self.free[rows], slots, not_compared)
 
 
-def quantities(old: Answer, new: Answer, without: Collection[UnknownKind] = ()) -> Quantities:
+def _in_a_row(sizes: Mapping[Unknown, int]) -> dict[Unknown, slice]:
+    """The rows of unknowns of these sizes, one after the other."""
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    return {unknown: slice(*rows) for unknown, rows in zip(sizes, pairwise(ends), strict=True)}
+
+
+def quantities(old: RefinedPoses, new: RefinedPoses, without: Collection[UnknownKind] = ()) -> Quantities:
     """The frames, scales, time offsets and intrinsics that both have; kinds in ``without`` are left out."""
-    unknowns = [unknown for unknown in _common(old, new) if unknown.kind not in without]
     not_compared = {}
-    rows: list[tuple[Unknown, Array, tuple[Array, Array], tuple[Array, Array], Array]] = []
-    for unknown in unknowns:
-        G = _selector(old, unknown), _selector(new, unknown)
-        why = _why_not(old, new, unknown, G)
-        if why:
+    differences: dict[Unknown, Array] = {}
+    units: list[Array] = []
+    by_errors: tuple[list[Array], list[Array]] = (
+        [],
+        [],
+    )  # derivatives of the differences by all that each leaves unknown
+    for unknown in _common(old, new):
+        if unknown.kind in without:
+            continue
+        G = [_selector(each, unknown) for each in (old, new)]
+        unit = _unit(old, new, unknown)
+        if why := _why_not(old, new, unknown, G, unit):
             not_compared[unknown] = why
             continue
-        difference, J = _difference(old, new, unknown)
-        # Jacobians of Log(old^-1 new) by both right perturbations.
-        rows.append((unknown, difference, (J[0] @ G[0], J[1] @ G[1]), G, _unit(old, new, unknown)))
-    slots, first = {}, 0
-    for unknown, difference, *_ in rows:
-        slots[unknown] = slice(first, first + len(difference))
-        first += len(difference)
-    if not rows:
+        differences[unknown], J = _difference(old, new, unknown)
+        units.append(unit)
+        for side in (0, 1):
+            by_errors[side].append(J[side] @ G[side] / unit[:, None])
+    slots = _in_a_row({unknown: len(difference) for unknown, difference in differences.items()})
+    if not slots:
         empty = np.zeros((0, 0))
         return Quantities(np.zeros(0), (empty, empty), empty, {}, not_compared)
-    unit = np.concatenate([row[4] for row in rows])
-    covariances, free = [], []
-    for side, refined in enumerate((old, new)):
-        joint = refined.joint
-        G = np.concatenate([row[2][side] for row in rows]) / unit[:, None]
-        covariances.append(G @ joint.finite @ G.T)
-        free.append(joint.reach(G))
+    first, second = (np.concatenate(each) for each in by_errors)
     return Quantities(
-        np.concatenate([row[1] for row in rows]) / unit,
-        (covariances[0], covariances[1]),
-        np.hstack(free),
+        np.concatenate(list(differences.values())) / np.concatenate(units),
+        (first @ old.joint.finite @ first.T, second @ new.joint.finite @ second.T),
+        np.hstack([old.joint.reach(first), new.joint.reach(second)]),
         slots,
         not_compared,
     )
 
 
-def _common(old: Answer, new: Answer) -> Iterator[Unknown]:
+def _common(old: RefinedPoses, new: RefinedPoses) -> Iterator[Unknown]:
     """Frames that both have, and unknowns of other kinds that both estimated."""
     for poses, others in ((old.X, new.X), (old.Y, new.Y)):
         yield from (Unknown(UnknownKind.FRAME, name) for name in poses if name in others)
@@ -141,27 +127,21 @@ def _common(old: Answer, new: Answer) -> Iterator[Unknown]:
         yield unknown
 
 
-def _selector(refined: Answer, unknown: Unknown) -> Array:
+def _selector(refined: RefinedPoses, unknown: Unknown) -> Array:
     """The matrix (m, d) of an unknown's rows; zero for a frame that is known exactly."""
     if unknown in refined.joint.slots:
         return refined.joint.selector((unknown,))
     return np.zeros((6, len(refined.joint.unit)))
 
 
-def _why_not(old: Answer, new: Answer, unknown: Unknown, G: tuple[Array, Array]) -> str:
+def _why_not(old: RefinedPoses, new: RefinedPoses, unknown: Unknown, G: list[Array], unit: Array) -> str:
     """Why a quantity cannot be compared; empty where it can."""
     if not G[0].any() and not G[1].any():
         return "its pose was given as known, in both"
-    reached = [
-        refined.joint.reach(rows) / _unit(old, new, unknown)[:, None]
-        for refined, rows in zip((old, new), G, strict=True)
-    ]
-    which = [name for name, reach in zip(("OLD", "NEW"), reached, strict=True) if _is_free(reach, unknown)]
-    return (
-        f"the measurements of {' and of '.join(which)} leave its rotation free"
-        if which and unknown.kind is UnknownKind.FRAME
-        else (f"the measurements of {' and of '.join(which)} leave it free" if which else "")
-    )
+    sides = zip(("OLD", "NEW"), (old, new), G, strict=True)
+    free = [name for name, each, rows in sides if _is_free(each.joint.reach(rows) / unit[:, None], unknown)]
+    what = "its rotation" if unknown.kind is UnknownKind.FRAME else "it"
+    return f"the measurements of {' and of '.join(free)} leave {what} free" if free else ""
 
 
 def _is_free(reach: Array, unknown: Unknown) -> bool:
@@ -170,18 +150,19 @@ def _is_free(reach: Array, unknown: Unknown) -> bool:
     return bool(reach.shape[1]) and float(np.linalg.norm(rows, axis=1).max()) > SHARE
 
 
-def _difference(old: Answer, new: Answer, unknown: Unknown) -> tuple[Array, tuple[Array, Array]]:
+def _difference(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> tuple[Array, tuple[Array, Array]]:
     """New less old, and its derivatives by the errors of both, old first."""
     if unknown.kind is UnknownKind.FRAME:
         first, second = ((each.Y if unknown.owner in each.Y else each.X)[unknown.owner] for each in (old, new))
         xi = error_of(first, second)
         return xi, (-right_jacobian_inverse(-xi[None])[0], right_jacobian_inverse(xi[None])[0])
-    values = [_values(refined, unknown) for refined in (old, new)]
+    values = [numbers_of(refined, unknown) for refined in (old, new)]
     one = np.eye(len(values[0]))
     return values[1] - values[0], (-one, one)
 
 
-def _values(refined: Answer, unknown: Unknown) -> Array:
+def numbers_of(refined: RefinedPoses, unknown: Unknown) -> Array:
+    """The numbers of a camera, a time offset or a scale."""
     if unknown.kind is UnknownKind.INTRINSICS:
         return np.array(refined.intrinsics[unknown.owner].values)
     if unknown.kind is UnknownKind.TIME_OFFSET:
@@ -190,7 +171,7 @@ def _values(refined: Answer, unknown: Unknown) -> Array:
     return np.array([scale[unknown.owner] if isinstance(scale, Mapping) else scale])
 
 
-def _unit(old: Answer, new: Answer, unknown: Unknown) -> Array:
+def _unit(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> Array:
     """The unit of each row, from the first of both that has the unknown."""
     joint = old.joint if unknown in old.joint.slots else new.joint
     found: Array = joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)

@@ -10,10 +10,9 @@ import heapq
 from collections.abc import Iterator
 
 import numpy as np
-from pydantic import Field
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
+from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row
 from gtsam_rwhec.results.linear_model import OWN, LinearModel, inverse_of
 
 #: If there are more images than this, neighbours are chosen together.
@@ -28,39 +27,39 @@ AT_ONCE = 512
 LISTED = 10
 
 
-class ImageContribution(EvidenceRecord):
+class ImageContribution(FileRecord):
     """The contribution of one image."""
 
-    sensor: str = Field(description="the sensor's name")
-    targets: tuple[str, ...] = Field(description="what it saw")
-    time: float = Field(description="seconds since the first measurement, or the place of the measurement in its pair")
-    stamp_ns: int | None = Field(description="its stamp")
-    share: float = Field(description="of all that was learnt: the trace of its part of the hat matrix over unknowns")
-    moved: float = Field(description="without it the pose that moves most moves so many of its standard deviations")
-    moved_frame: str = Field(description="which pose that is")
-    moved_mm: float = Field(description="how far that pose's origin moves, millimetres")
-    growth: float = Field(description="without it the standard deviation that grows most grows by this share")
+    sensor: str
+    targets: tuple[str, ...]  #: What it saw
+    time: float  #: Seconds since the first measurement, or the place of the measurement in its pair
+    stamp_ns: int | None  #: Its stamp
+    share: float  #: Of all that was learnt: the trace of its part of the hat matrix over unknowns
+    moved: float  #: Without it the pose that moves most moves so many of its standard deviations
+    moved_frame: str  #: Which pose that is
+    moved_mm: float  #: How far that pose's origin moves, millimetres
+    growth: float  #: Without it the standard deviation that grows most grows by this share
 
 
-class Fewer(EvidenceRecord):
+class Fewer(FileRecord):
     """How many images have nearly as much information as all."""
 
-    growth: float = Field(description="no standard deviation is larger by more than this share")
-    bundles: int = Field(description="so many bundles of images are enough, if they are chosen well", ge=0)
+    growth: float  #: No standard deviation is larger by more than this share
+    bundles: Count  #: So many bundles of images are enough, if they are chosen well
 
 
-class ContributionEvidence(EvidenceRecord):
+class ContributionEvidence(FileRecord):
     """How much each image contributed."""
 
-    has_stamps: bool = Field(description="whether an image is known by its stamp; else each measurement is one")
-    images: int = Field(description="in the answer", ge=0)
-    bundle: int = Field(description="images are chosen in bundles of so many neighbours", ge=1)
-    bundles: int = Field(description="bundles among which the choice was", ge=0)
-    important: tuple[ImageContribution, ...] = Field(description="those that tell most, the first most of all")
-    influential: tuple[ImageContribution, ...] = Field(description="those without which the answer moves most")
-    shares: Row = Field(description="of all images, the largest first")
-    fewer: tuple[Fewer, ...] = Field(description="how many images are enough")
-    curve: Row = Field(description="the largest growth of a standard deviation with the first 1, 2, ... chosen bundles")
+    has_stamps: bool  #: Whether an image is known by its stamp; else each measurement is one
+    images: Count  #: In the answer
+    bundle: PositiveCount  #: Images are chosen in bundles of so many neighbours
+    bundles: Count  #: Bundles among which the choice was
+    important: tuple[ImageContribution, ...]  #: Those that tell most, the first most of all
+    influential: tuple[ImageContribution, ...]  #: Those without which the answer moves most
+    shares: Row  #: Of all images, the largest first
+    fewer: tuple[Fewer, ...]  #: How many images are enough
+    curve: Row  #: The largest growth of a standard deviation with the first 1, 2, ... chosen bundles
 
 
 def contribution_of(model: LinearModel) -> ContributionEvidence | None:
@@ -99,7 +98,8 @@ def _images(model: LinearModel, which: np.ndarray) -> list[np.ndarray]:
     """The measurements of each image."""
     if model.stamps_ns is None:
         return [np.array([i]) for i in which]
-    keys = np.column_stack([model.sensor[which], model.stamps_ns[which] - model.stamps_ns.min()])
+    sensor = np.sum([i * mine for i, mine in enumerate(model.by_sensor.values())], axis=0)
+    keys = np.column_stack([sensor[which], model.stamps_ns[which] - model.stamps_ns.min()])
     _, image = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(image.ravel(), kind="stable")
     return np.split(which[order], np.flatnonzero(np.diff(image.ravel()[order])) + 1)

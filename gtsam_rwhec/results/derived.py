@@ -8,86 +8,85 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from pydantic import Field
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Positive, Triple, triple
 
-Triple = tuple[float, float, float]
 Deviations = tuple[float | None, float | None, float | None]
 #: Metres from a sensor at which points are tested, beside the distance at which it saw its targets.
 DISTANCES_M = (0.5, 1.0, 2.0)
 
 
-class FrameAngles(EvidenceRecord):
+class FrameAngles(FileRecord):
     """The rotation of a frame on its carrier as angles."""
 
-    frame: str = Field(description="sensor or target")
-    rpy_deg: Triple = Field(description="roll, pitch, yaw, degrees: R = Rz(yaw) Ry(pitch) Rx(roll)")
+    frame: str  #: Sensor or target
+    rpy_deg: Triple  #: Roll, pitch, yaw, degrees: R = Rz(yaw) Ry(pitch) Rx(roll)
 
 
-class Scalar(EvidenceRecord):
+class Scalar(FileRecord):
     """A scale or a clock offset that was estimated."""
 
     kind: Literal["scale", "time_offset"]
-    owner: str = Field(description="target or sensor; empty for a scale that all share")
-    value: float = Field(description="measured / true length; or seconds: a stamp + this = the carriers' time")
-    deviation: float | None = Field(description="one standard deviation; null: infinite")
+    owner: str  #: Target or sensor; empty for a scale that all share
+    value: float  #: Measured / true length; or seconds: a stamp + this = the carriers' time
+    deviation: float | None  #: One standard deviation; null: infinite
 
 
-class PointAt(EvidenceRecord):
+class PointAt(FileRecord):
     """How far off a point is that a sensor sees at a distance, in the direction in which it saw its targets."""
 
     sensor: str
-    seen_from: str = Field(description="the frame in which the point is expressed")
-    distance_m: float = Field(description="from the sensor", gt=0.0)
-    is_seen: bool = Field(description="whether this is the typical distance of its targets")
-    radius_mm: float | None = Field(description="the true point is within it; null: a free direction moves the point")
+    seen_from: str  #: The frame in which the point is expressed
+    distance_m: Positive  #: From the sensor
+    is_seen: bool  #: Whether this is the typical distance of its targets
+    radius_mm: float | None  #: The true point is within it; null: a free direction moves the point
 
 
-class RelativePose(EvidenceRecord):
+class RelativePose(FileRecord):
     """The pose of a sensor in another sensor's frame, which is often known far better than each on its carrier."""
 
     first: str
     second: str
-    translation_m: Triple = Field(description="of T_first_second")
-    rpy_deg: Triple = Field(description="roll, pitch, yaw, degrees")
-    deviations_mm: Deviations = Field(description="along the second's axes; null: infinite")
-    deviations_deg: Deviations = Field(description="about the second's axes; null: infinite")
+    translation_m: Triple  #: Of T_first_second
+    rpy_deg: Triple  #: Roll, pitch, yaw, degrees
+    deviations_mm: Deviations  #: Along the second's axes; null: infinite
+    deviations_deg: Deviations  #: About the second's axes; null: infinite
 
 
-class ClockEffect(EvidenceRecord):
+class ClockEffect(FileRecord):
     """What an error of a clock offset that was estimated would do to a frame: E[pose | offset] - E[pose]."""
 
-    sensor: str = Field(description="whose clock")
-    frame: str = Field(description="whose pose moves")
-    rotation_deg: float = Field(description="of one millisecond", ge=0.0)
-    translation_mm: float = Field(description="of one millisecond", ge=0.0)
+    sensor: str  #: Whose clock
+    frame: str  #: Whose pose moves
+    rotation_deg: NotNegative  #: Of one millisecond
+    translation_mm: NotNegative  #: Of one millisecond
 
 
-class Derived(EvidenceRecord):
+class Derived(FileRecord):
     """What follows from poses and covariances."""
 
-    angles: tuple[FrameAngles, ...] = Field(description="of every sensor and target")
-    scalars: tuple[Scalar, ...] = Field(default=(), description="scales and clock offsets that were estimated")
-    level: float = Field(default=0.95, description="probability of the points' radii")
-    points: tuple[PointAt, ...] = Field(default=(), description="at several distances, by sensor")
-    relative: tuple[RelativePose, ...] = Field(default=(), description="of sensors in the first sensor's frame")
-    clocks: tuple[ClockEffect, ...] = Field(default=(), description="of every estimated offset on every frame")
+    angles: tuple[FrameAngles, ...]  #: Of every sensor and target
+    scalars: tuple[Scalar, ...] = ()  #: Scales and clock offsets that were estimated
+    level: float = 0.95  #: Probability of the points' radii
+    points: tuple[PointAt, ...] = ()  #: At several distances, by sensor
+    relative: tuple[RelativePose, ...] = ()  #: Of sensors in the first sensor's frame
+    clocks: tuple[ClockEffect, ...] = ()  #: Of every estimated offset on every frame
 
 
 def derived_of(calibration: Calibration) -> Derived:
     """What follows from a calibration's poses and covariances."""
-    angles, refined = tuple(_angles(calibration.Y | calibration.X)), calibration.refined
+    poses, refined = calibration.Y | calibration.X, calibration.refined
+    angles = tuple(FrameAngles(frame=name, rpy_deg=_rpy_deg(poses[name])) for name in sorted(poses, key=natural_key))
     if refined is None:
         return Derived(angles=angles)
     return Derived(
         angles=angles,
-        scalars=tuple(_scalars(refined)),
+        scalars=tuple(scalars_of(refined)),
         level=calibration.options.level,
         points=tuple(_points(calibration)),
         relative=tuple(_relative(refined)),
@@ -95,7 +94,7 @@ def derived_of(calibration: Calibration) -> Derived:
     )
 
 
-def _scalars(refined: RefinedPoses) -> Iterator[Scalar]:
+def scalars_of(refined: RefinedPoses) -> Iterator[Scalar]:
     """Scales and clock offsets with their deviations."""
     for unknown in refined.unknowns:
         deviation = _finite(math.sqrt(refined.covariance(unknown)[0, 0]))
@@ -135,8 +134,8 @@ def _relative(refined: RefinedPoses) -> Iterator[RelativePose]:
         yield RelativePose(
             first=first,
             second=second,
-            translation_m=_triple(pose.translation()),
-            rpy_deg=_triple(np.degrees(pose.rotation().rpy())),
+            translation_m=triple(pose.translation()),
+            rpy_deg=_rpy_deg(pose),
             deviations_mm=_deviations(millimetres),
             deviations_deg=_deviations(degrees),
         )
@@ -161,14 +160,8 @@ def clock_effects(refined: RefinedPoses) -> Iterator[ClockEffect]:
             )
 
 
-def _angles(poses: Mapping[str, gtsam.Pose3]) -> Iterator[FrameAngles]:
-    for name in sorted(poses, key=natural_key):
-        yield FrameAngles(frame=name, rpy_deg=_triple(np.degrees(poses[name].rotation().rpy())))
-
-
-def _triple(values: np.ndarray) -> Triple:
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
+def _rpy_deg(pose: gtsam.Pose3) -> Triple:
+    return triple(np.degrees(pose.rotation().rpy()))
 
 
 def _deviations(values: np.ndarray) -> Deviations:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict
 
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.fitting.pair_data import local_paths
@@ -16,7 +15,7 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount
 from gtsam_rwhec.results.image_errors import (
     SeenCamera,
     SeenView,
@@ -37,55 +36,53 @@ MOST_ROWS = 24
 MOST_LISTED = 200
 
 
-class SeenTrack(EvidenceRecord):
+class SeenTrack(FileRecord):
     """Measurements of a pair, or of all targets by a sensor, over time."""
 
-    sensor: str = Field(description="the sensor's name")
-    target: str | None = Field(description="the target's name; null: all targets together")
-    used: int = Field(description="measurements in the answer", ge=0)
-    removed: int = Field(description="measurements that are not", ge=0)
-    used_at: tuple[tuple[int, int], ...] = Field(
-        description="pieces of time with measurements in the answer, and how many"
-    )
-    removed_at: dict[str, tuple[tuple[int, int], ...]] = Field(description="the same of removed measurements, by stage")
+    sensor: str
+    target: str | None  #: The target's name; null: all targets together
+    used: Count  #: Measurements in the answer
+    removed: Count  #: Measurements that are not
+    used_at: tuple[tuple[int, int], ...]  #: Pieces of time with measurements in the answer, and how many
+    removed_at: dict[str, tuple[tuple[int, int], ...]]  #: The same of removed measurements, by stage
 
 
-class RemovedCount(EvidenceRecord):
+class RemovedCount(FileRecord):
     """How many measurements of a pair were removed for a reason."""
 
-    target: str = Field(description="the target's name")
-    sensor: str = Field(description="the sensor's name")
-    stage: str = Field(description="which stage removed them")
-    reason: str = Field(description="why")
-    count: int = Field(description="how many", gt=0)
+    target: str
+    sensor: str
+    stage: str  #: Which stage removed them
+    reason: str  #: Why
+    count: PositiveCount  #: How many
 
 
-class RemovedMeasurement(EvidenceRecord):
+class RemovedMeasurement(FileRecord):
     """A measurement that was removed."""
 
-    target: str = Field(description="the target's name")
-    sensor: str = Field(description="the sensor's name")
-    reason: str = Field(description="why")
-    image: str = Field(description="name of the image's file; else its stamp in nanoseconds, or its place in the pair")
-    time_s: float | None = Field(description="since the first measurement; null without stamps")
+    target: str
+    sensor: str
+    reason: str  #: Why
+    image: str  #: Name of the image's file; else its stamp in nanoseconds, or its place in the pair
+    time_s: float | None  #: Since the first measurement; null without stamps
 
 
-class SeenEvidence(EvidenceRecord):
+class SeenEvidence(FileRecord):
     """What was seen."""
 
     model_config = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 
-    span_s: float | None = Field(description="from the first measurement to the last; null: no stamps")
-    pieces: int = Field(description="pieces that the time, or without stamps the order, is divided into", gt=0)
-    tracks: tuple[SeenTrack, ...] = Field(description="a row each of the figure over time")
-    used: int = Field(description="measurements in the answer", ge=0)
-    removed: int = Field(description="measurements that are not", ge=0)
-    removed_counts: tuple[RemovedCount, ...] = Field(description="all that was removed, by pair, stage and reason")
-    removed_list: tuple[RemovedMeasurement, ...] = Field(description="the first that were removed")
-    cameras: tuple[SeenCamera, ...] = Field(default=(), description="cameras with corners")
-    worst: tuple[WorstImage, ...] = Field(default=(), description="images whose corners are farthest off, worst first")
-    sheet: bytes | None = Field(default=None, description="contact sheet, JPEG, base64")
-    no_pictures: str = Field(default="", description="why there are no images; empty where there are some")
+    span_s: float | None  #: From the first measurement to the last; null: no stamps
+    pieces: PositiveCount  #: Pieces that the time, or without stamps the order, is divided into
+    tracks: tuple[SeenTrack, ...]  #: A row each of the figure over time
+    used: Count  #: Measurements in the answer
+    removed: Count  #: Measurements that are not
+    removed_counts: tuple[RemovedCount, ...]  #: All that was removed, by pair, stage and reason
+    removed_list: tuple[RemovedMeasurement, ...]  #: The first that were removed
+    cameras: tuple[SeenCamera, ...] = ()  #: Cameras with corners
+    worst: tuple[WorstImage, ...] = ()  #: Images whose corners are farthest off, worst first
+    sheet: bytes | None = None  #: Contact sheet, JPEG, base64
+    no_pictures: str = ""  #: Why there are no images; empty where there are some
 
 
 class Marked(Protocol):
@@ -98,16 +95,6 @@ class Marked(Protocol):
     @property
     def reasons(self) -> tuple[str, ...]:
         """The reason of each measurement."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """A row of the figure: where its measurements are in time, and the stage that removed each (empty: it is used)."""
-
-    sensor: str
-    target: str | None
-    piece: np.ndarray
-    stage: np.ndarray
 
 
 def span_of(pairs: Iterable[Marked]) -> tuple[int, float | None]:
@@ -123,47 +110,44 @@ def span_of(pairs: Iterable[Marked]) -> tuple[int, float | None]:
 def tracks_of(pairs: Mapping[Pair, Marked], stage_of: Callable[[str], str]) -> tuple[SeenTrack, ...]:
     """A row for each pair, sensor by sensor; with many pairs one for each sensor, those with the most removed first."""
     first, span = span_of(pairs.values())
-    rows = [_row(pair, measured, first, span, stage_of) for pair, measured in pairs.items()]
-    rows.sort(key=lambda row: row.sensor)
-    if len(rows) > MOST_ROWS:
-        of_sensor: dict[str, list[_Row]] = defaultdict(list)
-        for row in rows:
-            of_sensor[row.sensor].append(row)
-        rows = [
-            _Row(sensor, None, np.concatenate([r.piece for r in of]), np.concatenate([r.stage for r in of]))
-            for sensor, of in of_sensor.items()
-        ]
-        rows.sort(key=lambda row: -int((row.stage != "").sum()))
-    return tuple(_track(row) for row in rows[:MOST_ROWS])
+    are_many = len(pairs) > MOST_ROWS
+    counts: dict[tuple[str, str | None], Counter[tuple[str, int]]] = defaultdict(Counter)
+    for pair, measured in sorted(pairs.items(), key=lambda item: item[0].sensor):
+        stages = {reason: stage_of(reason) if reason else "" for reason in set(measured.reasons)}
+        places = zip(measured.reasons, _pieces(measured, first, span), strict=True)
+        counts[pair.sensor, None if are_many else pair.target].update((stages[why], piece) for why, piece in places)
+    tracks = [_track(sensor, target, count) for (sensor, target), count in counts.items()]
+    if are_many:
+        tracks.sort(key=lambda track: -track.removed)
+    return tuple(tracks[:MOST_ROWS])
 
 
-def _row(pair: Pair, measured: Marked, first: int, span: float | None, stage_of: Callable[[str], str]) -> _Row:
-    number = len(measured.reasons)
+def _pieces(measured: Marked, first: int, span: float | None) -> list[int]:
+    """The piece of time of each measurement."""
     if span is None or measured.stamps_ns is None:
-        share = np.arange(number) / max(number, 1)
+        share = np.arange(len(measured.reasons)) / max(len(measured.reasons), 1)
     else:
         share = 1e-9 * (measured.stamps_ns - first) / (span or 1.0)
-    stages = {reason: stage_of(reason) if reason else "" for reason in set(measured.reasons)}
-    stage = np.array([stages[reason] for reason in measured.reasons], dtype="U20")
-    return _Row(pair.sensor, pair.target, np.minimum((PIECES * share).astype(int), PIECES - 1), stage)
+    pieces: list[int] = np.minimum((PIECES * share).astype(int), PIECES - 1).tolist()
+    return pieces
 
 
-def _track(row: _Row) -> SeenTrack:
-    is_used = row.stage == ""
-    stages = np.unique(row.stage[~is_used]).tolist()
+def _track(sensor: str, target: str | None, count: Counter[tuple[str, int]]) -> SeenTrack:
+    """A row of the figure, of how many measurements each stage removed in each piece; no stage: they are used."""
+    at: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for (stage, piece), number in sorted(count.items()):
+        at[stage].append((piece, number))
+    used_at = at.pop("", [])
+    used = sum(number for _, number in used_at)
+    removed_at = {stage: tuple(pieces) for stage, pieces in at.items()}
     return SeenTrack(
-        sensor=row.sensor,
-        target=row.target,
-        used=int(is_used.sum()),
-        removed=int((~is_used).sum()),
-        used_at=_counted(row.piece[is_used]),
-        removed_at={stage: _counted(row.piece[row.stage == stage]) for stage in stages},
+        sensor=sensor,
+        target=target,
+        used=used,
+        removed=count.total() - used,
+        used_at=tuple(used_at),
+        removed_at=removed_at,
     )
-
-
-def _counted(pieces: np.ndarray) -> tuple[tuple[int, int], ...]:
-    at, count = np.unique(pieces, return_counts=True)
-    return tuple(zip(at.tolist(), count.tolist(), strict=True))
 
 
 def counts_of(

@@ -23,13 +23,13 @@ from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.results.contribution import ContributionEvidence, contribution_of
 from gtsam_rwhec.results.derived import Derived, derived_of
 from gtsam_rwhec.results.detection_evidence import SeenEvidence, seen_in_problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
+from gtsam_rwhec.results.file_record import Count, FileRecord
 from gtsam_rwhec.results.json_tree import MOST_BYTES as MOST_BYTES_OF_RESULT
 from gtsam_rwhec.results.json_tree import in_words
 from gtsam_rwhec.results.linear_model import LinearModel, measured_rows
 from gtsam_rwhec.results.proof_spectrum import Proof, proof_of
 from gtsam_rwhec.results.residual_evidence import ResidualsEvidence, residuals_of
-from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of_problem
+from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
 from gtsam_rwhec.results.weak_poses import WeakDirection, weak_directions
 
 FORMAT: Final = "gtsam-rwhec evidence"
@@ -39,20 +39,20 @@ FORMAT_VERSION: Final = 1
 MOST_BYTES = 100_000_000
 
 
-class Evidence(EvidenceRecord):
+class Evidence(FileRecord):
     """What a report shows beside the result. A part is None where its data are missing."""
 
     format: Literal["gtsam-rwhec evidence"] = FORMAT
     format_version: Literal[1] = FORMAT_VERSION
-    result_sha256: str = Field(default="", description="checksum of the result's file; empty where it was not known")
-    derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
-    proof: Proof | None = Field(default=None, description="gap and spectrum of the certificate")
-    weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
-    scene: SceneEvidence | None = Field(default=None, description="what is needed to draw the rig in space")
-    seen: SeenEvidence | None = Field(default=None, description="detections, removed measurements, corners, images")
-    residuals: ResidualsEvidence | None = Field(default=None, description="what is left, and what it says of the noise")
-    contribution: ContributionEvidence | None = Field(default=None, description="how much each image told")
-    inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
+    result_sha256: str = ""  #: Checksum of the result's file; empty where it was not known
+    derived: Derived | None = None  #: What follows from poses and covariances
+    proof: Proof | None = None  #: Gap and spectrum of the certificate
+    weak: tuple[WeakDirection, ...] = ()  #: Least known directions, the worst first
+    scene: SceneEvidence | None = None  #: What is needed to draw the rig in space
+    seen: SeenEvidence | None = None  #: Detections, removed measurements, corners, images
+    residuals: ResidualsEvidence | None = None  #: What is left, and what it says of the noise
+    contribution: ContributionEvidence | None = None  #: How much each image told
+    inputs: Inputs | None = None  #: Files, versions, options, rig file
 
 
 def evidence_path(result_path: str | Path) -> Path:
@@ -114,26 +114,25 @@ PACKAGES = ("gtsam-rwhec", "gtsam", "numpy", "scipy", "clarabel", "opencv-python
 PIECE = 1 << 20
 
 
-class InputFile(EvidenceRecord):
+class InputFile(FileRecord):
     """A file that was read."""
 
-    name: str = Field(description="its name, without its folder")
-    bytes: int = Field(description="its size", ge=0)
+    name: str  #: Its name, without its folder
+    bytes: Count  #: Its size
     sha256: str = Field(description="checksum of its content", pattern="[0-9a-f]{64}")
 
 
-class Inputs(EvidenceRecord):
+class Inputs(FileRecord):
     """All that is needed to make a calibration again."""
 
-    files: tuple[InputFile, ...] = Field(description="the files with the measurements")
-    command: str = Field(default="", description="the command, or the call, that made it")
-    versions: dict[str, str] = Field(description="of the packages that decide the answer, and of Python")
-    options: dict[str, str] = Field(default={}, description="options of the calibration that are not the default")
-    seeds: dict[str, int] = Field(default={}, description="seeds of random numbers, by what draws them")
-    rig_file: str | None = Field(default=None, description="the text of the rig file")
-    copies: dict[str, str] = Field(
-        default={}, description="the poses as texts of other programs, under the rig file's names, by the file's name"
-    )
+    files: tuple[InputFile, ...]  #: The files with the measurements
+    command: str = ""  #: The command, or the call, that made it
+    versions: dict[str, str]  #: Of the packages that decide the answer, and of Python
+    options: dict[str, str] = Field(default_factory=dict)  #: Options of the calibration that are not the default
+    seeds: dict[str, int] = Field(default_factory=dict)  #: Seeds of random numbers, by what draws them
+    rig_file: str | None = None  #: The text of the rig file
+    #: The poses as texts of other programs, under the rig file's names, by the name of the file
+    copies: dict[str, str] = Field(default_factory=dict)
 
     def with_options(self, options: CalibrateOptions) -> Inputs:
         """The record with the options of a calibration, and its seeds."""
@@ -200,21 +199,16 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
     inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
     rows = measured_rows(problem, calibration)
     model = LinearModel.of(rows, calibration)
+    carriers = problem.sensor_carrier, problem.target_carrier
+    inliers = calibration.outliers.inliers
+    proven = selected(problem, inliers) if inliers else problem
     return Evidence(
         derived=derived_of(calibration),
-        proof=_proof(problem, calibration),
+        proof=None if calibration.solution is None else proof_of(calibration.solution, proven),
         weak=weak_directions(calibration, rows),
-        scene=scene_of_problem(problem, calibration, rows),
+        scene=scene_of(calibration, rows, carriers, problem.cameras, problem.boards),
         seen=seen_in_problem(problem, calibration.refined, rows, calibration.options.carrier_path),
         residuals=None if model is None else residuals_of(model, calibration),
         contribution=None if model is None else contribution_of(model),
         inputs=inputs.with_options(calibration.options),
     )
-
-
-def _proof(problem: Problem, calibration: Calibration) -> Proof | None:
-    """The proof of the certified solution, with the measurements that it is of."""
-    if calibration.solution is None:
-        return None
-    inliers = calibration.outliers.inliers
-    return proof_of(calibration.solution, selected(problem, inliers) if inliers else problem)

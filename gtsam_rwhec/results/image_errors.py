@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict
 from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -14,7 +14,7 @@ from gtsam_rwhec.fitting.corner_residuals import shaped
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import SIZE, WARPS, Reprojection
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
+from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row
 
 #: An image's longer side has so many cells, and its shorter side so many, for the share that has corners.
 CELLS = (8, 6)
@@ -23,43 +23,42 @@ CELLS = (8, 6)
 MOST_WORST = 6
 
 
-class SeenCamera(EvidenceRecord):
+class SeenCamera(FileRecord):
     """Where a camera saw corners, in the images that are used."""
 
-    sensor: str = Field(description="the sensor's name")
-    width: int = Field(description="pixels", gt=0)
-    height: int = Field(description="pixels", gt=0)
-    images: int = Field(description="images with corners, once for each target", ge=0)
-    corners: int = Field(description="corners in them", ge=0)
-    cells: tuple[tuple[int, ...], ...] = Field(description="corners in each cell of the image, rows from the top")
-    share: float = Field(description="share of the cells that have a corner")
-    rms_px: float = Field(description="root mean square of dx and dy over all corners that count")
-    noise_px: float | None = Field(description="deviation of a corner along each axis, as it counted")
-    at_optimum: bool = Field(
-        description="true: the carriers' pose of each image as its corners and the pose's noise together say; false: "
-        "the pose as measured"
-    )
-    x: Row = Field(description="some of the corners, spread over all images: pixels from the left")
-    y: Row = Field(description="pixels from the top")
-    dx: Row = Field(description="seen minus predicted, pixels")
-    dy: Row = Field(description="seen minus predicted, pixels")
+    sensor: str
+    width: PositiveCount  #: Pixels
+    height: PositiveCount  #: Pixels
+    images: Count  #: Images with corners, once for each target
+    corners: Count  #: Corners in them
+    cells: tuple[tuple[int, ...], ...]  #: Corners in each cell of the image, rows from the top
+    share: float  #: Share of the cells that have a corner
+    rms_px: float  #: Root mean square of dx and dy over all corners that count
+    noise_px: float | None  #: Deviation of a corner along each axis, as it counted
+    #: True: the carriers' pose of each image as its corners and the pose's noise together say; false: the pose as
+    #: measured
+    at_optimum: bool
+    x: Row  #: Some of the corners, spread over all images: pixels from the left
+    y: Row  #: Pixels from the top
+    dx: Row  #: Seen minus predicted, pixels
+    dy: Row  #: Seen minus predicted, pixels
 
 
-class WorstImage(EvidenceRecord):
+class WorstImage(FileRecord):
     """An image whose corners are far off under the answer."""
 
     model_config = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 
-    target: str = Field(description="the target's name")
-    sensor: str = Field(description="the sensor's name")
-    image: str = Field(description="name of the image's file; else its stamp in nanoseconds, or its place in the pair")
-    is_used: bool = Field(description="whether it is in the answer")
-    corners: int = Field(description="corners in it", gt=0)
-    rms_px: float = Field(description="root mean square of its corners' errors along each axis, pixels")
-    largest_px: float = Field(description="length of the largest error, pixels")
-    times_noise: float | None = Field(description="rms over the deviation of a corner")
-    magnified: float = Field(default=1.0, description="errors are drawn so many times as long")
-    picture: bytes | None = Field(default=None, description="the target in it, JPEG, base64; null where there is none")
+    target: str
+    sensor: str
+    image: str  #: Name of the image's file; else its stamp in nanoseconds, or its place in the pair
+    is_used: bool  #: Whether it is in the answer
+    corners: PositiveCount  #: Corners in it
+    rms_px: float  #: Root mean square of its corners' errors along each axis, pixels
+    largest_px: float  #: Length of the largest error, pixels
+    times_noise: float | None  #: Rms over the deviation of a corner
+    magnified: float = 1.0  #: Errors are drawn so many times as long
+    picture: bytes | None = None  #: The target in it, JPEG, base64; null where there is none
 
 
 #: Fewer corners than this in an image say nothing beside its pose.
@@ -240,11 +239,9 @@ def _seen_camera(
 def cells_with_corners(pixels: Array, size: tuple[int, int]) -> np.ndarray:
     """How many corners (n, 2) are in each cell of an image of a (width, height), rows from the top."""
     columns, rows = CELLS if size[0] >= size[1] else CELLS[::-1]
-    cells = np.zeros((rows, columns), dtype=int)
-    good = pixels[np.isfinite(pixels).all(axis=1)]
-    at = np.clip(((good + 0.5) / size * [columns, rows]).astype(int), 0, [columns - 1, rows - 1])
-    np.add.at(cells, (at[:, 1], at[:, 0]), 1)
-    return cells
+    good = np.clip(pixels[np.isfinite(pixels).all(axis=1)] + 0.5, 0.0, size)
+    cells, *_ = np.histogram2d(good[:, 1], good[:, 0], (rows, columns), ((0.0, size[1]), (0.0, size[0])))
+    return cells.astype(int)
 
 
 def worst_views(rated: Iterable[RatedView], most: int = MOST_WORST) -> list[RatedView]:

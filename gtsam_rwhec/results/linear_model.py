@@ -36,17 +36,17 @@ class LinearModel:
     """All measurements of frames that the answer has, pair after pair."""
 
     pairs: tuple[Pair, ...]
+    stamps_ns: np.ndarray | None  #: None where a pair has none
+    frames: dict[str, slice]  #: Where the frames' six unknowns are
+    dimension: int
     pair: np.ndarray  #: Each measurement's place in ``pairs``
     within: np.ndarray  #: Its place among the measurements of its pair
-    stamps_ns: np.ndarray | None  #: None where a pair has none
     used: np.ndarray
     residual: Array  #: [rad, m], in the target's axes, lengths as measured
     noise: Array  #: Its covariance before the fit
     J: Array  #: The change of the prediction by the measurement's own unknowns
     places: np.ndarray  #: Where these are among all unknowns; ``dimension`` stands for one that is known
     A: Array  #: The carriers' poses
-    frames: dict[str, slice]  #: Where the frames' six unknowns are
-    dimension: int
 
     @staticmethod
     def of(rows: Mapping[Pair, MeasuredRows], calibration: Calibration) -> LinearModel | None:
@@ -66,12 +66,8 @@ class LinearModel:
             scale = refined.scale if isinstance(refined.scale, float) else refined.scale[pair.target]
             X, Y = calibration.X[pair.target].matrix(), calibration.Y[pair.sensor].matrix()
             P = np.linalg.inv(Y) @ of.A @ X
-            as_measured = np.repeat([1.0, scale], 3)
-            J = np.zeros((count, 6, OWN))
-            J[:, :, :6] = np.diag(as_measured)
-            J[:, :, 6:12] = -as_measured[:, None] * se3.adjoint(se3.inverse(P))
-            J[:, 3:, 12] = np.einsum("nji,nj->ni", P[:, :3, :3], P[:, :3, 3])
-            noise = _noise_of_B(of, refined.noise[pair]) + _noise_of_A(calibration.noise_of_A, of.A, X, as_measured)
+            noise = _noise_of_B(of, refined.noise[pair]) + noise_of_A(calibration.noise_of_A, of.A, X, scale)
+            J = derivatives(P, scale)
             P[:, :3, 3] *= scale
             own = next((i for i, one in enumerate(scales) if one.owner in ("", pair.target)), None)
             at = np.r_[
@@ -81,24 +77,12 @@ class LinearModel:
             ]
             residual = se3.logmap(se3.inverse(P) @ of.B)
             places = np.tile(at, (count, 1))
-            parts.append((np.full(count, number), np.arange(count), of.used, residual, noise, J, places))
-        pair_of, within, used, residual, noise, J, places = (np.concatenate(part) for part in zip(*parts, strict=True))
+            parts.append((np.full(count, number), np.arange(count), of.used, residual, noise, J, places, of.A))
         stamps = [rows[pair].stamps_ns for pair in known]
         together = [one for one in stamps if one is not None]
-        return LinearModel(
-            pairs=tuple(known),
-            pair=pair_of,
-            within=within,
-            stamps_ns=np.concatenate(together) if len(together) == len(stamps) else None,
-            used=used,
-            residual=residual,
-            noise=noise,
-            J=J,
-            places=places,
-            A=np.concatenate([rows[pair].A for pair in known]),
-            frames=frames,
-            dimension=dimension,
-        )
+        stamps_ns = np.concatenate(together) if len(together) == len(stamps) else None
+        arrays = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return LinearModel(tuple(known), stamps_ns, frames, dimension, *arrays)
 
     @property
     def seconds(self) -> Array:
@@ -109,11 +93,10 @@ class LinearModel:
         return seconds
 
     @property
-    def sensor(self) -> np.ndarray:
-        """The sensor's place (N,) among all sensors, in the order of the pairs."""
-        names = list(dict.fromkeys(pair.sensor for pair in self.pairs))
-        of_pair = np.array([names.index(pair.sensor) for pair in self.pairs])
-        return np.asarray(of_pair[self.pair])
+    def by_sensor(self) -> dict[str, np.ndarray]:
+        """Which measurements (N,) each sensor made, in the order of the pairs."""
+        names = np.array([pair.sensor for pair in self.pairs])[self.pair]
+        return {name: names == name for name in dict.fromkeys(pair.sensor for pair in self.pairs)}
 
     def whitened(self) -> tuple[Array, Array]:
         """Residuals (N, 6) and derivatives (N, 6, 13) in units of the noise."""
@@ -141,12 +124,18 @@ class LinearModel:
 
 def inverse_of(information: Array) -> Array:
     """The covariance: the inverse of an information; along free directions it is zero, for nothing is moved there."""
-    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    scaled, unit = equilibrated(information)
+    values, vectors = np.linalg.eigh(scaled)
     known = values > FREE * values.max(initial=0.0)
-    scaled = vectors[:, known] * unit[:, None]
-    result: Array = (scaled / values[known]) @ scaled.T
+    vectors = vectors[:, known] * unit[:, None]
+    result: Array = (vectors / values[known]) @ vectors.T
     return result
+
+
+def equilibrated(information: Array) -> tuple[Array, Array]:
+    """The information with ones on its diagonal, and the units in which it is so."""
+    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    return information * unit[:, None] * unit, unit
 
 
 def _places(where: slice | None, dimension: int) -> np.ndarray:
@@ -165,12 +154,22 @@ def _noise_of_B(of: MeasuredRows, typical: PairNoise) -> Array:
     return scaled
 
 
-def _noise_of_A(noise: CarrierNoise | None, A: Array, X: Array, as_measured: Array) -> Array:
+def derivatives(P: Array, scale: float = 1.0) -> Array:
+    """Those (N, 6, 13) of predictions (N, 4, 4), in true lengths, by target, sensor and scale."""
+    as_measured = np.repeat([1.0, scale], 3)
+    J = np.zeros((len(P), 6, OWN))
+    J[:, :, :6] = np.diag(as_measured)
+    J[:, :, 6:12] = -as_measured[:, None] * se3.adjoint(se3.inverse(P))
+    J[:, 3:, 12] = np.einsum("nji,nj->ni", P[:, :3, :3], P[:, :3, 3])
+    return J
+
+
+def noise_of_A(noise: CarrierNoise | None, A: Array, X: Array, scale: float = 1.0) -> Array:
     """A's covariance in the prediction's axes (N, 6, 6); zero where A counts as exact."""
     if noise is None:
         return np.zeros((len(A), 6, 6))
     frame = X if noise.about == "targetcarrier" else A @ X
-    E = as_measured[:, None] * se3.adjoint(se3.inverse(np.broadcast_to(frame, A.shape)))
+    E = np.repeat([1.0, scale], 3)[:, None] * se3.adjoint(se3.inverse(np.broadcast_to(frame, A.shape)))
     E = E * np.repeat([noise.rotation_rad, noise.translation_m], 3)
     moved: Array = E @ E.transpose(0, 2, 1)
     return moved

@@ -7,24 +7,18 @@ from __future__ import annotations
 
 from typing import Annotated, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from gtsam_rwhec.calibration.outliers import LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.sizes import is_size_doubted, is_size_uncertain
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.file_record import Count, FileRecord, NotNegative, Positive
 
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
 Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]
-Count: TypeAlias = Annotated[int, Field(ge=0)]
-Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
-NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class _Count(_Record):
+class _Count(FileRecord):
     """How many measurements of one target by one sensor were used."""
 
     target: str = Field(description="the target's name")
@@ -58,7 +52,7 @@ class OutlierCount(_Count):
     left_out: Count = Field(default=0, description="measurements that were left out as outliers")
 
 
-class DetectionReport(_Record):
+class DetectionReport(FileRecord):
     """What the detection stage reports."""
 
     sources: tuple[str, ...] = Field(description="file names of the logs")
@@ -81,7 +75,7 @@ class DetectionReport(_Record):
     )
 
 
-class CleaningReport(_Record):
+class CleaningReport(FileRecord):
     """What the cleaning stage reports."""
 
     tracks: tuple[TrackCount, ...] = Field(description="measurements of each target by each sensor")
@@ -93,7 +87,7 @@ class CleaningReport(_Record):
     )
 
 
-class SizeFields(_Record):
+class SizeFields(FileRecord):
     """What the measurements say about a target's stated size."""
 
     target: str = Field(description="the target's name")
@@ -120,7 +114,7 @@ class SizeFields(_Record):
         return is_size_uncertain(self.scale, self.sigma)
 
 
-class TimeOffsetFields(_Record):
+class TimeOffsetFields(FileRecord):
     """The time offset of a sensor's clock."""
 
     sensor: str = Field(description="the sensor's name")
@@ -130,7 +124,7 @@ class TimeOffsetFields(_Record):
     )
 
 
-class LogFields(_Record):
+class LogFields(FileRecord):
     """Where a calibration's measurements came from, and what became of them."""
 
     sensor_carrier: str = Field(description="name of the frame that carries the sensors")

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 from rwhec_factors import se3
 
@@ -25,7 +24,6 @@ from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import INSTANTS, Settled, Task, moved, thinned
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import data_of, scale_of, sensors_with_offset
-from gtsam_rwhec.fitting.reprojection_record import Intrinsics
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
@@ -44,29 +42,13 @@ MAX_CHOICES = 4
 
 @dataclass(frozen=True)
 class NearAnswer:
-    """What a new log says near an old answer.
+    """What a new log says near an old answer."""
 
-    Attributes
-    ----------
-    X, Y, scale, time_offsets_s
-        As in ``RefinedPoses``; those that fit the new log best, near the old ones.
-    joint : JointCovariance
-    degrees_of_freedom : float
-    inliers : dict of (target, sensor) to (N,) booleans
-        The measurements that agree with one another.
-    free : tuple of str
-        Directions that the new log leaves free, in words.
-    """
-
-    X: dict[str, gtsam.Pose3]
-    Y: dict[str, gtsam.Pose3]
-    scale: float | dict[str, float]
-    time_offsets_s: dict[str, float]
-    joint: JointCovariance
-    degrees_of_freedom: float
-    inliers: dict[Pair, np.ndarray]
-    free: tuple[str, ...]
-    intrinsics: dict[str, Intrinsics] = field(default_factory=dict)
+    #: The old answer with the poses, scales, clocks and covariance of the new log; its noise and cost are the old ones
+    refined: RefinedPoses
+    degrees_of_freedom: float  #: Of this covariance
+    inliers: dict[Pair, np.ndarray]  #: (N,) booleans: the measurements that agree with one another
+    free: tuple[str, ...]  #: Directions that the new log leaves free, in words
 
 
 def near(
@@ -107,12 +89,17 @@ def near(
     ]
     freedom = min((mixture.degrees_of_freedom(basis[rows]) for rows in frames), default=float(np.inf))
     spare = 6 * task.problem.number_of_measurements - len(task.layout.unit)
-    return NearAnswer(
+    found_poses = replace(
+        old,
         X=state.X,
         Y=state.Y,
         scale=scale_of(task.problem, state),
         time_offsets_s=state.offsets_s,
         joint=replace(task.layout, finite=finite),
+        intrinsics={},
+    )
+    return NearAnswer(
+        found_poses,
         degrees_of_freedom=min(freedom, max(0.5 * spare, FEWEST)),
         inliers=inliers,
         free=tuple(map(str, task.free_directions)),

@@ -9,10 +9,9 @@ it without eigenvalues, for all variables and with rounding enclosed; the spectr
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row
+from gtsam_rwhec.results.file_record import FileRecord, Row
 from gtsam_rwhec.solver.answers import given_answer, given_translations
 from gtsam_rwhec.solver.certificate import Certificate, Multipliers
 from gtsam_rwhec.solver.descent import homogeneous
@@ -28,23 +27,23 @@ MOST_ROWS = 1000
 SAME_COST = 1e-6
 
 
-class ProvenPart(EvidenceRecord):
+class ProvenPart(FileRecord):
     """One unconnected part of a calibration."""
 
-    names: tuple[str, ...] = Field(description="its frames")
-    gap: float | None = Field(description="cost less lower bound, at least 0; null: there is no bound")
-    relative_gap: float | None = Field(description="the gap over the cost; null: there is no bound")
-    rows: int = Field(default=0, description="rows of Z: nine for each free frame, and one")
-    eigenvalues: Row | None = Field(default=None, description="of Z, ascending; null: not computed")
-    rounding: float | None = Field(default=None, description="what rounding may change in an eigenvalue, about")
-    why_not: str = Field(default="", description="why there are no eigenvalues")
+    names: tuple[str, ...]  #: Its frames
+    gap: float | None  #: Cost less lower bound, at least 0; null: there is no bound
+    relative_gap: float | None  #: The gap over the cost; null: there is no bound
+    rows: int = 0  #: Rows of Z: nine for each free frame, and one
+    eigenvalues: Row | None = None  #: Of Z, ascending; null: not computed
+    rounding: float | None = None  #: What rounding may change in an eigenvalue, about
+    why_not: str = ""  #: Why there are no eigenvalues
 
 
-class Proof(EvidenceRecord):
+class Proof(FileRecord):
     """The proof of a calibration."""
 
-    gap: float | None = Field(description="of all parts together; null: there is no bound")
-    relative_gap: float | None = Field(description="the gap over the cost; null: there is no bound")
+    gap: float | None  #: Of all parts together; null: there is no bound
+    relative_gap: float | None  #: The gap over the cost; null: there is no bound
     parts: tuple[ProvenPart, ...]
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from pydantic import Field
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Row, Rows
-from gtsam_rwhec.results.linear_model import LinearModel, inverse_of
+from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row, Rows
+from gtsam_rwhec.results.linear_model import LinearModel, equilibrated, inverse_of
 
 #: So many measurements are kept one by one; of more, every so-many-th.
 MOST_KEPT = 5_000
@@ -27,61 +26,61 @@ AXES = ("x", "y", "z")
 COMPONENTS = tuple(f"{what} {axis}" for what in ("rotation about", "translation along") for axis in AXES)
 
 
-class PairResiduals(EvidenceRecord):
+class PairResiduals(FileRecord):
     """The residuals of a pair: B against the prediction Y^-1 A X, in the target's axes."""
 
-    target: str = Field(description="the target's name")
-    sensor: str = Field(description="the sensor's name")
-    used: int = Field(description="measurements in the answer", ge=0)
-    rms_deg: float = Field(description="root mean square angle of those in the answer, degrees")
-    rms_mm: float = Field(description="root mean square length of those in the answer, millimetres")
-    spread: float = Field(description="root mean square in units of the noise: 1 where they are as large as the noise")
-    neighbours: float | None = Field(description="correlation with the one before; null: too few")
-    band: float | None = Field(description="by chance it is within this of zero in 95 %")
-    times: Row = Field(description="of those kept one by one: seconds since the first, or places without stamps")
-    in_answer: tuple[bool, ...] = Field(description="whether it is in the answer")
-    deg: Row = Field(description="angle, degrees")
-    mm: Row = Field(description="length, millimetres")
-    normalised: Rows = Field(description="in units of the noise, rotation first; of those in the answer")
+    target: str
+    sensor: str
+    used: Count  #: Measurements in the answer
+    rms_deg: float  #: Root mean square angle of those in the answer, degrees
+    rms_mm: float  #: Root mean square length of those in the answer, millimetres
+    spread: float  #: Root mean square in units of the noise: 1 where they are as large as the noise
+    neighbours: float | None  #: Correlation with the one before; null: too few
+    band: float | None  #: By chance it is within this of zero in 95 %
+    times: Row  #: Of those kept one by one: seconds since the first, or places without stamps
+    in_answer: tuple[bool, ...]  #: Whether it is in the answer
+    deg: Row  #: Angle, degrees
+    mm: Row  #: Length, millimetres
+    normalised: Rows  #: In units of the noise, rotation first; of those in the answer
 
 
-class HoldOut(EvidenceRecord):
+class HoldOut(FileRecord):
     """Measurements of a sensor, predicted by all that are not of their block in time, in one linear step."""
 
-    sensor: str = Field(description="the sensor's name")
-    measurements: int = Field(description="that could be predicted", ge=0)
-    held_out_mm: float = Field(description="root mean square length, millimetres")
-    held_out_deg: float = Field(description="root mean square angle, degrees")
-    fitted_mm: float = Field(description="the same with all measurements in the fit")
-    fitted_deg: float = Field(description="the same with all measurements in the fit")
+    sensor: str
+    measurements: Count  #: That could be predicted
+    held_out_mm: float  #: Root mean square length, millimetres
+    held_out_deg: float  #: Root mean square angle, degrees
+    fitted_mm: float  #: The same with all measurements in the fit
+    fitted_deg: float  #: The same with all measurements in the fit
 
 
-class Dependence(EvidenceRecord):
+class Dependence(FileRecord):
     """How a residual depends on the pose of the carriers: the strongest dependence of all."""
 
-    sensor: str = Field(description="the sensor's name")
-    component: str = Field(description="which of the six residuals")
-    by: str = Field(description="what of A it depends on")
-    correlation: float = Field(description="between the two")
-    by_chance: float = Field(description="the largest of all is below this in 99 % if there is none")
-    x: Row = Field(description="what of A: radians, or metres")
-    y: Row = Field(description="the residual in units of its noise")
+    sensor: str
+    component: str  #: Which of the six residuals
+    by: str  #: What of A it depends on
+    correlation: float  #: Between the two
+    by_chance: float  #: The largest of all is below this in 99 % if there is none
+    x: Row  #: What of A: radians, or metres
+    y: Row  #: The residual in units of its noise
 
 
-class ResidualsEvidence(EvidenceRecord):
+class ResidualsEvidence(FileRecord):
     """Residuals of all pairs, and what they say of the noise model."""
 
-    has_stamps: bool = Field(description="whether times are seconds")
-    measurements: int = Field(description="in the answer", ge=0)
-    kept_every: int = Field(description="every so-many-th is kept one by one", ge=1)
-    pairs: tuple[PairResiduals, ...] = Field(description="by pair")
-    spread: float = Field(description="root mean square of all residuals in units of the noise")
-    beyond_3: float = Field(description="share of them beyond three deviations")
-    excess_kurtosis: float = Field(description="of them; 0 for normal noise, positive for heavy tails")
-    instants: int | None = Field(description="carrier poses with measurements; null: no model of the noise")
-    worth: float | None = Field(description="so many instants with independent noise would tell as much")
-    hold_out: tuple[HoldOut, ...] = Field(description="by sensor")
-    dependence: Dependence | None = Field(description="of the residuals on the carriers' pose; null: too few")
+    has_stamps: bool  #: Whether times are seconds
+    measurements: Count  #: In the answer
+    kept_every: PositiveCount  #: Every so-many-th is kept one by one
+    pairs: tuple[PairResiduals, ...]  #: By pair
+    spread: float  #: Root mean square of all residuals in units of the noise
+    beyond_3: float  #: Share of them beyond three deviations
+    excess_kurtosis: float  #: Of them; 0 for normal noise, positive for heavy tails
+    instants: int | None  #: Carrier poses with measurements; null: no model of the noise
+    worth: float | None  #: So many instants with independent noise would tell as much
+    hold_out: tuple[HoldOut, ...]  #: By sensor
+    dependence: Dependence | None  #: Of the residuals on the carriers' pose; null: too few
 
 
 def residuals_of(model: LinearModel, calibration: Calibration) -> ResidualsEvidence:
@@ -159,13 +158,12 @@ def _hold_out(model: LinearModel, r: Array, J: Array) -> Iterator[HoldOut]:
         if not mine.any():
             continue
         left = whole - model.information(J, mine)
-        if np.linalg.matrix_rank(_scaled(left), tol=1e-9, hermitian=True) < len(left):
+        if np.linalg.matrix_rank(equilibrated(left)[0], tol=1e-9, hermitian=True) < len(left):
             continue
         step = np.append(inverse_of(left) @ (pull - model.gradient(J, r, mine)), 0.0)
         predicted[mine] = model.residual[mine] - np.einsum("nij,nj->ni", model.J[mine], step[model.places[mine]])
-    sensors = list(dict.fromkeys(pair.sensor for pair in model.pairs))
-    for number, sensor in enumerate(sensors):
-        known = (model.sensor == number) & np.isfinite(predicted[:, 0])
+    for sensor, of_sensor in model.by_sensor.items():
+        known = of_sensor & np.isfinite(predicted[:, 0])
         if known.any():
             held, fitted = sizes(predicted[known]), sizes(model.residual[known])
             yield HoldOut(
@@ -178,18 +176,11 @@ def _hold_out(model: LinearModel, r: Array, J: Array) -> Iterator[HoldOut]:
             )
 
 
-def _scaled(information: Array) -> Array:
-    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
-    scaled: Array = information * unit[:, None] * unit
-    return scaled
-
-
 def _dependence(model: LinearModel, r: Array) -> Dependence | None:
     """The strongest correlation of a residual with a coordinate of A, over sensors, residuals and coordinates."""
-    best: tuple[float, Dependence] | None = None
-    sensors = list(dict.fromkeys(pair.sensor for pair in model.pairs))
-    for number, sensor in enumerate(sensors):
-        mine = model.used & (model.sensor == number)
+    found: list[Dependence] = []
+    for sensor, of_sensor in model.by_sensor.items():
+        mine = model.used & of_sensor
         if mine.sum() < FEWEST:
             continue
         coordinates, names = _coordinates(model.A[mine])
@@ -197,23 +188,19 @@ def _dependence(model: LinearModel, r: Array) -> Dependence | None:
         spread = np.outer(values.std(axis=0), coordinates.std(axis=0)) * len(values)
         correlation = np.divide(values.T @ coordinates, spread, out=np.zeros(spread.shape), where=spread > 0.0)
         row, column = np.unravel_index(int(np.abs(correlation).argmax()), correlation.shape)
-        by_chance = min(CHANCE_OF_MANY / np.sqrt(len(values)), 1.0)
-        found = float(correlation[row, column])
-        if best is None or abs(found) / by_chance > best[0]:
-            every = slice(None, None, -(-len(values) // 1000))
-            best = (
-                abs(found) / by_chance,
-                Dependence(
-                    sensor=sensor,
-                    component=COMPONENTS[row],
-                    by=names[column],
-                    correlation=found,
-                    by_chance=by_chance,
-                    x=_rounded(coordinates[every, column]),
-                    y=_rounded(r[mine][every, row]),
-                ),
+        every = slice(None, None, -(-len(values) // 1000))
+        found.append(
+            Dependence(
+                sensor=sensor,
+                component=COMPONENTS[row],
+                by=names[column],
+                correlation=float(correlation[row, column]),
+                by_chance=min(CHANCE_OF_MANY / np.sqrt(len(values)), 1.0),
+                x=_rounded(coordinates[every, column]),
+                y=_rounded(r[mine][every, row]),
             )
-    return None if best is None else best[1]
+        )
+    return max(found, key=lambda one: abs(one.correlation) / one.by_chance, default=None)
 
 
 def _coordinates(A: Array) -> tuple[Array, tuple[str, ...]]:

@@ -45,6 +45,7 @@ from gtsam_rwhec.results.schema import (
     ResultFile,
     pose_rows,
 )
+from gtsam_rwhec.solver.free_directions import FreeDirection
 from gtsam_rwhec.solver.solution import Solution
 
 #: The name of the result in an output folder.
@@ -63,6 +64,12 @@ class Result:
     refined: RefinedPoses | None  #: The refined calibration; None if the solution was not refined
     log: LogFields | None  #: What became of the measurements; None if they do not come from a log
     calibration: CalibrationFields | None = None  #: What ``calibrate`` found and chose; None if it did not run
+
+    @property
+    def free_directions(self) -> tuple[FreeDirection, ...]:
+        """What the measurements leave free."""
+        refined = () if self.refined is None else self.refined.free_directions
+        return refined or self.solution.identifiability.free_directions
 
     @property
     def judgement(self) -> Judgement:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import gtsam
 import numpy as np
-from pydantic import Field
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
@@ -30,8 +29,7 @@ from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.evidence_record import EvidenceRecord, Rows
+from gtsam_rwhec.results.file_record import Count, FileRecord, Rows
 from gtsam_rwhec.results.linear_model import MeasuredRows
 
 #: The path is thinned to this many poses.
@@ -41,58 +39,41 @@ EDGE = 4
 #: Words in the names of carriers: those of the first kind stand still for people, those of the last move.
 STANDING = frozenset({"world", "map", "earth", "room", "floor", "ground", "odom", "mocap", "vicon", "optitrack"})
 PARTLY = frozenset({"base", "table", "cell", "stand", "origin"})
-MOVING = frozenset(
-    {
-        "hand",
-        "tool",
-        "tool0",
-        "ee",
-        "eef",
-        "tcp",
-        "flange",
-        "gripper",
-        "wrist",
-        "body",
-        "vehicle",
-        "car",
-        "rig",
-        "drone",
-    }
-)
+MOVING = frozenset({"hand", "tool", "tool0", "ee", "eef", "tcp", "flange", "gripper", "wrist", "body"})
+MOVING |= {"vehicle", "car", "rig", "drone"}
 _PARTS = re.compile(r"[^a-z0-9]+")
 
 
-class SensorScene(EvidenceRecord):
+class SensorScene(FileRecord):
     """A sensor in space, and where it saw its targets. Angles are between its z axis and the targets' origins."""
 
-    rim: Rows = Field(description="unit vectors to the image's border, clockwise from the top left; empty: not known")
-    measurements: int = Field(description="measurements in the answer", ge=0)
-    behind: int = Field(description="measurements whose target is not in front, z <= 0", ge=0)
-    distance_m: tuple[float, float, float] | None = Field(description="nearest, median, farthest; m")
-    off_axis_deg: tuple[float, float] | None = Field(description="median and largest, as measured; degrees")
-    off_axis_by_poses_deg: tuple[float, float] | None = Field(description="the same by the calibrated poses; degrees")
+    rim: Rows  #: Unit vectors to the image's border, clockwise from the top left; empty: not known
+    measurements: Count  #: Measurements in the answer
+    behind: Count  #: Measurements whose target is not in front, z <= 0
+    distance_m: tuple[float, float, float] | None  #: Nearest, median, farthest; m
+    off_axis_deg: tuple[float, float] | None  #: Median and largest, as measured; degrees
+    off_axis_by_poses_deg: tuple[float, float] | None  #: The same by the calibrated poses; degrees
 
 
-class TargetScene(EvidenceRecord):
+class TargetScene(FileRecord):
     """A target in space, and from where it was seen."""
 
-    board: DrawnBoard | None = Field(description="as drawn; null where its shape is not known")
-    measurements: int = Field(description="measurements in the answer", ge=0)
-    tilt_deg: float = Field(description="angle between its z axis and that of its carrier; degrees")
-    oblique_deg: tuple[float, float] | None = Field(
-        description="angle between its z axis and the direction to the sensor, by the poses: median, largest; degrees"
-    )
+    board: DrawnBoard | None  #: As drawn; null where its shape is not known
+    measurements: Count  #: Measurements in the answer
+    tilt_deg: float  #: Angle between its z axis and that of its carrier; degrees
+    #: Angle between its z axis and the direction to the sensor, by the poses: median, largest; degrees
+    oblique_deg: tuple[float, float] | None
 
 
-class SceneEvidence(EvidenceRecord):
+class SceneEvidence(FileRecord):
     """What is needed to draw the rig."""
 
-    standing: Literal["targets", "sensors"] = Field(description="whose carrier is drawn as standing still")
-    why: str = Field(description="why this one")
-    poses: Rows = Field(description="pose of the other carrier in it: x, y, z (m), qw, qx, qy, qz; in order of time")
-    of: int = Field(description="of so many poses these are a choice, evenly spread", ge=0)
-    seconds: tuple[float, ...] | None = Field(description="time of each pose after the first; null without stamps")
-    typical: int = Field(description="which of the poses is nearest to all others", ge=0)
+    standing: Literal["targets", "sensors"]  #: Whose carrier is drawn as standing still
+    why: str  #: Why this one
+    poses: Rows  #: Pose of the other carrier in it: x, y, z (m), qw, qx, qy, qz; in order of time
+    of: Count  #: Of so many poses these are a choice, evenly spread
+    seconds: tuple[float, ...] | None  #: Time of each pose after the first; null without stamps
+    typical: Count  #: Which of the poses is nearest to all others
     sensors: dict[str, SensorScene]
     targets: dict[str, TargetScene]
 
@@ -127,7 +108,8 @@ def scene_of(
     standing, why = standing_carrier(*carriers)
     path, seconds, count = _path(used, standing)
     refined = calibration.refined
-    found = {} if refined is None else {name: one.camera for name, one in refined.intrinsics.items()}
+    if refined is not None:
+        cameras = {**cameras, **{name: one.camera for name, one in refined.intrinsics.items()}}
     shapes = {} if refined is None or refined.reprojection is None else refined.reprojection.boards
     seen = {pair: _seen(pair, one, calibration) for pair, one in used.items()}
     boards = {
@@ -142,7 +124,7 @@ def scene_of(
         seconds=None if seconds is None else tuple(seconds.tolist()),
         typical=_medoid(path),
         sensors={
-            name: _sensor({**cameras, **found}.get(name), [one for pair, one in seen.items() if pair.sensor == name])
+            name: _sensor(cameras.get(name), [one for pair, one in seen.items() if pair.sensor == name])
             for name in calibration.Y
         },
         targets={
@@ -150,14 +132,6 @@ def scene_of(
             for name, pose in calibration.X.items()
         },
     )
-
-
-def scene_of_problem(
-    problem: Problem, calibration: Calibration, rows: Mapping[Pair, MeasuredRows]
-) -> SceneEvidence | None:
-    """The same of a problem; its boards are those whose corners it was given."""
-    carriers = problem.sensor_carrier, problem.target_carrier
-    return scene_of(calibration, rows, carriers, problem.cameras, problem.boards)
 
 
 def standing_carrier(sensors: str | None, targets: str | None) -> tuple[Literal["targets", "sensors"], str]:
@@ -207,18 +181,15 @@ def _medoid(poses: Array) -> int:
     return int(np.argmin(apart.sum(axis=0)))
 
 
-class _Seen:
-    """The measurements of a pair that count: B with true lengths, and what the poses predict, (n, 4, 4)."""
-
-    def __init__(self, B: Array, predicted: Array) -> None:
-        self.B, self.predicted = B, predicted
+#: The measurements of a pair that count: B with true lengths, and what the poses predict, (n, 4, 4).
+_Seen = tuple[Array, Array]
 
 
 def _seen(pair: Pair, one: MeasuredRows, calibration: Calibration) -> _Seen:
     B = one.B[one.used].copy()
     B[:, :3, 3] /= _scale(calibration, pair.target)
     X, Y = calibration.X[pair.target].matrix(), calibration.Y[pair.sensor].matrix()
-    return _Seen(B, se3.inverse(Y[None]) @ one.A[one.used] @ X)
+    return B, se3.inverse(Y[None]) @ one.A[one.used] @ X
 
 
 def _scale(calibration: Calibration, target: str) -> float:
@@ -232,9 +203,8 @@ def _sensor(camera: Camera | None, seen: list[_Seen]) -> SensorScene:
         return SensorScene(
             rim=rim, measurements=0, behind=0, distance_m=None, off_axis_deg=None, off_axis_by_poses_deg=None
         )
-    t = np.concatenate([one.B[:, :3, 3] for one in seen])
+    t, by_poses = (np.concatenate(each)[:, :3, 3] for each in zip(*seen, strict=True))
     distance = np.linalg.norm(t, axis=1)
-    by_poses = np.concatenate([one.predicted[:, :3, 3] for one in seen])
     return SensorScene(
         rim=rim,
         measurements=len(t),
@@ -247,10 +217,10 @@ def _sensor(camera: Camera | None, seen: list[_Seen]) -> SensorScene:
 
 def _target(pose: gtsam.Pose3, board: DrawnBoard | None, seen: list[_Seen]) -> TargetScene:
     z = pose.rotation().matrix()[:, 2]
-    towards = [se3.inverse(one.predicted)[:, :3, 3] for one in seen]
+    towards = [se3.inverse(predicted)[:, :3, 3] for _, predicted in seen]
     return TargetScene(
         board=board,
-        measurements=sum(len(one.B) for one in seen),
+        measurements=sum(len(B) for B, _ in seen),
         tilt_deg=float(_angle(z[None])[0]),
         oblique_deg=_median_and_most(_angle(np.concatenate(towards))) if towards else None,
     )
@@ -311,12 +281,12 @@ CIRCLE, RADIUS = 8, 0.25
 BEHIND = 0.004
 
 
-class DrawnBoard(EvidenceRecord):
+class DrawnBoard(FileRecord):
     """A target as it is drawn."""
 
-    words: str = Field(description="what it is, and its size as found")
-    paper: Rows = Field(description="the corners of the paper in the target's frame, m; empty where it is not known")
-    dark: tuple[Rows, ...] = Field(description="the dark parts, each a convex polygon, m")
+    words: str  #: What it is, and its size as found
+    paper: Rows  #: The corners of the paper in the target's frame, m; empty where it is not known
+    dark: tuple[Rows, ...]  #: The dark parts, each a convex polygon, m
 
 
 def drawn_board(
@@ -340,9 +310,7 @@ def drawn_board(
     if len(dark) > MOST_PARTS:
         dark = [dark[i] for i in np.linspace(0, len(dark) - 1, MOST_PARTS).round().astype(int).tolist()]
     reach = float(np.linalg.norm(target.corners(), axis=1).max())
-    warp = _warp(shape)
-    if isinstance(target, Bundle):
-        warp = np.zeros(2)  # its tags are in no common plane
+    warp = np.zeros(2) if isinstance(target, Bundle) else _warp(shape)  # a bundle's tags are in no common plane
     bent = [_bent(polygon / scale, reach / scale, warp) for polygon in dark]
     if len(paper):
         low = min((float(polygon[:, 2].min()) for polygon in bent), default=0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +17,16 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
-from gtsam_rwhec.results.changed_frames import as_result, share_words, without_constant_errors
+from gtsam_rwhec.results.changed_frames import (
+    as_result,
+    movement_words,
+    movements_of,
+    share_words,
+    without_constant_errors,
+)
 from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
 from gtsam_rwhec.results.near_answer import NearAnswer, near, stated_as
 from gtsam_rwhec.results.result_file import Result
@@ -94,59 +101,55 @@ class Verification:
 
     def sentence(self, name: str) -> str:
         """How far a frame seems to have moved, in words, without a full stop."""
+        if name in self.movements:
+            return movement_words(name, self.movements[name], self.test)
         assert self.test is not None
-        deviations = f"{self.test.groups[name].deviations:.1f} joint deviations"
         verb = "changed" if name in self.test.changed else "differs"
-        if name not in self.movements:
-            return f"{shown(name)} {verb}: {deviations}"
-        moved = self.movements[name]
-        verb = "moved" if name in self.test.changed else "differs by"
-        by = f"{verb} {moved}"
-        return f"{shown(name)} {by}: {deviations}"
+        return f"{shown(name)} {verb}: {self.test.groups[name].deviations:.1f} joint deviations"
 
 
 #: Predictions are far off if they exceed this many times the old log's residuals, and these lengths and angles.
 FAR, LEAST_MM, LEAST_DEG = 10.0, 5.0, 0.5
 
 
-def _at_offsets(problem: Problem, found: NearAnswer, path: Trajectory | None) -> Problem:
-    """The measurements with A on the carriers' path at the time offsets that were found."""
-    if path is None:
-        return problem
+def _at_offsets(problem: Problem, offsets_s: Mapping[str, float], path: Trajectory) -> Problem:
+    """The measurements with A on the carriers' path at these time offsets."""
     moved = {}
     for pair in problem.pairs:
         one = problem.measurements(*pair)
-        offset_s = found.time_offsets_s.get(pair.sensor)
-        if offset_s is not None and one.stamps_ns is not None:
-            one = replace(one, A=path.at(one.stamps_ns + round(1e9 * offset_s))[0])
+        if pair.sensor in offsets_s and one.stamps_ns is not None:
+            one = replace(one, A=path.at(one.stamps_ns + round(1e9 * offsets_s[pair.sensor]))[0])
         moved[pair] = one
     return problem.with_measurements(moved)
+
+
+def _predicted(
+    problem: Problem, answer: RefinedPoses, sensor: str, inliers: Mapping[Pair, np.ndarray] | None = None
+) -> PredictionError:
+    """How well an answer predicts what a sensor measured; of some measurements, or of all."""
+    errors = []
+    for pair in problem.pairs:
+        if pair.sensor == sensor:
+            of_pair = prediction_errors(problem, answer, pair, problem.measurements(*pair))
+            errors.append(of_pair if inliers is None else of_pair[:, inliers[pair]])
+    return PredictionError.of(*np.concatenate(errors, axis=1))
 
 
 def checks_of(
     result: Result, old: RefinedPoses, found: NearAnswer, problem: Problem, path: Trajectory | None
 ) -> dict[str, SensorCheck]:
     """By sensor, how well the old poses and the best ones predict what it saw."""
-    problem = _at_offsets(problem, found, path)
-    held = replace(old, time_offsets_s={} if path is not None else found.time_offsets_s)
-    best = replace(held, X=found.X, Y=found.Y, scale=found.scale)
+    offsets_s = found.refined.time_offsets_s
+    if path is not None:
+        problem, offsets_s = _at_offsets(problem, offsets_s, path), {}
+    answers = [replace(each, time_offsets_s=offsets_s) for each in (old, found.refined)]
     checks = {}
     for sensor in problem.sensors:
-        pairs = [pair for pair in problem.pairs if pair.sensor == sensor]
-        errors = []
-        for answer in (held, best):
-            of_pairs = [
-                prediction_errors(problem, answer, pair, problem.measurements(*pair))[:, found.inliers[pair]]
-                for pair in pairs
-            ]
-            errors.append(PredictionError.of(*np.concatenate(of_pairs, axis=1)))
+        held, best = (_predicted(problem, answer, sensor, found.inliers) for answer in answers)
+        outliers = sum(int((~inliers).sum()) for pair, inliers in found.inliers.items() if pair.sensor == sensor)
         before = _residual_m(result, sensor)
-        checks[sensor] = SensorCheck(
-            held=errors[0],
-            best=errors[1],
-            outliers=sum(int((~found.inliers[pair]).sum()) for pair in pairs),
-            noise_ratio=None if before is None else 1e-3 * errors[1].translation_rms_mm / before,
-        )
+        ratio = None if before is None else 1e-3 * best.translation_rms_mm / before
+        checks[sensor] = SensorCheck(held, best, outliers, ratio)
     return checks
 
 
@@ -162,10 +165,7 @@ def far_off(result: Result, old: RefinedPoses, problem: Problem) -> dict[str, Se
     """The sensors whose new measurements are far off the old poses' predictions, whatever the noise is."""
     checks = {}
     for sensor in problem.sensors:
-        pairs = [pair for pair in problem.pairs if pair.sensor == sensor]
-        here = replace(old, time_offsets_s={})
-        errors = [prediction_errors(problem, here, pair, problem.measurements(*pair)) for pair in pairs]
-        held = PredictionError.of(*np.concatenate(errors, axis=1))
+        held = _predicted(problem, replace(old, time_offsets_s={}), sensor)
         residuals = [result.solution.residuals[pair] for pair in result.solution.residuals if pair.sensor == sensor]
         before_mm = 1e3 * max((one.translation_rms_m for one in residuals), default=0.0)
         before_deg = float(np.degrees(max((one.rotation_rms_rad for one in residuals), default=0.0)))
@@ -263,16 +263,10 @@ def verify(
         common.difference, common.covariances, common.free, common.groups,
         (refined.degrees_of_freedom, found.degrees_of_freedom), level,
     )  # fmt: skip
-    movements = {
-        name: Movement.of(pose, now[name])
-        for poses, now in ((refined.Y, found.Y), (refined.X, found.X))
-        for name, pose in poses.items()
-        if name in now
-    }
     checks = checks_of(result, refined, found, stated, carrier_path)
     return Verification(
         test=test,
-        movements=movements,
+        movements=movements_of(refined, found.refined),
         sensors=checks,
         not_checked=not_checked,
         targets_may_move=targets_may_move,
@@ -290,9 +284,9 @@ def _compared(
 ) -> tuple[NearAnswer, Quantities]:
     """What the new measurements say near the old poses, and what of it can be compared."""
     found = near(old, problem, how, noise, progress)
-    common = quantities(old, found, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
+    common = quantities(old, found.refined, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
     if targets_may_move:
-        common = _of_sensors(common, old)
+        common = common.only(lambda unknown: unknown.owner in old.Y)
     if not common.slots:
         said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
         raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
@@ -301,13 +295,10 @@ def _compared(
 
 def in_words(common: Quantities) -> dict[str, str]:
     """What is not compared, and why."""
-    words = {"of OLD": "of the old log", "of NEW": "of the new log"}
-    said = {}
-    for unknown, why in common.not_compared.items():
-        for name, other in words.items():
-            why = why.replace(name, other)
-        said[str(unknown)] = why
-    return said
+    return {
+        str(unknown): why.replace("of OLD", "of the old log").replace("of NEW", "of the new log")
+        for unknown, why in common.not_compared.items()
+    }
 
 
 def _unseen(old: RefinedPoses, problem: Problem, targets_may_move: bool) -> dict[str, str]:
@@ -319,28 +310,10 @@ def _unseen(old: RefinedPoses, problem: Problem, targets_may_move: bool) -> dict
 
 
 def _noise_options(carrier: CarrierNoise | None, *, systematic: bool) -> NoiseOptions:
-    stated: dict[Component, float] = {}
-    if carrier is not None and carrier.covariances is None:
-        stated = {
-            Component.CARRIER_ROTATION: carrier.rotation_rad,
-            Component.CARRIER_TRANSLATION: carrier.translation_m,
-        }
-        return NoiseOptions(stated=stated, systematic=systematic, side=carrier.about)
-    return NoiseOptions(systematic=systematic)
-
-
-def _of_sensors(common: Quantities, old: RefinedPoses) -> Quantities:
-    """The quantities that are not of targets: these are unknown again."""
-    kept = {unknown: rows for unknown, rows in common.slots.items() if unknown.owner in old.Y}
-    rows = [row for place in kept.values() for row in range(place.start, place.stop)]
-    slots, first = {}, 0
-    for unknown, place in kept.items():
-        slots[unknown] = slice(first, first + place.stop - place.start)
-        first = slots[unknown].stop
-    at = np.ix_(rows, rows)
-    one, other = common.covariances
-    not_compared = {unknown: why for unknown, why in common.not_compared.items() if unknown.owner in old.Y}
-    return Quantities(common.difference[rows], (one[at], other[at]), common.free[rows], slots, not_compared)
+    if carrier is None or carrier.covariances is not None:
+        return NoiseOptions(systematic=systematic)
+    stated = {Component.CARRIER_ROTATION: carrier.rotation_rad, Component.CARRIER_TRANSLATION: carrier.translation_m}
+    return NoiseOptions(stated=stated, systematic=systematic, side=carrier.about)
 
 
 def _remarks(

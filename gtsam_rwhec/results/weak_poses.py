@@ -16,22 +16,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import PairNoise, Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.results.evidence_record import EvidenceRecord
-from gtsam_rwhec.results.linear_model import MeasuredRows
+from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Triple, triple
+from gtsam_rwhec.results.linear_model import MeasuredRows, derivatives, noise_of_A
 
-Triple = tuple[float, float, float]
 Kind = Literal["translation", "rotation"]
 #: The turn of the thought experiment, and how many measurements it has, half of them to each side.
 TURN_RAD, MORE = np.radians(30.0), 10
@@ -41,23 +38,21 @@ WEAK = 3.0
 BETTER = 0.9
 
 
-class WeakDirection(EvidenceRecord):
+class WeakDirection(FileRecord):
     """The least known direction of a frame, along which or about which its pose is most uncertain."""
 
-    frame: str = Field(description="sensor or target")
-    kind: Kind = Field(description="along the direction, or about it")
-    carrier: str = Field(description="name of the frame's carrier")
-    axis: Triple = Field(description="the direction, a unit vector in the frame's own axes; its sign is arbitrary")
-    axis_in_carrier: Triple = Field(description="the same in the carrier's axes")
-    deviation: float = Field(description="one standard deviation, millimetres or degrees", ge=0.0)
-    least: float = Field(description="the deviation along, or about, the frame's best known direction", ge=0.0)
-    is_weak: bool = Field(description=f"whether it is more than {WEAK:g} times the median of all directions")
-    partner: str | None = Field(default=None, description="the frame with which it was measured most often")
-    turn: Triple | None = Field(
-        default=None, description="the best axis to turn about, in the axes of the sensors' carrier; null: none is"
-    )
-    after_turning: float | None = Field(default=None, description="the deviation after ten such measurements")
-    after_more: float | None = Field(default=None, description="the deviation after ten more like those there are")
+    frame: str  #: Sensor or target
+    kind: Kind  #: Along the direction, or about it
+    carrier: str  #: Name of the frame's carrier
+    axis: Triple  #: The direction, a unit vector in the frame's own axes; its sign is arbitrary
+    axis_in_carrier: Triple  #: The same in the carrier's axes
+    deviation: NotNegative  #: One standard deviation, millimetres or degrees
+    least: NotNegative  #: The deviation along, or about, the frame's best known direction
+    is_weak: bool  #: Whether it is more than ``WEAK`` times the median of all directions
+    partner: str | None = None  #: The frame with which it was measured most often
+    turn: Triple | None = None  #: The best axis to turn about, in the axes of the sensors' carrier; null: none is
+    after_turning: float | None = None  #: The deviation after ten such measurements
+    after_more: float | None = None  #: The deviation after ten more like those there are
 
 
 def weak_directions(calibration: Calibration, rows: Mapping[Pair, MeasuredRows]) -> tuple[WeakDirection, ...]:
@@ -97,8 +92,8 @@ def _directions(
                 frame=frame,
                 kind=kind,
                 carrier=names[0] if is_sensor else names[1],
-                axis=_triple(axis),
-                axis_in_carrier=_triple(R @ axis),
+                axis=triple(axis),
+                axis_in_carrier=triple(R @ axis),
                 deviation=float(sizes[-1]),
                 least=float(sizes[0]),
                 is_weak=False,
@@ -129,9 +124,8 @@ def _tried(
         return None
     X, Y = refined.X[pair.target].matrix(), refined.Y[pair.sensor].matrix()
     A = measured.A[measured.used]
-    noise = refined.noise[pair]
-    model = _Measured(X, Y, (noise.rotation_rad, noise.translation_m), _carrier_noise(calibration))
-    credit = model.information(A)
+    of_pair = X, Y, refined.noise[pair], calibration.noise_of_A
+    credit = _information(A, *of_pair)
     root = np.linalg.cholesky(covariance + 1e-15 * np.diag(np.diagonal(covariance) + 1e-300))
     share = float(np.linalg.eigvalsh(root.T @ credit @ root)[-1])
     like = A[np.linspace(0, len(A) - 1, MORE).round().astype(int)]
@@ -144,35 +138,20 @@ def _tried(
         turns = np.tile([TURN_RAD, -TURN_RAD], MORE // 2)[:, None] * axis
         turned = se3.expmap(np.hstack([turns, np.zeros_like(turns)]))
         turned[:, :3, 3] = place - turned[:, :3, :3] @ place
-        motions.append((_triple(axis), turned @ middle))
+        motions.append((triple(axis), turned @ middle))
     result = []
     for turn, poses in motions:
-        added = root.T @ (model.information(poses) / max(share, 1.0)) @ root
+        added = root.T @ (_information(poses, *of_pair) / max(share, 1.0)) @ root
         result.append((turn, root @ np.linalg.inv(np.eye(12) + added) @ root.T))
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """What measurements of a pair tell of its target and sensor: X, Y (4, 4), B's noise (rad, m), and A's."""
-
-    X: Array
-    Y: Array
-    noise: tuple[float, float]
-    carrier: CarrierNoise | None
-
-    def information(self, A: Array) -> Array:
-        """The information (12, 12) of measurements at A (n, 4, 4), if their noise is independent."""
-        B = se3.inverse(self.Y[None]) @ A @ self.X
-        J = np.concatenate([np.broadcast_to(np.eye(6), (len(A), 6, 6)), -se3.adjoint(se3.inverse(B))], axis=2)
-        noise = np.broadcast_to(np.diag(np.repeat(np.square(self.noise), 3)), (len(A), 6, 6))
-        if self.carrier is not None:
-            moved = self.X[None] if self.carrier.about == "targetcarrier" else A @ self.X
-            by = se3.adjoint(se3.inverse(moved))
-            own = np.repeat([self.carrier.rotation_rad**2, self.carrier.translation_m**2], 3)
-            noise = noise + (by * own) @ by.transpose(0, 2, 1)
-        total: Array = (J.transpose(0, 2, 1) @ np.linalg.solve(noise, J)).sum(axis=0)
-        return total
+def _information(A: Array, X: Array, Y: Array, noise: PairNoise, carrier: CarrierNoise | None) -> Array:
+    """The information (12, 12) of measurements at A (n, 4, 4) on target and sensor, if their noise is independent."""
+    J = derivatives(se3.inverse(Y[None]) @ A @ X)[:, :, :12]
+    own = np.diag(np.repeat([noise.rotation_rad**2, noise.translation_m**2], 3))
+    total: Array = (J.transpose(0, 2, 1) @ np.linalg.solve(own + noise_of_A(carrier, A, X), J)).sum(axis=0)
+    return total
 
 
 def _best(
@@ -187,16 +166,3 @@ def _best(
     if left[best] < BETTER * more:
         found |= {"turn": tried[best][0], "after_turning": left[best]}
     return found
-
-
-def _carrier_noise(calibration: Calibration) -> CarrierNoise | None:
-    """The noise of A that was found, or stated as standard deviations."""
-    model = calibration.noise.model
-    noise = None if model is None else model.carrier_noise
-    noise = noise or calibration.options.carrier_noise
-    return None if noise is None or noise.covariances is not None else noise
-
-
-def _triple(values: Array) -> Triple:
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z

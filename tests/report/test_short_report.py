@@ -59,7 +59,7 @@ def large(sensors: int, targets: int, facts: int, advice: int, sentences: int) -
     return ShortReport(
         judgement=rw.Judgement.of(found, "nothing speaks against them"),
         advice=tuple(
-            (f"  - Do the thing of number {i}, and what it asks for in many words.", "") for i in range(advice)),
+            (f"Do the thing of number {i}, and what it asks for in many words.", "") for i in range(advice)),
         points=points,
         poses=(PoseTables(tables, "±: of all axes."), PoseTables(tuple(map(with_largest, tables)), "±: the largest.")),
         sentences=tuple((f"A sentence of number {i}.", "") for i in range(sentences)),
