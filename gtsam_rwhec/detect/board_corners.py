@@ -82,8 +82,6 @@ def crossings_of_edges(gray: Gray, corners_px: Array, directions: Array, along_p
     return np.asarray(q + low)
 
 
-#: cornerSubPix ends after 30 rounds, or with a step of at most 1e-3 pixels.
-CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 #: Blur and the gradient's window widen each printed edge by this many pixels.
 GRADIENT_PX = 2.0
 #: Corners nearer to the image's border than this are not measured, pixels.
@@ -260,9 +258,3 @@ def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndar
         sigma = float(np.median(off[kept])) / 1.18
         kept = off <= np.clip(ASTRAY_SIGMA * sigma, ASTRAY_LEAST_PX, ASTRAY_PX)
     return kept
-
-
-def refined_corners(gray: Gray, corners: Array, half: int) -> Array:
-    """Places (n, 2) of corners where two dark squares meet, in windows of 2 half + 1 pixels."""
-    places = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
-    return cv2.cornerSubPix(gray, places, (half, half), (-1, -1), CRITERIA).reshape(-1, 2).astype(float)
