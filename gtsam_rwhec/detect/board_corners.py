@@ -16,6 +16,7 @@ import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import AprilGrid, Charuco
+from gtsam_rwhec.detect.board_evidence import BoardPlane
 from gtsam_rwhec.detect.board_layout import BoardTags, largest_off, tag_places
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.geometry.poses import Array
@@ -30,32 +31,26 @@ SETTLED_PX, ROUNDS = 2e-3, 15
 LEAST_SHARE = 0.08
 
 
-@dataclass(frozen=True, eq=False)
-class Strips:
-    """Where the edges of n corners are, up to a pixel."""
+def crossings_of_edges(gray: Gray, corners_px: Array, directions: Array, along_px: Array, across_px: Array) -> Array:
+    """Places (n, 2) of the corners, pixels; nan where two edges were not found.
 
-    corners_px: Array  #: (n, 2)
-    directions: Array  #: (n, 2, 2): unit vectors along the two edges in the image
-    #: (n, 2): the free length along each edge and the free width across it, where nothing else is printed, pixels
-    along_px: Array
-    across_px: Array
-
-
-def crossings_of_edges(gray: Gray, strips: Strips) -> Array:
-    """Places (n, 2) of the corners, pixels; nan where two edges were not found."""
-    along = np.clip(strips.along_px, LEAST_ALONG, MOST_ALONG)[:, None].astype(np.float32)
-    across = np.clip(strips.across_px, LEAST_ACROSS, MOST_ACROSS)[:, None].astype(np.float32)
+    Up to a pixel they are at `corners_px` (n, 2); `directions` (n, 2, 2) are unit vectors along the two edges in the
+    image. `along_px` and `across_px` (n, 2) are the free length along each edge and the free width across it, where
+    nothing else is printed.
+    """
+    along = np.clip(along_px, LEAST_ALONG, MOST_ALONG)[:, None].astype(np.float32)
+    across = np.clip(across_px, LEAST_ACROSS, MOST_ACROSS)[:, None].astype(np.float32)
     half = int(np.ceil(along.max(initial=LEAST_ALONG))) + 1
-    low = np.maximum(np.floor(strips.corners_px.min(axis=0)).astype(int) - half - 3, 0)
-    high = np.minimum(np.ceil(strips.corners_px.max(axis=0)).astype(int) + half + 4, gray.shape[::-1])
+    low = np.maximum(np.floor(corners_px.min(axis=0)).astype(int) - half - 3, 0)
+    high = np.minimum(np.ceil(corners_px.max(axis=0)).astype(int) + half + 4, gray.shape[::-1])
     part = np.ascontiguousarray(gray[low[1] : high[1], low[0] : high[0]])
     if min(part.shape) < 3:
-        return np.full_like(strips.corners_px, np.nan)
+        return np.full_like(corners_px, np.nan)
     slopes = np.stack([cv2.Sobel(part, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1))], axis=-1)
     window = np.stack(np.meshgrid(*2 * [np.arange(-half, half + 1)]), axis=-1).reshape(-1, 2)
-    directions = strips.directions.astype(np.float32)
+    directions = directions.astype(np.float32)
     normals = np.stack([-directions[..., 1], directions[..., 0]], axis=-1)
-    start = strips.corners_px - low
+    start = corners_px - low
     q = start.copy()
     limit = np.array(part.shape[::-1]) - 1
     moving = np.arange(len(q))
@@ -87,8 +82,6 @@ def crossings_of_edges(gray: Gray, strips: Strips) -> Array:
     return np.asarray(q + low)
 
 
-#: cornerSubPix ends after 30 rounds, or with a step of at most 1e-3 pixels.
-CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 #: Blur and the gradient's window widen each printed edge by this many pixels.
 GRADIENT_PX = 2.0
 #: Corners nearer to the image's border than this are not measured, pixels.
@@ -157,7 +150,7 @@ def board_corners(gray: Gray, board: Charuco | AprilGrid, tags: BoardTags, camer
     # The pattern repeats itself, so the search must not jump: the known part grows by one square or tag at a time.
     pitch = board.square_m if isinstance(board, Charuco) else board.tag_m * (1.0 + board.spacing)
     while True:
-        places = _Places.of(camera, known, seen)
+        places = _plane(camera, known, seen)
         if places is None:
             return nothing
         near = np.abs(corners.places[:, None] - known).max(axis=2).min(axis=1) < NEAR * pitch
@@ -176,10 +169,16 @@ def board_corners(gray: Gray, board: Charuco | AprilGrid, tags: BoardTags, camer
             known, seen = np.concatenate([known, tag_plane]), np.concatenate([seen, tags_px])
     order = np.argsort(numbers)
     numbers, found = numbers[order], found[order]
-    places = _Places.of(camera, known, seen)
+    places = _plane(camera, known, seen)
     if places is None or not _are_there(places, tag_plane, tags_px):
         return nothing
     return numbers, found
+
+
+def _plane(camera: Camera, known: Array, seen: Array) -> BoardPlane | None:
+    """The plane of points (n, 2) that were seen at pixels (n, 2), by those that have a ray."""
+    has_ray = camera.has_ray(seen)
+    return BoardPlane.through(known[has_ray], seen[has_ray], camera)
 
 
 def _span_a_plane(points: Array) -> bool:
@@ -188,47 +187,19 @@ def _span_a_plane(points: Array) -> bool:
     return bool(extent[1] > 0.1 * extent[0])
 
 
-def _are_there(places: _Places, tag_plane: Array, tags_px: Array) -> bool:
+def _are_there(places: BoardPlane, tag_plane: Array, tags_px: Array) -> bool:
     """Whether the tags' corners (4 m, 2) are where the board's corners predict them."""
-    off = np.linalg.norm(places.pixels(tag_plane) - tags_px, axis=1).reshape(-1, 4).max(axis=1)
+    off = np.linalg.norm(places.seen(tag_plane) - tags_px, axis=1).reshape(-1, 4).max(axis=1)
     return bool(np.median(off / largest_off(tags_px.reshape(-1, 4, 2))) <= 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """Projects a plane's points into the image: a homography (3, 3) to a camera without distortion, then the
-    distortion.
-    """
-
-    H: Array
-    focal: float
-    camera: Camera
-
-    @staticmethod
-    def of(camera: Camera, plane: Array, pixels: Array) -> _Places | None:
-        """Fit the homography to points (n, 2) of the plane and their pixels (n, 2); None where it cannot be fitted."""
-        focal = camera.focal_px
-        flat = camera.undistort(pixels) * focal
-        good = np.isfinite(flat).all(axis=1)
-        if good.sum() < 4:
-            return None
-        H, _ = cv2.findHomography(plane[good], flat[good], 0)
-        return None if H is None or not np.isfinite(H).all() else _Places(np.asarray(H), focal, camera)
-
-    def pixels(self, plane: Array) -> Array:
-        """Pixels (..., 2) of points (..., 2); nan where the camera does not see them."""
-        flat = np.asarray(cv2.perspectiveTransform(plane.reshape(-1, 1, 2), self.H)).reshape(plane.shape) / self.focal
-        within = np.linalg.norm(flat, axis=-1, keepdims=True) < self.camera.ring
-        return self.camera.pixels(np.where(within, flat, np.nan))
-
-
-def _found(gray: Gray, corners: _Corners, places: _Places, which: np.ndarray) -> tuple[np.ndarray, Array]:
+def _found(gray: Gray, corners: _Corners, places: BoardPlane, which: np.ndarray) -> tuple[np.ndarray, Array]:
     """Indices and places of the corners of `which` that look as printed."""
     at = corners.places[which]
-    predicted = places.pixels(at)
+    predicted = places.seen(at)
     nudge = 1e-3 * corners.along
     # Pixels (n, 2, 2) of a step along the board's x and y.
-    steps = np.stack([places.pixels(at + nudge * axis) - predicted for axis in np.eye(2)], axis=1) / nudge
+    steps = np.stack([places.seen(at + nudge * axis) - predicted for axis in np.eye(2)], axis=1) / nudge
     length = np.linalg.norm(steps, axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
         directions = steps / length[..., None]
@@ -240,20 +211,15 @@ def _found(gray: Gray, corners: _Corners, places: _Places, which: np.ndarray) ->
     which, predicted = which[inside], predicted[inside]
     if not len(which):
         return which, predicted
-    strips = Strips(
-        predicted,
-        directions[inside],
-        corners.along * length[inside] - GRADIENT_PX,
-        corners.across * apart[inside] - GRADIENT_PX,
-    )
-    refined = crossings_of_edges(gray, strips)
+    along, across = corners.along * length[inside], corners.across * apart[inside]
+    refined = crossings_of_edges(gray, predicted, directions[inside], along - GRADIENT_PX, across - GRADIENT_PX)
     moved = np.linalg.norm(refined - predicted, axis=1)
     with np.errstate(invalid="ignore"):
-        good = moved < np.maximum(MOST_MOVED * (corners.across * apart[inside]).min(axis=1), LEAST_MOVED_PX)
+        good = moved < np.maximum(MOST_MOVED * across.min(axis=1), LEAST_MOVED_PX)
     refined = np.where(good[:, None], refined, predicted)
     off = refined - predicted
     dark, light = (
-        _gray_at(gray, places.pixels(corners.places[which, None] + offsets[which]) + off[:, None])
+        _gray_at(gray, places.seen(corners.places[which, None] + offsets[which]) + off[:, None])
         for offsets in (corners.dark, corners.light)
     )
     contrast = light.min(axis=1) - dark.max(axis=1)
@@ -292,9 +258,3 @@ def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndar
         sigma = float(np.median(off[kept])) / 1.18
         kept = off <= np.clip(ASTRAY_SIGMA * sigma, ASTRAY_LEAST_PX, ASTRAY_PX)
     return kept
-
-
-def refined_corners(gray: Gray, corners: Array, half: int) -> Array:
-    """Places (n, 2) of corners where two dark squares meet, in windows of 2 half + 1 pixels."""
-    places = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
-    return cv2.cornerSubPix(gray, places, (half, half), (-1, -1), CRITERIA).reshape(-1, 2).astype(float)

@@ -56,7 +56,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class BoardPlane:
-    """A board before a camera: H (3, 3) takes steps, from the first corner or circle, to pixels without distortion."""
+    """A board before a camera: H (3, 3) takes places on it to pixels without distortion."""
 
     H: Array
     focal: float
@@ -75,10 +75,20 @@ class BoardPlane:
         return BoardPlane(np.asarray(H, dtype=float), focal, camera)
 
     def pixels(self, steps: Array) -> Array:
-        """Pixels (..., 2) of places (..., 2) on the board, in steps to the right and down from the first."""
+        """Pixels (..., 2) of places (..., 2), as in `through`: steps right and down from the first, or metres."""
+        flat = self._flat(steps)
+        return flat if self.camera is None else self.camera.pixels(flat / self.focal)
+
+    def seen(self, steps: Array) -> Array:
+        """As `pixels`; nan where the camera does not see a place, since its distortion folds back."""
+        assert self.camera is not None
+        x = self._flat(steps) / self.focal
+        within = np.linalg.norm(x, axis=-1, keepdims=True) < self.camera.ring
+        return self.camera.pixels(np.where(within, x, np.nan))
+
+    def _flat(self, steps: Array) -> Array:
         flat = cv2.perspectiveTransform(np.asarray(steps, dtype=float).reshape(-1, 1, 2), self.H)
-        found: Array = np.asarray(flat, dtype=float).reshape(np.shape(steps))
-        return found if self.camera is None else self.camera.pixels(found / self.focal)
+        return np.asarray(flat, dtype=float).reshape(np.shape(steps))
 
     def jacobians(self, steps: Array) -> Array:
         """Derivatives (..., 2, 2) of pixels by steps, by central differences over a fifth of a step."""

@@ -30,26 +30,19 @@ FLAT = 1e-4
 SAMPLES = 200
 
 
-def agreeing(places: Array, flat: Array, off_px: Array | None = None) -> np.ndarray:
+def agreeing(places: Array, flat: Array) -> np.ndarray:
     """Say which (m,) of a board's tags are in the largest set that fits one pose. A single tag agrees with itself.
 
-    Parameters
-    ----------
-    places : (m, 4, 3) array
-        The tags' corners in the board's frame, any unit.
-    flat : (m, 4, 2) array
-        Where they were seen, pixels of a camera without distortion, from its principal point; nan agrees with nothing.
-    off_px : (m,) array, optional
-        By how much a corner may be off; by default `LARGEST_OFF` of the tag's side.
+    `places` (m, 4, 3) are the tags' corners in the board's frame, any unit; `flat` (m, 4, 2) is where they were seen,
+    pixels of a camera without distortion, from its principal point; nan agrees with nothing.
     """
     seen = np.asarray(np.isfinite(flat).all(axis=(1, 2)))
+    in_plane = plane_coordinates(places)
     if seen.sum() < 2:
         return seen
-    largest = largest_off(flat) if off_px is None else off_px
-    in_plane = plane_coordinates(places)
     agrees = np.zeros(len(places), dtype=bool)
     if in_plane is not None:
-        agrees[seen] = _by_homography(in_plane[seen], flat[seen], largest[seen])
+        agrees[seen] = _by_homography(in_plane[seen], flat[seen])
     return agrees
 
 
@@ -89,8 +82,7 @@ def agreeing_in_space(places: Array, x: Array, off: Array) -> np.ndarray:
 
 def all_agree(plane: Array, flat: Array) -> bool:
     """Whether all tags (m, 4, 2) of a plane, seen at `flat` (m, 4, 2), fit one least-squares homography."""
-    H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), 0)
-    return bool(_near(np.asarray(H), plane, flat, largest_off(flat)).all())
+    return bool((_off(plane, flat) <= largest_off(flat)).all())
 
 
 def spans_a_plane(plane: Array) -> bool:
@@ -121,31 +113,30 @@ def plane_coordinates(places: Array) -> Array | None:
     return np.asarray((places - middle) @ both.T)
 
 
-def _by_homography(plane: Array, flat: Array, largest: Array) -> np.ndarray:
+def _by_homography(plane: Array, flat: Array) -> np.ndarray:
     """`agreeing` for tags in one plane: RANSAC over the corners, then least squares over the tags that agree."""
-    everything = np.ones(len(plane), dtype=bool)
-    H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), 0)
-    agrees = _near(np.asarray(H), plane, flat, largest)
+    largest = largest_off(flat)
+    agrees = _off(plane, flat) <= largest
     if agrees.all():
-        return everything
-    H, _ = cv2.findHomography(plane.reshape(-1, 2), flat.reshape(-1, 2), cv2.RANSAC, float(np.median(largest)))
-    agrees = _near(np.asarray(H), plane, flat, largest)
+        return agrees
+    agrees = _off(plane, flat, ransac_px=float(np.median(largest))) <= largest
     for _ in range(2):
-        if agrees.sum() < 2:
-            break
-        H, _ = cv2.findHomography(plane[agrees].reshape(-1, 2), flat[agrees].reshape(-1, 2), 0)
-        again = _near(np.asarray(H), plane, flat, largest)
+        again = _off(plane, flat, agrees) <= largest if agrees.sum() > 1 else agrees
         if again.sum() < agrees.sum():
             break
         agrees = again
     return agrees
 
 
-def _near(H: Array, plane: Array, flat: Array, largest: Array) -> np.ndarray:
-    if H.dtype == object or not np.isfinite(H).all():
-        return np.zeros(len(plane), dtype=bool)
+def _off(plane: Array, flat: Array, fitted: np.ndarray | None = None, ransac_px: float | None = None) -> Array:
+    """How far (m,) a corner of each tag is off a homography of the `fitted` tags, pixels; infinite where none fits."""
+    some = slice(None) if fitted is None else fitted
+    method = (0,) if ransac_px is None else (cv2.RANSAC, ransac_px)
+    H, _ = cv2.findHomography(plane[some].reshape(-1, 2), flat[some].reshape(-1, 2), *method)
+    if H is None or not np.isfinite(H).all():
+        return np.full(len(plane), np.inf)
     predicted = cv2.perspectiveTransform(plane.reshape(-1, 1, 2), H).reshape(flat.shape)
-    return np.asarray(np.linalg.norm(predicted - flat, axis=2).max(axis=1) <= largest)
+    return np.asarray(np.linalg.norm(predicted - flat, axis=2).max(axis=1))
 
 
 #: Fewer tags fit too many layouts.
@@ -156,12 +147,8 @@ MOST_COLUMNS = 30
 ORDERS = [(left, top, along) for along in (True, False) for top in (True, False) for left in (True, False)]
 
 
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """The tags' places (m, 4, 2) in a possible layout, any unit, and what the rig file must say for it."""
-
-    plane: Array
-    cure: str
+#: The tags' places (m, 4, 2) in a possible layout, any unit, and what the rig file must say for it.
+_Layout: TypeAlias = tuple[Array, str]
 
 
 def layout_that_fits(board: Charuco | AprilGrid | TagGrid, ids: np.ndarray, flat: Array) -> str:
@@ -171,49 +158,36 @@ def layout_that_fits(board: Charuco | AprilGrid | TagGrid, ids: np.ndarray, flat
     """
     if len(np.unique(ids)) < max(LEAST_TAGS, len(ids)) or not np.isfinite(flat).all():
         return ""
-    for layout in _charucos(board, ids) if isinstance(board, Charuco) else _grids(board, ids):
-        turns = range(4) if isinstance(board, AprilGrid) else (0,)
-        if spans_a_plane(layout.plane) and any(all_agree(layout.plane, np.roll(flat, t, axis=1)) for t in turns):
-            return layout.cure
+    turns = range(4) if isinstance(board, AprilGrid) else (0,)
+    for plane, cure in _charucos(board, ids) if isinstance(board, Charuco) else _grids(board, ids):
+        if spans_a_plane(plane) and any(all_agree(plane, np.roll(flat, turn, axis=1)) for turn in turns):
+            return cure
     return ""
 
 
 def _charucos(board: Charuco, ids: np.ndarray) -> Iterator[_Layout]:
-    tried = [(replace_sizes(board, board.rows, board.columns), f"write squares: [{board.rows}, {board.columns}]")]
+    tried: list[tuple[dict[str, int], str]] = [
+        ({"columns": board.rows, "rows": board.columns}, f"write squares: [{board.rows}, {board.columns}]")
+    ]
     count = board.columns * board.rows // 2
-    for shift in range(-int(ids.min()), count):
-        if shift and board.first_id + shift <= ids.min() and ids.max() < board.first_id + shift + count:
-            tried.append((_shifted(board, shift), f"write first_id: {board.first_id + shift}"))
+    for first in range(board.first_id - int(ids.min()), board.first_id + count):
+        if first != board.first_id and first <= ids.min() and ids.max() < first + count:
+            tried.append(({"first_id": first}, f"write first_id: {first}"))
     for columns in range(2, MOST_COLUMNS):
-        rows = int(np.ceil(2 * (ids.max() - board.first_id + 1) / columns))
-        whole = board.columns * board.rows // columns
-        words = (
-            f"count the squares: the markers fit {columns} columns, as in squares: [{columns}, {max(rows, whole, 2)}]"
-        )
-        tried.append((replace_sizes(board, columns, max(rows, whole, 2)), words))
-    for candidate, words in tried:
-        if candidate is None:
+        needed = int(np.ceil(2 * (ids.max() - board.first_id + 1) / columns))
+        rows = max(needed, board.columns * board.rows // columns, 2)
+        words = f"count the squares: the markers fit {columns} columns, as in squares: [{columns}, {rows}]"
+        tried.append(({"columns": columns, "rows": rows}, words))
+    for changes, words in tried:
+        try:
+            candidate = replace(board, **changes)
+        except TargetError:  # its family has too few markers
             continue
         for is_legacy in (False, True):
             cells = _markers(candidate, is_legacy)
             rows_of = ids - candidate.first_id
             if rows_of.min() >= 0 and rows_of.max() < len(cells):
-                yield _Layout(_tags(cells[rows_of], candidate.square_m, candidate.marker_m), words)
-
-
-def replace_sizes(board: Charuco, columns: int, rows: int) -> Charuco | None:
-    """The board with other numbers of squares; None if its family has too few markers."""
-    try:
-        return replace(board, columns=columns, rows=rows)
-    except TargetError:
-        return None
-
-
-def _shifted(board: Charuco, shift: int) -> Charuco | None:
-    try:
-        return replace(board, first_id=board.first_id + shift)
-    except TargetError:
-        return None
+                yield _tags(cells[rows_of], candidate.square_m, candidate.marker_m), words
 
 
 def _markers(board: Charuco, is_legacy: bool) -> Array:
@@ -251,7 +225,7 @@ def _grids(board: AprilGrid | TagGrid, ids: np.ndarray) -> Iterator[_Layout]:
             tags = f"tags: [{columns}, {rows}], ids: [{', '.join(map(str, listed))}]"
             as_grid = f"type: tag_grid, tag_m: {board.tag_m:g}, gap_m: {gap:g}, "
             cure = f"write {as_grid if is_kalibrs else ''}{tags}"
-        yield _Layout(_tags(cells, board.tag_m + gap, board.tag_m), cure)
+        yield _tags(cells, board.tag_m + gap, board.tag_m), cure
 
 
 def _cells(k: np.ndarray, columns: int, rows: int, order: tuple[bool, bool, bool]) -> Array:
@@ -358,12 +332,4 @@ def _quarter_turns(places: Array, flat: Array) -> int:
     """By how many quarter turns a grid's tags are turned in their places: generators of grids differ in this."""
     if not np.isfinite(flat).all():
         return 0
-    errors = []
-    for turn in range(4):
-        turned = np.roll(flat, turn, axis=1)
-        H, _ = cv2.findHomography(places[..., :2].reshape(-1, 2), turned.reshape(-1, 2), 0)
-        if H is None:
-            return 0
-        predicted = cv2.perspectiveTransform(places[..., :2].reshape(-1, 1, 2), H).reshape(flat.shape)
-        errors.append(float(np.median(np.linalg.norm(predicted - turned, axis=2).max(axis=1))))
-    return int(np.argmin(errors))
+    return int(np.argmin([np.median(_off(places[..., :2], np.roll(flat, turn, axis=1))) for turn in range(4)]))

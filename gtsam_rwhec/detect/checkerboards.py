@@ -17,16 +17,12 @@ from scipy.special import ndtr
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.detect.board_corners import refined_corners
 from gtsam_rwhec.detect.board_evidence import LEAST_KEPT, Evidence, FoundBoard, evidence, plane_through, smallest_step
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.detect.saddle_lattices import LEVELS, boards_in, groups_of, lattices, saddles, scaled_down
 from gtsam_rwhec.geometry.poses import Array
 
-#: The half window at a corner is this share of the distance between neighbouring lines of corners, at most 9 pixels.
-#: The second share is tried if the first gives corners that are not on a grid.
-OF_SQUARE = (0.4, 0.25)
 #: Rough corners, before they are measured, may be off their places in a plane by this (pixels), or by this share of the
 #: distance between lines: a shadow's edge moves them.
 ROUGHLY_PX, ROUGHLY = 1.0, 0.06
@@ -86,26 +82,20 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
         grid = grid[::-1]
-    tried: list[tuple[Array, Evidence]] = []
-    for share in OF_SQUARE:  # a smaller window where something else is in the larger one, as a shadow's edge
-        step = smallest_step(grid)
-        rough = refined_corners(gray, grid.reshape(-1, 2), int(np.clip(share * step, 2, 9))).reshape(grid.shape)
-        tried.append(_measured(gray, rough, max(ROUGHLY_PX, ROUGHLY * step), camera))
-        if tried[-1][1].rejection is not Rejection.NOT_A_GRID:
-            break
-    refined, seen = tried[-1]
+    refined, seen = _measured(gray, grid, camera)
     kept = seen.kept
     if not seen.first_is_dark:
         refined, kept = _other_colour(refined), _other_colour(kept)
     return FoundBoard(refined[kept], np.flatnonzero(kept), seen.rejection)
 
 
-def _measured(gray: Gray, rough: Array, most_px: float, camera: Camera | None) -> tuple[Array, Evidence]:
+def _measured(gray: Gray, rough: Array, camera: Camera | None) -> tuple[Array, Evidence]:
     """Corners (rows, columns, 2), measured where the plane through most rough corners predicts them, and their
     evidence.
     """
     rows, columns = rough.shape[:2]
     everyone = np.ones((rows, columns), dtype=bool)
+    most_px = max(ROUGHLY_PX, ROUGHLY * smallest_step(rough))
     found = plane_through(rough, camera, most_px, everyone)
     if found is None or (found[1] <= most_px).mean() < LEAST_KEPT:
         return rough, Evidence(Rejection.NOT_A_GRID, everyone)

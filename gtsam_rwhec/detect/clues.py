@@ -43,8 +43,8 @@ def edge_blur_px(gray: Gray) -> float:
     Of a step that is blurred by s, a blur by s0 more lowers the gradient in its middle by R = sqrt(1 + s0^2 / s^2)
     (Zhuo and Sim 2011, equation 5). Wide edges are measured again with a larger s0, which noise disturbs less.
     """
-    blur_px = _edge_blur_px(gray, *AGAIN_PX[0])
-    return _edge_blur_px(gray, *AGAIN_PX[1]) if blur_px > WIDE_PX else blur_px
+    blur_px = _edge_blur_px(gray, AGAIN_PX[0])
+    return _edge_blur_px(gray, AGAIN_PX[1]) if blur_px > WIDE_PX else blur_px
 
 
 def motion_blur_px(gray: Gray) -> tuple[float, float]:
@@ -53,35 +53,40 @@ def motion_blur_px(gray: Gray) -> tuple[float, float]:
     The standard deviation as in `edge_blur_px`, of edges by their direction: what moves blurs the edges across its way,
     and leaves those along it sharp. A lens that is out of focus blurs all alike.
     """
-    smooth = cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), AGAIN_PX[0][0])
-    again = cv2.GaussianBlur(smooth, (0, 0), AGAIN_PX[0][1])
-    x, y = _slopes(np.asarray(smooth))
-    first, second = np.asarray(cv2.magnitude(x, y)), _gradient(np.asarray(again))
-    peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
-    direction = np.rint(np.arctan2(y, x) % np.pi / np.pi * DIRECTIONS).astype(int) % DIRECTIONS
+    gradients, ratios, directions = _edges(gray, AGAIN_PX[0])
+    number = np.rint(directions / np.pi * DIRECTIONS).astype(int) % DIRECTIONS
     found = []
-    for number in range(DIRECTIONS):
-        of_these = peak & (direction == number)
-        if of_these.sum() < FEWEST_EDGES:
-            continue
-        some = of_these & (first >= np.median(first[of_these]))
-        ratio = max(float(np.median(first[some] / np.maximum(second[some], 1e-6))), 1.01)
-        found.append(float(np.sqrt(max(AGAIN_PX[0][1] ** 2 / (ratio**2 - 1.0) - AGAIN_PX[0][0] ** 2, 0.0))))
+    for of_these in (number == direction for direction in range(DIRECTIONS)):
+        if of_these.sum() >= FEWEST_EDGES:
+            some = of_these & (gradients >= np.median(gradients[of_these]))
+            found.append(_blur_px(ratios[some], AGAIN_PX[0]))
     return (max(found), min(found)) if len(found) > 1 else (float("nan"), float("nan"))
 
 
-def _edge_blur_px(gray: Gray, first_px: float, again_px: float) -> float:
-    smooth = cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), first_px)
-    again = cv2.GaussianBlur(smooth, (0, 0), again_px)
-    first, second = (_gradient(np.asarray(values, dtype=np.float32)) for values in (smooth, again))
+def _edges(gray: Gray, by_px: tuple[float, float]) -> tuple[Array, Array, Array]:
+    """Gradients (n,) on edges, by how much (n,) more blur lowers them, and the edges' directions (n,), 0 to pi."""
+    smooth = cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), by_px[0])
+    (x, y), (x_again, y_again) = (
+        [cv2.Sobel(values, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
+        for values in (smooth, cv2.GaussianBlur(smooth, (0, 0), by_px[1]))
+    )
+    first, second = np.asarray(cv2.magnitude(x, y)), np.asarray(cv2.magnitude(x_again, y_again))
     peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
-    strong = np.sort(first[peak])[-max(20, round(EDGES * gray.size)) :]
-    if len(strong) < 20:
+    return first[peak], first[peak] / np.maximum(second[peak], 1e-6), np.arctan2(y[peak], x[peak]) % np.pi
+
+
+def _edge_blur_px(gray: Gray, by_px: tuple[float, float]) -> float:
+    gradients, ratios, _ = _edges(gray, by_px)
+    if len(gradients) < 20:
         return float("nan")
-    some = peak & (first >= strong[0])
-    ratio = max(float(np.median(first[some] / np.maximum(second[some], 1e-6))), 1.01)
-    # What the gradients were first smoothed by is taken off again.
-    return float(np.sqrt(max(again_px**2 / (ratio**2 - 1.0) - first_px**2, 0.0)))
+    least = np.sort(gradients)[-max(20, round(EDGES * gray.size)) :][0]
+    return _blur_px(ratios[gradients >= least], by_px)
+
+
+def _blur_px(ratios: Array, by_px: tuple[float, float]) -> float:
+    """The blur of edges that more blur lowers so; what the gradients were first smoothed by is taken off again."""
+    ratio = max(float(np.median(ratios)), 1.01)
+    return float(np.sqrt(max(by_px[1] ** 2 / (ratio**2 - 1.0) - by_px[0] ** 2, 0.0)))
 
 
 def saturated_share(gray: Gray) -> float:
@@ -122,15 +127,6 @@ def resized(gray: Gray, camera: Camera, scale: float) -> tuple[Gray, Camera]:
         K[row, 2] = factor * (K[row, 2] + 0.5) - 0.5
     smaller = np.asarray(cv2.resize(gray, (width, height), interpolation=way), dtype=np.uint8)
     return smaller, replace(camera, width=width, height=height, K=K)
-
-
-def _gradient(values: Array) -> Array:
-    return np.asarray(cv2.magnitude(*_slopes(values)))
-
-
-def _slopes(values: Array) -> tuple[Array, Array]:
-    x, y = (cv2.Sobel(values, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1)))
-    return np.asarray(x), np.asarray(y)
 
 
 #: A checkerboard has at most this number of corners each way.
@@ -180,18 +176,10 @@ def clues(
 
     Another target is surer than what is wrong with the image. Nothing more is tried when `is_late` says so.
     """
-    tries: list[Callable[[], Iterator[Clue]]] = [
-        lambda: _another_target(gray, target, camera, options),
-        lambda: _too_small(gray, target, camera, options),
-        lambda: _too_dark(gray, target, camera, options),
-        lambda: _blurred(gray, target, camera, options),
-        lambda: _no_margin(gray, target),
-        lambda: _too_bright(gray),
-    ]
-    for attempt in tries:
+    for attempt in (_another_target, _too_small, _too_dark, _blurred, _no_margin, _too_bright):
         if is_late():
             break
-        found = list(attempt())
+        found = list(attempt(gray, target, camera, options))
         if found:
             return found
     return []
@@ -228,7 +216,7 @@ def _blurred(gray: Gray, target: Target, camera: Camera, options: DetectionOptio
             yield Clue(About.BLURRED, figure=blur_px)
 
 
-def _no_margin(gray: Gray, target: Target) -> Iterator[Clue]:
+def _no_margin(gray: Gray, target: Target, *_: object) -> Iterator[Clue]:
     """A tag of the target is read once what is as dark as its black is told from it."""
     border = 2 if isinstance(target, AprilGrid) else 1
     for level in np.percentile(gray[::2, ::2], LEVELS) if target.ids else ():
@@ -239,7 +227,7 @@ def _no_margin(gray: Gray, target: Target) -> Iterator[Clue]:
             return
 
 
-def _too_bright(gray: Gray) -> Iterator[Clue]:
+def _too_bright(gray: Gray, *_: object) -> Iterator[Clue]:
     if saturated_share(gray) >= TOO_BRIGHT:
         yield Clue(About.BRIGHT, figure=saturated_share(gray))
 
@@ -268,12 +256,11 @@ def _other_grid(gray: Gray, grid: CircleGrid, camera: Camera, options: Detection
     if c != r and read(gray, camera, replace(grid, columns=r, rows=c), options) is not None:
         yield Clue(About.COUNTS, (r, c))  # as likely as another place of the dot, and the commoner mistake
         return
-    dots: list[bool | str] = [word for word in (*CORNERS, False) if word != (grid.corner or False)]
-    if grid.asymmetric:  # such a grid has no larger dot
-        dots = []
-    for dot in dots:
-        if read(gray, camera, replace(grid, larger_dot=dot), options) is not None:
-            yield Clue(About.DOT, dot or "")
+    for dot in (*CORNERS, ""):
+        if grid.asymmetric or dot == grid.corner:  # an asymmetric grid has no larger dot
+            continue
+        if read(gray, camera, replace(grid, larger_dot=dot or False), options) is not None:
+            yield Clue(About.DOT, dot)
             return
     others = [(c + i, r + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     others += [(b + i, a + j) for a, b in [(c, r)] * (r != c) for i, j in ((1, 0), (0, 1), (-1, 0), (0, -1))]

@@ -16,14 +16,14 @@ import numpy as np
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.detect.pictures import (
     NOT_USED,
-    SHIFT,
     USED,
     WHITE,
     Colour,
     Picture,
     Words,
-    dashed_line,
+    circle,
     fitted,
+    line,
     wrapped,
     written,
 )
@@ -128,7 +128,7 @@ def _band(band: Band, width: int) -> Picture:
     picture: Picture = np.full((header + rows * step, width, 3), 255, np.uint8)
     cv2.rectangle(picture, (0, 0), (width, header - GAP), PAPER, -1)
     words = [Words((GAP, 8), fitted(band.sensor, TITLE + 2, width - 2 * GAP, is_bold=True), TITLE + 2, is_bold=True)]
-    words += [Words((GAP, 12 + (i + 1) * (TITLE + 4)), line, TITLE - 3, INK) for i, line in enumerate(counts)]
+    words += [Words((GAP, 12 + (i + 1) * (TITLE + 4)), said, TITLE - 3, INK) for i, said in enumerate(counts)]
     for i, tile in enumerate(band.tiles):
         left, top = GAP + (i % ACROSS) * (WIDTH + GAP), header + (i // ACROSS) * step
         picture[top : top + height, left : left + WIDTH] = _small_picture(tile, height)
@@ -155,16 +155,10 @@ def _small_picture(tile: Tile, height: int) -> Picture:
         around = cv2.convexHull(corners.astype(np.float32))[:, 0].astype(float)
         colour = USED if outline.is_used else NOT_USED
         for start, end in zip(around, np.roll(around, -1, axis=0), strict=True):
-            if outline.is_used:
-                ends = np.rint(np.array([start, end]) * (1 << SHIFT)).astype(int).tolist()
-                cv2.line(picture, ends[0], ends[1], WHITE, 4, cv2.LINE_AA, SHIFT)
-                cv2.line(picture, ends[0], ends[1], colour, 2, cv2.LINE_AA, SHIFT)
-            else:
-                dashed_line(picture, start, end, WHITE, 4)
-                dashed_line(picture, start, end, colour, 2)
-        first = np.rint(corners[0] * (1 << SHIFT)).astype(int).tolist()
-        cv2.circle(picture, first, 4 << SHIFT, WHITE, -1, cv2.LINE_AA, SHIFT)
-        cv2.circle(picture, first, 3 << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
+            line(picture, start, end, WHITE, 4, is_dashed=not outline.is_used)
+            line(picture, start, end, colour, 2, is_dashed=not outline.is_used)
+        circle(picture, corners[0], 4, WHITE)
+        circle(picture, corners[0], 3, colour)
     if tile.detail is not None and min(height, len(gray)) > DETAIL + 4:
         _draw_detail(picture, tile.detail, tile.outlines[0], min(height, len(gray)))
     return picture
@@ -178,9 +172,9 @@ def _draw_detail(picture: Picture, detail: Detail, outline: Outline, height: int
     cv2.rectangle(picture, (left - 2, top - 2), (left + DETAIL + 1, top + DETAIL + 1), WHITE, -1)
     inside: Picture = np.asarray(cv2.cvtColor(detail.gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     colour = USED if outline.is_used else NOT_USED
-    for i, place in enumerate(np.rint(detail.corners * (1 << SHIFT)).astype(int).tolist()):
-        cv2.circle(inside, place, (5 if i == 0 else 3) << SHIFT, WHITE, -1, cv2.LINE_AA, SHIFT)
-        cv2.circle(inside, place, (4 if i == 0 else 2) << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
+    for i, place in enumerate(detail.corners):
+        circle(inside, place, 5 if i == 0 else 3, WHITE)
+        circle(inside, place, 4 if i == 0 else 2, colour)
     picture[top : top + DETAIL, left : left + DETAIL] = inside
 
 
@@ -188,19 +182,11 @@ def _frame(picture: Picture, left: int, top: int, height: int, outcome: Outcome)
     """Found: a solid line. Rejected: dashes. Nothing seen: thin and gray. Not usable: a double line."""
     box = np.array([[left, top], [left + WIDTH, top], [left + WIDTH, top + height], [left, top + height]], dtype=float)
     box += np.array([[-2.0, -2.0], [1.0, -2.0], [1.0, 1.0], [-2.0, 1.0]])
+    width = {Outcome.FOUND: 2, Outcome.REJECTED: 4, Outcome.NOTHING: 1, Outcome.FAILED: 3}[outcome]
     for start, end in zip(box, np.roll(box, -1, axis=0), strict=True):
-        ends = tuple(start.astype(int).tolist()), tuple(end.astype(int).tolist())
-        if outcome is Outcome.REJECTED:
-            dashed_line(picture, start, end, outcome.colour, 4)
-        else:
-            cv2.line(
-                picture,
-                *ends,
-                outcome.colour,
-                1 if outcome is Outcome.NOTHING else 2 if outcome is Outcome.FOUND else 3,
-            )
+        line(picture, start, end, outcome.colour, width, is_dashed=outcome is Outcome.REJECTED)
         if outcome is Outcome.FAILED:
-            cv2.line(picture, *ends, WHITE, 1)
+            line(picture, start, end, WHITE)
 
 
 def _caption(tile: Tile, left: int, top: int) -> list[Words]:
@@ -209,4 +195,4 @@ def _caption(tile: Tile, left: int, top: int) -> list[Words]:
     name = Words((left + 20, top), fitted(tile.name, SMALL, WIDTH - 20, is_bold=True), SMALL, INK, is_bold=True)
     said = tile.outcome.word if not tile.words else f"{tile.outcome.word}: {tile.words}"
     lines = wrapped(said, SMALL, WIDTH, LINES - 1)
-    return [mark, name] + [Words((left, top + (i + 1) * LINE), line, SMALL, INK) for i, line in enumerate(lines)]
+    return [mark, name] + [Words((left, top + (i + 1) * LINE), words, SMALL, INK) for i, words in enumerate(lines)]

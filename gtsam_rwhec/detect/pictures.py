@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,10 +58,10 @@ def written(picture: Picture, words: Sequence[Words]) -> Picture:
         return picture
     image = Image.fromarray(picture)
     pen = ImageDraw.Draw(image)
-    for line in words:
+    for each in words:
         pen.text(
-            line.place, shown(line.text, MOST_READ), fill=line.colour, font=font(line.size, is_bold=line.is_bold),
-            stroke_width=0 if line.outline is None else max(1, line.size // 8), stroke_fill=line.outline,
+            each.place, shown(each.text, MOST_READ), fill=each.colour, font=font(each.size, is_bold=each.is_bold),
+            stroke_width=0 if each.outline is None else max(1, each.size // 8), stroke_fill=each.outline,
         )  # fmt: skip
     return np.asarray(image, dtype=np.uint8)
 
@@ -158,8 +158,7 @@ def draw(gray: Gray, detections: Iterable[DetectionRecord], camera: Camera, capt
             continue
         colour = NOT_USED if record.reason else USED
         corners = scaled(record.corners_px, scale)
-        _draw_order(picture, corners, is_closed=len(corners) == 4, colour=colour, is_dashed=bool(record.reason))
-        _draw_corners(picture, corners, mark, colour, is_oblique=bool(record.reason))
+        _draw_corners(picture, corners, mark, colour, is_used=not record.reason)
         if record.T_camera_tag is not None and not record.reason:
             words += _draw_axes(picture, record.T_camera_tag, camera, scale, letters)
         label = f"{record.id}: rejected, {record.reason}" if record.reason else record.id
@@ -181,42 +180,49 @@ def scaled(pixels: Array, scale: float) -> Array:
     return np.asarray(scale * (pixels + 0.5) - 0.5)
 
 
-def dashed_line(picture: Picture, start: Array, end: Array, colour: Colour, width: int = 1) -> None:
-    """A line of dashes between two places."""
+def line(
+    picture: Picture, start: Array, end: Array, colour: Colour, width: int = 1, *, is_dashed: bool = False
+) -> None:
+    """A line between two places, which may be of dashes."""
+    ends = np.stack([start, end])[None]
     length = float(np.linalg.norm(end - start))
-    if not np.isfinite(length) or length > 1e5:
-        return
-    count = max(1, round(0.5 * length / DASH_PX))
-    ends = np.linspace(start, end, 2 * count, endpoint=False)
-    for a, b in zip(_fixed(ends[::2]), _fixed(ends[1::2]), strict=True):
-        cv2.line(picture, tuple(a.tolist()), tuple(b.tolist()), colour, width, cv2.LINE_AA, SHIFT)
-
-
-def _draw_order(picture: Picture, corners: Array, *, is_closed: bool, colour: Colour, is_dashed: bool) -> None:
-    """A thin line through the corners in their order, closed for a tag's four."""
     if is_dashed:
-        around = np.vstack([corners, corners[:1]]) if is_closed else corners
-        for start, end in pairwise(around):
-            dashed_line(picture, start, end, colour)
-    else:
-        cv2.polylines(picture, [_fixed(corners)], is_closed, colour, 1, cv2.LINE_AA, SHIFT)
+        if not np.isfinite(length) or length > 1e5:
+            return
+        count = max(1, round(0.5 * length / DASH_PX))
+        ends = np.linspace(start, end, 2 * count, endpoint=False).reshape(count, 2, 2)
+    for a, b in _fixed(ends).tolist():
+        cv2.line(picture, a, b, colour, width, cv2.LINE_AA, SHIFT)
 
 
-def _draw_corners(picture: Picture, corners: Array, mark: float, colour: Colour, *, is_oblique: bool) -> None:
-    """A cross at each corner, open in its middle so that the corner is seen, and a ring around the first."""
-    if len(corners) > 1:  # crosses of neighbours do not meet
-        apart = np.linalg.norm(corners[:, None] - corners, axis=2) + np.diag(np.full(len(corners), np.inf))
-        mark = float(np.clip(0.35 * np.median(apart.min(axis=1)), 3.0, mark))
+def circle(picture: Picture, middle: Array, radius: float, colour: Colour, width: int = -1) -> None:
+    """A circle about a place; a disc without a width."""
+    cv2.circle(picture, _fixed(middle).tolist(), round(radius * (1 << SHIFT)), colour, width, cv2.LINE_AA, SHIFT)
+
+
+def radius_between(places: Array, share: float, most: float) -> float:
+    """The radius of marks at places (n, 2): at most this share of the usual distance of neighbours, and `most`."""
+    if len(places) < 2:
+        return most
+    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(len(places), np.inf))
+    return float(np.clip(share * np.median(apart.min(axis=1)), 3.0, most))
+
+
+def _draw_corners(picture: Picture, corners: Array, mark: float, colour: Colour, *, is_used: bool) -> None:
+    """A thin line through the corners in their order, closed for a tag's four; a cross at each corner, open in its
+    middle so that the corner is seen, and a ring around the first.
+    """
+    around = np.vstack([corners, corners[:1]]) if len(corners) == 4 else corners
+    for start, end in pairwise(around):
+        line(picture, start, end, colour, is_dashed=not is_used)
+    mark = radius_between(corners, 0.35, mark)  # crosses of neighbours do not meet
     arms = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    if is_oblique:
+    if not is_used:
         arms = arms @ (np.sqrt(0.5) * np.array([[1.0, 1.0], [-1.0, 1.0]]))
     for width, tone in ((3, WHITE), (1, colour)):
-        for arm in arms:
-            starts, ends = _fixed(corners + 0.3 * mark * arm), _fixed(corners + mark * arm)
-            for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
-                cv2.line(picture, start, end, tone, width, cv2.LINE_AA, SHIFT)
-        first = tuple(_fixed(corners[:1])[0].tolist())
-        cv2.circle(picture, first, round(1.7 * mark * (1 << SHIFT)), tone, width + 1, cv2.LINE_AA, SHIFT)
+        for corner, arm in product(corners, arms):
+            line(picture, corner + 0.3 * mark * arm, corner + mark * arm, tone, width)
+        circle(picture, corners[0], 1.7 * mark, tone, width + 1)
 
 
 def _draw_axes(picture: Picture, T: Array, camera: Camera, scale: float, letters: int) -> list[Words]:
@@ -226,11 +232,11 @@ def _draw_axes(picture: Picture, T: Array, camera: Camera, scale: float, letters
     pixels = camera.project(points)
     if not np.isfinite(pixels).all():
         return []
-    start, *ends = _fixed(scaled(pixels, scale))
+    start, *ends = scaled(pixels, scale)
     words = []
     for end, colour, name in zip(ends, AXES, "xyz", strict=True):
-        cv2.line(picture, tuple(start.tolist()), tuple(end.tolist()), colour, 2, cv2.LINE_AA, SHIFT)
-        place = np.clip(end / (1 << SHIFT) + 2.0, 0.0, np.array(picture.shape[1::-1]) - 1.0)
+        line(picture, start, end, colour, 2)
+        place = np.clip(end + 2.0, 0.0, np.array(picture.shape[1::-1]) - 1.0)
         words.append(Words((float(place[0]), float(place[1])), name, letters, colour, is_bold=True, outline=WHITE))
     return words
 
@@ -281,18 +287,16 @@ def draw_errors(gray: Gray, seen: Array, errors: Array) -> DrawnErrors:
     at, off = scaled(seen[finite] - [left, top], scale), -errors[finite]
     times = magnification(off, scale)
     ends, crosses = at + scale * times * off, at + scale * off
-    mark = _mark(at)
-    for start, end in zip(_fixed(at).tolist(), _fixed(ends).tolist(), strict=True):
-        cv2.line(picture, start, end, WHITE, 4, cv2.LINE_AA, SHIFT)
-        cv2.line(picture, start, end, NOT_USED, 2, cv2.LINE_AA, SHIFT)
+    mark = radius_between(at, 0.3, RADIUS)
+    for start, end in zip(at, ends, strict=True):
+        line(picture, start, end, WHITE, 4)
+        line(picture, start, end, NOT_USED, 2)
     arms = mark * (ARM / RADIUS) * np.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0]])
-    for width, is_outline in ((4, True), (2, False)):
-        for place in _fixed(at).tolist():
-            colour = WHITE if is_outline else USED
-            cv2.circle(picture, place, round(mark * (1 << SHIFT)), colour, width, cv2.LINE_AA, SHIFT)
-        for arm in arms:
-            for start, end in zip(_fixed(crosses - arm).tolist(), _fixed(crosses + arm).tolist(), strict=True):
-                cv2.line(picture, start, end, WHITE if is_outline else NOT_USED, width, cv2.LINE_AA, SHIFT)
+    for width, of_circle, of_cross in ((4, WHITE, WHITE), (2, USED, NOT_USED)):
+        for place in at:
+            circle(picture, place, mark, of_circle, width)
+        for cross, arm in product(crosses, arms):
+            line(picture, cross - arm, cross + arm, of_cross, width)
     order = np.argsort(-np.linalg.norm(off, axis=1), kind="stable")[:NUMBERED]
     most = np.array(picture.shape[1::-1]) - 1.5 * LETTERS
     words = []
@@ -322,11 +326,3 @@ def _window(gray: Gray, seen: Array) -> tuple[int, int, int, int]:
     left, top = np.floor(middle - half).astype(int).tolist()
     right, bottom = np.ceil(middle + half).astype(int).tolist()
     return max(left, 0), max(top, 0), right, bottom
-
-
-def _mark(at: Array) -> float:
-    """The radius of circles: those of neighbours do not meet."""
-    if len(at) < 2:
-        return float(RADIUS)
-    apart = np.linalg.norm(at[:, None] - at, axis=2) + np.diag(np.full(len(at), np.inf))
-    return float(np.clip(0.3 * np.median(apart.min(axis=1)), 3.0, RADIUS))

@@ -274,66 +274,53 @@ def _pose(T: Array) -> dict[str, dict[str, float]]:
     }
 
 
-_NUMBER = {"type": "number"}
-_INTEGER = {"type": "integer"}
-_STRING = {"type": "string"}
-
-
-def _message(title: str = "", /, **properties: Any) -> dict[str, Any]:
-    schema: dict[str, Any] = {"type": "object", "properties": properties}
-    return {"title": title, **schema} if title else schema
-
-
-def _several(items: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": items}
-
-
-_TIME = _message("time", sec=_INTEGER, nsec=_INTEGER)
-_VECTOR = _message("foxglove.Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _message("foxglove.Quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _message("foxglove.Pose", position=_VECTOR, orientation=_QUATERNION)
-_POINT = _message("foxglove.Point2", x=_NUMBER, y=_NUMBER)
-_COLOR = _message("foxglove.Color", r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
-
-_TRANSFORM = _message(
-    "foxglove.FrameTransform", timestamp=_TIME, parent_frame_id=_STRING, child_frame_id=_STRING,
-    translation=_VECTOR, rotation=_QUATERNION,
-)  # fmt: skip
-_POINTS = _message(
-    "foxglove.PointsAnnotation", timestamp=_TIME, type=_INTEGER, points=_several(_POINT), outline_color=_COLOR,
-    outline_colors=_several(_COLOR), fill_color=_COLOR, thickness=_NUMBER,
-)  # fmt: skip
-_TEXT = _message(
-    "foxglove.TextAnnotation", timestamp=_TIME, position=_POINT, text=_STRING, font_size=_NUMBER, text_color=_COLOR,
-    background_color=_COLOR,
-)  # fmt: skip
-_DETECTION = _message(
-    family=_STRING, id=_STRING, size_m=_NUMBER, corners_px=_several(_POINT), pose=_POSE,
-    covariance=_several(_NUMBER), corner_indices=_several(_INTEGER), reprojection_px=_NUMBER, reason=_STRING,
-)  # fmt: skip
-
-_SCHEMAS = {
-    "foxglove.FrameTransforms": _message(transforms=_several(_TRANSFORM)),
-    "foxglove.PoseInFrame": _message(timestamp=_TIME, frame_id=_STRING, pose=_POSE),
-    "foxglove.PosesInFrame": _message(timestamp=_TIME, frame_id=_STRING, poses=_several(_POSE)),
-    "foxglove.ImageAnnotations": _message(
-        circles=_several(_message()), points=_several(_POINTS), texts=_several(_TEXT)
-    ),
-    "foxglove.CompressedImage": _message(
-        timestamp=_TIME, frame_id=_STRING, data={"type": "string", "contentEncoding": "base64"}, format=_STRING
-    ),
-    "foxglove.CameraCalibration": _message(
-        timestamp=_TIME, frame_id=_STRING, width=_INTEGER, height=_INTEGER, distortion_model=_STRING,
-        **dict.fromkeys("DKRP", _several(_NUMBER)),
-    ),
-    TAG_DETECTIONS: _message(timestamp=_TIME, frame_id=_STRING, detections=_several(_DETECTION)),
-    MEASURED_PAIR: _message(
-        timestamp=_TIME, target=_STRING, sensor=_STRING, A=_several(_NUMBER), B=_several(_NUMBER),
-        is_inlier={"type": "boolean"}, reason=_STRING, covariance=_several(_NUMBER),
-    ),
+#: Messages by schema, each with a value of its type in every field; a list has one entry.
+_TIME: dict[str, Any] = {"sec": 0, "nsec": 0}
+_VECTOR, _QUATERNION = dict.fromkeys("xyz", 0.0), dict.fromkeys("xyzw", 0.0)
+_POSE = {"position": _VECTOR, "orientation": _QUATERNION}
+_POINT = dict.fromkeys("xy", 0.0)
+_IN_FRAME: dict[str, Any] = {"timestamp": _TIME, "frame_id": ""}
+_TRANSFORM = {
+    "timestamp": _TIME, "parent_frame_id": "", "child_frame_id": "", "translation": _VECTOR, "rotation": _QUATERNION,
 }  # fmt: skip
+_POINTS = {
+    "timestamp": _TIME, "type": 0, "points": [_POINT], "outline_color": _GREEN, "outline_colors": [_GREEN],
+    "fill_color": _GREEN, "thickness": 0.0,
+}  # fmt: skip
+_TEXT = {
+    "timestamp": _TIME, "position": _POINT, "text": "", "font_size": 0.0, "text_color": _GREEN,
+    "background_color": _GREEN,
+}  # fmt: skip
+_DETECTION = {
+    "family": "", "id": "", "size_m": 0.0, "corners_px": [_POINT], "pose": _POSE, "covariance": [0.0],
+    "corner_indices": [0], "reprojection_px": 0.0, "reason": "",
+}  # fmt: skip
+_MESSAGES: dict[str, dict[str, Any]] = {
+    "foxglove.FrameTransforms": {"transforms": [_TRANSFORM]},
+    "foxglove.PoseInFrame": {**_IN_FRAME, "pose": _POSE},
+    "foxglove.PosesInFrame": {**_IN_FRAME, "poses": [_POSE]},
+    "foxglove.ImageAnnotations": {"circles": [{}], "points": [_POINTS], "texts": [_TEXT]},
+    "foxglove.CompressedImage": {**_IN_FRAME, "data": b"", "format": ""},
+    "foxglove.CameraCalibration": {
+        **_IN_FRAME, "width": 0, "height": 0, "distortion_model": "", "D": [0.0], "K": [0.0], "R": [0.0], "P": [0.0],
+    },
+    TAG_DETECTIONS: {**_IN_FRAME, "detections": [_DETECTION]},
+    MEASURED_PAIR: {
+        "timestamp": _TIME, "target": "", "sensor": "", "A": [0.0], "B": [0.0], "is_inlier": True, "reason": "",
+        "covariance": [0.0],
+    },
+}  # fmt: skip
+_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
 def json_schema(name: str) -> bytes:
     """The JSON schema that a channel of messages `name` carries."""
-    return json.dumps({"title": name, **_SCHEMAS[name]}).encode()
+    return json.dumps({"title": name, **_schema_of(_MESSAGES[name])}).encode()
+
+
+def _schema_of(value: Any) -> dict[str, Any]:
+    if isinstance(value, dict):
+        return {"type": "object", "properties": {field: _schema_of(each) for field, each in value.items()}}
+    if isinstance(value, list):
+        return {"type": "array", "items": _schema_of(value[0])}
+    return {"type": "string", "contentEncoding": "base64"} if value == b"" else {"type": _TYPES[type(value)]}

@@ -78,7 +78,8 @@ def fuzz(
 ) -> Outcome:
     """Fuzz one reader in processes of its own: a process that dies on an input is followed by another.
 
-    With a seed and a number of executions (``most``), and time enough for them, each run tries the same inputs.
+    With a seed and a number of executions (``most``), and time enough for them, each run tries the same inputs. The
+    process that follows has the next seed: with the same one it would try, and die of, the same inputs again.
     """
     corpus.mkdir(parents=True, exist_ok=True)
     findings.mkdir(parents=True, exist_ok=True)
@@ -88,17 +89,19 @@ def fuzz(
     environment = {**os.environ, "TMPDIR": folder.name, "PYTHONHASHSEED": "0"}
     executions = refused = coverage = peak_mb = 0
     slowest_s = 0.0
+    processes = 0
     while (
         (left := seconds - (time.monotonic() - began)) > 0
         and (most is None or executions < most)
         and len(list(findings.iterdir())) < MOST_FINDINGS
     ):
         command = [sys.executable, str(HERE / "fuzzed_process.py"), reader, str(int(left) + 1), corpus, findings]
-        limits = ["" if seed is None else str(seed), "" if most is None else str(most - executions)]
+        limits = ["" if seed is None else str(seed + processes), "" if most is None else str(most - executions)]
         process = subprocess.run(
             [*map(str, command), *limits],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment,
         )  # fmt: skip
+        processes += 1
         said = process.stdout.decode(errors="replace")
         state = findings.parent / f"{reader}.state.json"
         if not state.exists():
