@@ -11,12 +11,10 @@ from gtsam_rwhec.methods.linear_systems import (
     FREE,
     Stack,
     linear_outcome,
+    linear_poses,
     linear_rotations,
     linear_translations,
     paired_quaternions,
-    plain_form,
-    rotations_up_to_sign,
-    solve_scaled,
 )
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties, checked_start
 from gtsam_rwhec.problem.problem import Problem
@@ -153,21 +151,14 @@ _LI_SOURCE = (
 
 
 def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """Solve A X = Y B by linear least squares over all entries of X and Y, then project the matrices to rotations.
-
-    The translations belong to the matrices before the projection.
-    """
+    """Solve A X = Y B by linear least squares over all entries of X and Y, then project the matrices to rotations."""
     stack = Stack.of(problem)
-    form = plain_form(stack)
-    unknown = np.delete(np.arange(25), 6)
     undetermined = (
         "the linear system of the 24 entries of X and Y is singular: rotations about parallel axes, half turns alone, "
         "carriers that do not move, or a sensor that always sees the target in the same place; turn about a second "
         "axis, and change the distance"
     )
-    x = solve_scaled(form[np.ix_(unknown, unknown)], -form[unknown, 6], undetermined)
-    R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
-    return stack.outcome(R, x[:6].reshape(2, 3) + stack.origins)
+    return stack.outcome(*linear_poses(stack, undetermined))
 
 
 def _rows() -> Array:
