@@ -11,10 +11,12 @@ from gtsam_rwhec.methods.linear_systems import (
     FREE,
     Stack,
     linear_outcome,
-    linear_poses,
     linear_rotations,
     linear_translations,
     paired_quaternions,
+    plain_form,
+    poses_of,
+    solve_scaled,
 )
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties, checked_start
 from gtsam_rwhec.problem.problem import Problem
@@ -151,14 +153,19 @@ _LI_SOURCE = (
 
 
 def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """Solve A X = Y B by linear least squares over all entries of X and Y, then project the matrices to rotations."""
+    """Solve A X = Y B by linear least squares over all entries of X and Y, then project the matrices to rotations.
+
+    The translations belong to the matrices before the projection.
+    """
     stack = Stack.of(problem)
+    form, unknown = plain_form(stack), np.delete(np.arange(25), 6)
     undetermined = (
         "the linear system of the 24 entries of X and Y is singular: rotations about parallel axes, half turns alone, "
         "carriers that do not move, or a sensor that always sees the target in the same place; turn about a second "
         "axis, and change the distance"
     )
-    return stack.outcome(*linear_poses(stack, undetermined))
+    x = solve_scaled(form[np.ix_(unknown, unknown)], -form[unknown, 6], undetermined)
+    return stack.outcome(*poses_of(stack, x))
 
 
 def _rows() -> Array:

@@ -196,18 +196,6 @@ def plain_form(stack: Stack) -> Array:
     return form
 
 
-def linear_poses(stack: Stack, undetermined: str, smallest: float = FREE) -> tuple[Array, Array]:
-    """R (2, 3, 3) and t (2, 3), metres, of X and Y of one pair: linear least squares over all entries (Li 2010).
-
-    The matrices are projected to rotations; the translations belong to the matrices before the projection. Raises
-    UnderdeterminedError as ``solve_scaled``.
-    """
-    form = plain_form(stack)
-    unknown = np.delete(np.arange(25), 6)
-    x = solve_scaled(form[np.ix_(unknown, unknown)], -form[unknown, 6], undetermined, smallest)
-    return poses_of(stack, x)
-
-
 def poses_of(stack: Stack, x: Array) -> tuple[Array, Array]:
     """R (2, 3, 3) and t (2, 3), metres, of [t_X, t_Y, vec R_X, vec R_Y] (24,), whose matrices are projected."""
     R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))

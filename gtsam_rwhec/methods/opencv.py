@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from gtsam_rwhec.errors import CountError, OptionError, PoseError, UnderdeterminedError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.poses import Array, checked_rows
+from gtsam_rwhec.geometry.poses import LARGEST_M, Array, checked_rows
 from gtsam_rwhec.geometry.real_numbers import real_array
 from gtsam_rwhec.methods.certified import certified_hand_eye, certified_robot_world
 from gtsam_rwhec.methods.opencv_methods import (
@@ -40,6 +40,8 @@ from gtsam_rwhec.methods.opencv_methods import (
 
 #: Two motions about different axes need at least this many poses; OpenCV requires the same.
 FEWEST_POSES = 3
+#: Second row times third row, entries (1, 2), (2, 0), (0, 1), then (2, 1), (0, 2), (1, 0): their cross product.
+_NEXT, _AFTER = [4, 5, 3, 5, 3, 4], [8, 6, 7, 7, 8, 6]
 #: Shapes of a 3-vector.
 _VECTORS = ((3,), (3, 1), (1, 3))
 
@@ -57,8 +59,22 @@ def checked_poses(R: Any, t: Any, names: tuple[str, str]) -> tuple[Array, Array]
             f"{names[0]} has {len(rotations)} rotations and {names[1]} {len(translations)} translations; "
             "give one of each for every pose"
         )
-    checked_rows(se3.pose(rotations, translations), 0, " and ".join(names))
+    if not (are_rotations(rotations) and np.abs(translations).max() <= LARGEST_M):
+        checked_rows(se3.pose(rotations, translations), 0, " and ".join(names))
     return rotations, translations
+
+
+def are_rotations(R: Array) -> bool:
+    """Whether all matrices (N, 3, 3) are rotations to about 4e-4; a quick test before ``checked_rows``.
+
+    With |R|^2 = 3 and det R = 1 all singular values are 1: the mean of their squares equals their product's root.
+    """
+    rows = np.ascontiguousarray(R.reshape(-1, 9).T)
+    squares = np.einsum("kn,kn->n", rows, rows)
+    cross = rows[_NEXT] * rows[_AFTER]
+    determinants = np.einsum("kn,kn->n", rows[:3], cross[:3] - cross[3:])
+    worst = np.abs(np.concatenate([squares - 3.0, determinants - 1.0])).max()
+    return bool(worst < 1e-7)
 
 
 def check_counts(first: int, second: int, names: tuple[str, str]) -> None:
@@ -78,18 +94,34 @@ def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
     space. The matrix is zero when nothing rotates, and has rank two when all motions rotate about one axis.
     """
     for rotations, name in zip(R, where, strict=True):
-        total, square = rotations.sum(axis=0), float(len(rotations)) ** 2
-        turning = np.linalg.eigvalsh(square * np.eye(3) - total.T @ total)
-        if turning.sum() <= PARALLEL * square:
+        count = len(rotations)
+        least, most = least_and_most_turning(np.einsum("nij->ij", rotations), count)
+        if most <= PARALLEL * count**2:
             raise UnderdeterminedError(
                 f"{name}: no motion rotates, so the rotation and the translation are not determined; add poses that "
                 "turn about two different axes"
             )
-        if turning[0] <= PARALLEL * turning.sum():
+        if least <= PARALLEL * most:
             raise UnderdeterminedError(
                 f"{name}: all motions rotate about one axis, which leaves the translation along it free; add poses "
                 "that turn about another axis"
             )
+
+
+def least_and_most_turning(total: Array, count: int) -> tuple[float, float]:
+    """The determinant of N^2 I - S'S over the sum of its 2 x 2 minors, and its trace.
+
+    A small quotient is the smallest eigenvalue. Motions about one axis turn two directions alike, so two eigenvalues
+    are never small if the third is large. The sums use plain numbers: a call of NumPy takes longer than the sums.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (total.T @ total).tolist()
+    square = float(count) ** 2
+    a, e, i = square - a, square - e, square - i
+    b, c, d, f, g, h = -b, -c, -d, -f, -g, -h
+    first, second, third = e * i - f * h, f * g - d * i, d * h - e * g
+    minors = first + (a * i - c * g) + (a * e - b * d)
+    determinant = a * first + b * second + c * third
+    return (determinant / minors if minors > 0.0 else 0.0), a + e + i
 
 
 def _rotations(values: Any, where: str) -> Array:
