@@ -15,7 +15,7 @@ from gtsam_rwhec.methods.linear_systems import (
     linear_translations,
     paired_quaternions,
     plain_form,
-    rotations_up_to_sign,
+    poses_of,
     solve_scaled,
 )
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties, checked_start
@@ -158,16 +158,14 @@ def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     The translations belong to the matrices before the projection.
     """
     stack = Stack.of(problem)
-    form = plain_form(stack)
-    unknown = np.delete(np.arange(25), 6)
+    form, unknown = plain_form(stack), np.delete(np.arange(25), 6)
     undetermined = (
         "the linear system of the 24 entries of X and Y is singular: rotations about parallel axes, half turns alone, "
         "carriers that do not move, or a sensor that always sees the target in the same place; turn about a second "
         "axis, and change the distance"
     )
     x = solve_scaled(form[np.ix_(unknown, unknown)], -form[unknown, 6], undetermined)
-    R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
-    return stack.outcome(R, x[:6].reshape(2, 3) + stack.origins)
+    return stack.outcome(*poses_of(stack, x))
 
 
 def _rows() -> Array:

@@ -1,9 +1,9 @@
 """Dan (Daniilidis 1999), and nonlinear least squares: DQNLOpt and DQNLOptRnd on the cost (8), ChVecOpt and QuatVecOpt
 on the costs (30).
 
-Each cost is a quadratic form y'F y, where the few numbers y are computed from the pose. With F = L'L, the residual L y
-has 8 to 22 rows, whatever the number of motions. The unknowns are a quaternion p of any length (q = p / |p|) and a
-translation in units of 1/alpha, so every start can reach every rotation.
+Each cost is a quadratic form y'F y, where the few numbers y are computed from the pose. The unknowns are a
+quaternion p of any length (q = p / |p|) and a translation in units of 1/alpha, so every start can reach every
+rotation.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
 
 from gtsam_rwhec.errors import OptionError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
@@ -29,13 +28,12 @@ from gtsam_rwhec.methods.dual_quaternion_cost import (
     to_transform,
 )
 from gtsam_rwhec.methods.hand_eye_request import Request, free_directions, free_of_rotations_alone
+from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
 from gtsam_rwhec.methods.method import Outcome
 from gtsam_rwhec.methods.motions import Motions, squared_residuals
 
-#: least_squares stops when a step changes cost or unknowns by less than this share, which is rounding error.
-STOP = 1e-15
-#: An entry of a form of unit diagonal has this rounding error.
-ROUNDING = float(np.finfo(np.float64).eps)
+#: A descent takes at most this many steps.
+STEPS = 1000
 #: vec R (rows) of a unit quaternion is quadratic in it: entry k is q' _QUADRATIC[k] q.
 _QUADRATIC = ROTATION.transpose(2, 3, 0, 1).reshape(9, 4, 4)
 #: The numbers y (n,) of a pose's q (4,) and t (3,), with their derivatives (n, 4) by q and (n, 3) by t.
@@ -143,8 +141,8 @@ def _vector_lift(slopes: Array, q: Array, t: Array) -> tuple[Array, Array, Array
 
 def _descend_vector(request: Request, found: Minimum, rotation: Array, translation: Array, lift: Lift) -> Array:
     """Minimise a cost of eq. 30 from DQOpt's answer; the pose (4, 4) where the descent ends."""
-    factor = block_diag(root(rotation), request.alpha * root(translation))
-    return _descend(factor, lift, to_transform(found.q, found.q_dual), 1.0 / request.alpha)
+    form = block_diag(rotation, request.alpha**2 * translation)
+    return _descend(form, lift, to_transform(found.q, found.q_dual), 1.0 / request.alpha)
 
 
 def _descend_dual_quaternion(request: Request, start: Array) -> Array:
@@ -157,43 +155,22 @@ def _descend_dual_quaternion(request: Request, start: Array) -> Array:
         return np.concatenate([q, pure @ q]), np.concatenate([np.eye(4), pure]), by_t
 
     unit = 1.0 / request.alpha if request.covariances is None else _length(request)
-    return _descend(root(np.block([[cost.S, cost.W], [cost.W.T, cost.M]])), lift, start, unit)
+    return _descend(np.block([[cost.S, cost.W], [cost.W.T, cost.M]]), lift, start, unit)
 
 
-def _descend(factor: Array, lift: Lift, start: Array, unit: float) -> Array:
-    """Minimise |factor y|^2 over poses from a start (4, 4), translations in units of ``unit`` metres."""
+def _descend(form: Array, lift: Lift, start: Array, unit: float) -> Array:
+    """Minimise y' form y over poses from a start (4, 4), translations in units of ``unit`` metres."""
 
-    def pose(x: Array) -> tuple[Array, Array, Array]:
+    def chart(x: Array) -> tuple[Array, Array]:
         length = float(np.linalg.norm(x[:4]))
         q = x[:4] / length
-        return q, unit * x[4:], (np.eye(4) - np.outer(q, q)) / length  # the last is dq / dp
-
-    def residual(x: Array) -> Array:
-        q, t, _ = pose(x)
-        return factor @ lift(q, t)[0]
-
-    def jacobian(x: Array) -> Array:
-        q, t, slope = pose(x)
-        _, by_q, by_t = lift(q, t)
-        return factor @ np.hstack([by_q @ slope, unit * by_t])
+        y, by_q, by_t = lift(q, unit * x[4:])
+        return y, np.hstack([by_q @ (np.eye(4) - np.outer(q, q)) / length, unit * by_t])
 
     (q,), _ = from_transforms(start[None])
-    x0 = np.concatenate([q, start[:3, 3] / unit])
-    q, t, _ = pose(least_squares(residual, x0, jac=jacobian, method="lm", ftol=STOP, xtol=STOP, gtol=STOP).x)
-    return to_transform(q, 0.5 * times_vectors(q) @ t)
-
-
-def root(form: Array) -> Array:
-    """L with L'L a positive semidefinite form. Eigenvalues that are rounding error are set to zero.
-
-    The form is first brought to unit diagonal: rotations and lengths of any unit keep their own digits.
-    """
-    size = np.sqrt(np.maximum(form.diagonal(), 0.0))
-    size[size == 0.0] = 1.0
-    values, vectors = np.linalg.eigh(form / size / size[:, None])
-    values = np.where(values > ROUNDING * len(form), values, 0.0)
-    factor: Array = np.sqrt(values)[:, None] * vectors.T * size
-    return factor
+    x = descend_on_chart(form, chart, np.concatenate([q, start[:3, 3] / unit]), STEPS)
+    q = x[:4] / np.linalg.norm(x[:4])
+    return to_transform(q, 0.5 * unit * times_vectors(q) @ x[4:])
 
 
 def rotation_slopes(q: Array) -> Array:

@@ -79,6 +79,12 @@ class MotionMoments:
     BB: Array
     count: int
 
+    @staticmethod
+    def of(moments: Array, count: int) -> MotionMoments:
+        """From the ``gram`` (14, 14) of ``Motions.rows``."""
+        (AA, _), (BA, BB) = by_parts(moments, _PRODUCTS)
+        return MotionMoments(AA, BA, BB, count)
+
     def cost(self, alpha: float) -> DualQuaternionCost:
         """The cost (8) with alpha (1/m)."""
         square = alpha * alpha
@@ -161,8 +167,7 @@ def by_parts(moments: Array, products: Array) -> Array:
 
 def motion_moments(rows: Array, weights: Array | None = None) -> MotionMoments:
     """The sums of eq. 9 over ``Motions.rows`` (14, N), without alpha. Weights (N,) multiply the motions' terms."""
-    (AA, _), (BA, BB) = by_parts(gram(rows, weights), _PRODUCTS)
-    return MotionMoments(AA, BA, BB, rows.shape[1])
+    return MotionMoments.of(gram(rows, weights), rows.shape[1])
 
 
 def residuals(rows: Array, q: Array, q_dual: Array) -> Array:

@@ -22,7 +22,7 @@ from gtsam_rwhec.methods.certified import SOURCE
 from gtsam_rwhec.methods.closed_forms import DORNAIKA_SOURCE, start_of
 from gtsam_rwhec.methods.global_rotations import UnitForm
 from gtsam_rwhec.methods.levenberg_marquardt import Chart, descend_on_chart
-from gtsam_rwhec.methods.linear_systems import Stack, plain_form, rotations_up_to_sign
+from gtsam_rwhec.methods.linear_systems import Stack, plain_form, poses_of
 from gtsam_rwhec.methods.method import (
     UNWEIGHTED,
     Method,
@@ -446,8 +446,7 @@ def dornaika1998(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     start = np.concatenate([(T[:, :3, 3] - stack.origins).ravel(), T[:, :3, :3].transpose(0, 2, 1).ravel()])
     form = block_diag(2.0 * plain_form(stack), PENALTY * np.eye(18))
     x = descend_on_chart(form, _with_deviations, start, options.max_iterations)
-    R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
-    return stack.outcome(R, x[:6].reshape(2, 3) + stack.origins, starts_from=starts_from)
+    return stack.outcome(*poses_of(stack, x), starts_from=starts_from)
 
 
 def _with_deviations(p: Array) -> tuple[Array, Array]:

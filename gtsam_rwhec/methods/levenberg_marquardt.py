@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from gtsam_rwhec.geometry.poses import Array
 
@@ -20,6 +21,10 @@ FIRST_DAMPING = 1e-6
 MOST_DAMPING = 1e9
 #: A step with no larger entry (rad, m) is taken although rounding hides whether the cost falls.
 FLAT_STEP = 1e-7
+#: least_squares stops when a step changes cost or unknowns by less than this share, which is rounding error.
+STOP = 1e-15
+#: An entry of a form of unit diagonal has this rounding error.
+ROUNDING = float(np.finfo(np.float64).eps)
 #: The descent ends after a step with no larger entry (rad, m).
 LAST_STEP = 1e-9
 
@@ -72,11 +77,23 @@ def descend(
 
 
 def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: int) -> Array:
-    """Parameters (k,) of a local minimum of x(p)' Q x(p), for a form Q (m, m), from ``start`` (k,)."""
+    """Parameters (k,) of a local minimum of x(p)' Q x(p), for a form Q (m, m), m >= k, from ``start`` (k,)."""
+    L = root(form)
+    found = least_squares(
+        lambda p: L @ chart(p)[0], start, lambda p: L @ chart(p)[1], method="lm", ftol=STOP, xtol=STOP, gtol=STOP,
+        max_nfev=max_iterations,
+    )  # fmt: skip
+    return np.asarray(found.x)
 
-    def linearised(p: Array) -> Linearised:
-        x, J = chart(p)
-        Qx = form @ x
-        return Linearised(0.5 * float(x @ Qx), J.T @ Qx, J.T @ form @ J)
 
-    return descend(linearised, lambda p, step: p + step, start, max_iterations).point
+def root(form: Array) -> Array:
+    """L with L'L a positive semidefinite form. Eigenvalues that are rounding error are set to zero.
+
+    The form is first brought to unit diagonal: rotations and lengths of any unit keep their own digits.
+    """
+    size = np.sqrt(np.maximum(form.diagonal(), 0.0))
+    size[size == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(form / size / size[:, None])
+    values = np.where(values > ROUNDING * len(form), values, 0.0)
+    factor: Array = np.sqrt(values)[:, None] * vectors.T * size
+    return factor

@@ -195,6 +195,12 @@ def plain_form(stack: Stack) -> Array:
     return form
 
 
+def poses_of(stack: Stack, x: Array) -> tuple[Array, Array]:
+    """R (2, 3, 3) and t (2, 3), metres, of [t_X, t_Y, vec R_X, vec R_Y] (24,), whose matrices are projected."""
+    R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
+    return R, x[:6].reshape(2, 3) + stack.origins
+
+
 def paired_quaternions(stack: Stack) -> tuple[Array, Array]:
     """q_A and q_B (N, 4) with signs that fit: <q_A q_X, q_Y q_B> > 0 for the linear system's rotations."""
     q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])

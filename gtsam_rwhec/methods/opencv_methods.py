@@ -19,7 +19,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, conjugate, dual_parts, left, of_rotations, to_rotations
 from gtsam_rwhec.methods.dq_descent import squared, unit_combination
 from gtsam_rwhec.methods.dq_saddle import Minimum, minimum
-from gtsam_rwhec.methods.dual_quaternion_cost import MotionMoments, motion_moments, to_transform
+from gtsam_rwhec.methods.dual_quaternion_cost import MotionMoments, gram, to_transform
 from gtsam_rwhec.methods.linear_systems import solve_scaled
 from gtsam_rwhec.methods.motions import UNCERTAIN
 from gtsam_rwhec.solver.rotations import project
@@ -104,43 +104,41 @@ def products(matrices: Array, columns: Array) -> Array:
     return product.reshape(4, len(matrices), -1)
 
 
-def translation_features(stations: Stations) -> Array:
-    """Features (N, 46) of each station for the sums over the pairs that begin at it."""
-    R_G, t_G, u, count = stations.R_G, stations.t_G, stations.u, len(stations.u)
-    return np.concatenate(
-        [
-            np.ones((count, 1)),
-            R_G.reshape(count, 9),
-            t_G,
-            u,
-            np.einsum("nba,nb->na", R_G, t_G),
-            np.einsum("nar,nb->narb", R_G, u).reshape(count, 27),
-        ],
-        axis=1,
-    )
+def station_features(stations: Stations) -> Array:
+    """Features (N, 241) of each station, whose sums give ``pair_form``: 1, x = (u, rows of [R_G | t_G]), and x x'."""
+    count = len(stations.u)
+    E = np.concatenate([stations.R_G, stations.t_G[:, :, None]], axis=2).reshape(count, 12)
+    x = np.concatenate([stations.u, E], axis=1)
+    return np.concatenate([np.ones((count, 1)), x, np.einsum("na,nb->nab", x, x).reshape(count, 225)], axis=1)
+
+
+def pair_form(stations: Stations, sums: Array | None = None) -> Array:
+    """The sum of |(R_A - I) t - (R t_B - t_A)|^2 over pairs, as a form (13, 13) of (vec R, t, 1); vec takes rows.
+
+    With E = [R_G | t_G], a pair's residual, turned by R_G,j, is R_G,j R t_B + (E_j - E_i) (t, 1), and
+    t_B = R_C,j (u_j - u_i). So the form is made of the sums over i of (x_j - x_i)(x_j - x_i)' with x = (u, E).
+    ``sums`` (N, 241) are the ``station_features`` summed over the earlier stations of each station's pairs; all
+    earlier stations by default.
+    """
+    features = station_features(stations)
+    sums = all_earlier(features) if sums is None else sums
+    (ones, X, XX), x = np.split(sums, [1, 16], axis=1), features[:, 1:16]
+    own, crossed = features[:, 16:].reshape(-1, 15, 15), np.einsum("na,nb->nab", x, X)
+    M = ones[:, :, None] * own - crossed - crossed.transpose(0, 2, 1) + XX.reshape(-1, 15, 15)
+    of_E = M[:, 3:, 3:].sum(axis=0).reshape(3, 4, 3, 4)
+    form = np.empty((13, 13))
+    form[:9, :9] = np.kron(np.eye(3), np.einsum("nab,nbc,ndc->ad", stations.R_C, M[:, :3, :3], stations.R_C))
+    mixed = stations.R_C @ M[:, :3, 3:]
+    form[:9, 9:] = np.einsum("nac,ndak->cdk", stations.R_G, mixed.reshape(-1, 3, 3, 4)).reshape(9, 4)
+    form[9:, :9] = form[:9, 9:].T
+    form[9:, 9:] = np.einsum("akal->kl", of_E)
+    return form
 
 
 def translation_of(stations: Stations, R: Array, sums: Array | None = None) -> Array:
-    """The t (3,) that minimises the sum of |(R_A - I) t - (R t_B - t_A)|^2 over pairs (Tsai & Lenz 1989, eq. 15).
-
-    With p_j = R t_C,j + R_G,j' t_G,j and Z_j = R_G,j R R_C,j the right-hand side of a pair is
-    e = p_j - R R_C,j u_i - R_G,j' t_G,i, and R_A' e = R_G,i' (R_G,j p_j - Z_j u_i - t_G,i): all bilinear in i and j.
-    ``sums`` (N, 46) are the ``translation_features`` summed over the earlier stations of each station's pairs; all
-    earlier stations by default.
-    """
-    R_G = stations.R_G
-    R_RC = R @ stations.R_C
-    p = stations.t_C @ R.T + np.einsum("nba,nb->na", R_G, stations.t_G)
-    if sums is None:
-        sums = all_earlier(translation_features(stations))
-    ones, sum_R, sum_t = sums[:, 0], sums[:, 1:10].reshape(-1, 3, 3), sums[:, 10:13]
-    sum_u, sum_Rt, sum_Ru = sums[:, 13:16], sums[:, 16:19], sums[:, 19:].reshape(-1, 3, 3, 3)
-    sum_R_A = np.einsum("nab,nac->bc", R_G, sum_R)
-    normal = 2.0 * ones.sum() * np.eye(3) - sum_R_A - sum_R_A.T  # (R_A - I)'(R_A - I) = 2 I - R_A - R_A'
-    sum_e = ones @ p - np.einsum("nab,nb->a", R_RC, sum_u) - np.einsum("nba,nb->a", R_G, sum_t)
-    turned = np.einsum("nar,nab,nb->r", sum_R, R_G, p, optimize=True)
-    turned -= np.einsum("narb,nab->r", sum_Ru, R_G @ R_RC) + sum_Rt.sum(axis=0)
-    return np.linalg.solve(normal, turned - sum_e)
+    """The t (3,) that minimises ``pair_form`` for a rotation (Tsai & Lenz 1989, eq. 15)."""
+    of_t = pair_form(stations, sums)[9:12]
+    return -np.linalg.solve(of_t[:, 9:12], of_t[:, :9] @ R.ravel() + of_t[:, 12])
 
 
 #: Tsai's method uses motions of at least this 2 sin(angle / 2), by both sensors (from tests of OpenCV 4, to 1e-14).
@@ -156,7 +154,7 @@ def tsai(stations: Stations) -> tuple[Array, Array]:
     are in this range (OpenCV then returns the identity), or when they all rotate about one axis.
     """
     count = len(stations.u)
-    features = translation_features(stations)
+    features = station_features(stations)
     feature_sums, used = np.zeros_like(features), 0
     outer, sums = np.zeros((3, 3)), np.zeros(3)
     for block in pair_blocks(stations):
@@ -233,68 +231,25 @@ LENGTH_UNKNOWN = (
 def andreff(stations: Stations) -> tuple[Array, Array]:
     """Least squares of (I - R_A (x) R_B) vec(R) = 0 and (I (x) t_B') vec(R) + (I - R_A) t = t_A (their eq. 11).
 
-    vec takes rows. R is the nearest rotation. As in OpenCV 4, t stays the linear system's. The 12 x 12 normal equations
-    are sums over pairs of products of the two stations' features: with D_j = R_G,j' (x) R_C,j the product R_A (x) R_B
-    is D_j D_i'. Raises UnderdeterminedError when the translations do not determine the rotation's length.
+    vec takes rows. R is the nearest rotation. As in OpenCV 4, t stays the linear system's. With
+    D_j = R_G,j' (x) R_C,j the product R_A (x) R_B is D_j D_i', and D_j is orthogonal: the first equation has the
+    squares of (D_j - D_i)' vec(R). Raises UnderdeterminedError when the translations do not determine the rotation's
+    length.
     """
-    R_G, t_G, R_C, u, count = stations.R_G, stations.t_G, stations.R_C, stations.u, len(stations.u)
-    t_C = stations.t_C
-    D = np.einsum("nba,ncd->nacbd", R_G, R_C).reshape(count, 9, 9)
-    features = np.concatenate(
-        [
-            np.ones((count, 1)),
-            u,
-            t_G,
-            np.einsum("nba,nb->na", R_G, t_G),
-            R_G.reshape(count, 9),
-            np.einsum("na,nb->nab", u, u).reshape(count, 9),
-            np.einsum("na,nb->nab", u, t_G).reshape(count, 9),
-            np.einsum("nd,nac->ndac", u, R_G).reshape(count, 27),
-            D.transpose(0, 2, 1).reshape(count, 81),
-        ],
-        axis=1,
-    )
-    ends = np.cumsum([1, 3, 3, 3, 9, 9, 9, 27])
-    ones, U, T, RT, G, UU, UT, UG, DD = np.split(all_earlier(features), ends, axis=1)
-    G, UU, UT = (part.reshape(-1, 3, 3) for part in (G, UU, UT))
-    UG, DD = UG.reshape(-1, 3, 3, 3), DD.reshape(-1, 9, 9)
-    pairs = ones.sum()
-
-    sum_K = np.einsum("nab,nbc->ac", D, DD, optimize=True)
-    sum_R_A = np.einsum("nab,nac->bc", R_G, G)
-    # t_B = t_C,j - R_C,j u_i and t_A = R_G,j' (t_G,i - t_G,j)
-    cu = np.einsum("nab,nb->na", R_C, U)
-    crossed = np.einsum("na,nb->ab", t_C, cu)
-    tB_tB = np.einsum("n,na,nb->ab", ones[:, 0], t_C, t_C) - crossed - crossed.T
-    tB_tB += np.einsum("nab,nbc,ndc->ad", R_C, UU, R_C, optimize=True)
-    away = np.einsum("nab,na->nb", R_G, t_G)  # R_G,j' t_G,j
-    tB_tA = np.einsum("nb,nar,na->br", t_C, R_G, T, optimize=True)
-    tB_tA -= np.einsum("n,nb,nr->br", ones[:, 0], t_C, away)
-    tB_tA -= np.einsum("nbd,nda,nar->br", R_C, UT, R_G, optimize=True) - cu.T @ away
-    sum_tB = ones[:, 0] @ t_C - cu.sum(axis=0)
-    tB_RA = np.einsum("nb,nar,nac->brc", t_C, R_G, G, optimize=True)
-    tB_RA -= np.einsum("nbd,nar,ndac->brc", R_C, R_G, UG, optimize=True)
-    RA_tA = RT.sum(axis=0) - np.einsum("nac,na->c", G, t_G)
-    sum_tA = np.einsum("nar,na->r", R_G, T) - ones[:, 0] @ away
-
-    normal = np.empty((12, 12))
-    normal[:9, :9] = 2.0 * pairs * np.eye(9) - sum_K - sum_K.T + np.kron(np.eye(3), tB_tB)
-    coupling = np.einsum("b,rc->rbc", sum_tB, np.eye(3)) - tB_RA.transpose(1, 0, 2)
-    normal[:9, 9:] = coupling.reshape(9, 3)
-    normal[9:, :9] = normal[:9, 9:].T
-    normal[9:, 9:] = 2.0 * pairs * np.eye(3) - sum_R_A - sum_R_A.T
-    right = np.concatenate([tB_tA.T.reshape(9), sum_tA - RA_tA])
-    x = solve_scaled(normal, right, LENGTH_UNKNOWN.format("Andreff's"), SINGULAR)
+    form, count = pair_form(stations), len(stations.u)
+    D = np.einsum("nba,ncd->acbd", stations.R_G, stations.R_C).reshape(9, 9)  # summed over the stations
+    form[:9, :9] += count**2 * np.eye(9) - D @ D.T
+    x = solve_scaled(form[:12, :12], -form[:12, 12], LENGTH_UNKNOWN.format("Andreff's"), SINGULAR)
     return project(x[:9].reshape(1, 3, 3))[0], x[9:]
 
 
 def daniilidis(stations: Stations) -> tuple[Array, Array]:
     """The two smallest right singular vectors of T (his eq. 31), combined so that |q| = 1 and q.q' = 0 (eqs. 33-35)."""
-    gram = np.zeros((12, 12))
+    total = np.zeros((12, 12))
     for a, b, dual_a, dual_b, weight in screws(stations):
         z = np.concatenate([a[:3] + b[:3], a[:3] - b[:3], dual_a[:3] + dual_b[:3], dual_a[:3] - dual_b[:3]])
-        gram += (z * weight).reshape(12, -1) @ z.reshape(12, -1).T
-    basis = np.linalg.eigh(squared(gram))[1][:, :2]
+        total += (z * weight).reshape(12, -1) @ z.reshape(12, -1).T
+    basis = np.linalg.eigh(squared(total))[1][:, :2]
     X = to_transform(*unit_combination(basis[:4], basis[4:]))
     return X[:3, :3], X[:3, 3]
 
@@ -325,21 +280,20 @@ def dqopt(stations: Stations) -> tuple[Array, Array]:
     Motions near half a turn are left out, because the signs of their quaternions are uncertain; other motions of the
     same stations remain. Raises UnderdeterminedError when fewer than two motions remain.
     """
-    AA, BA, BB, used = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), 0
+    total, used = np.zeros((14, 14)), 0
     for a, b, dual_a, dual_b, weight in screws(stations):
         kept = (weight > 0.0) & (a[3] + b[3] >= UNCERTAIN)
         sides = (a[:3] + b[:3], a - b, dual_a[:3] + dual_b[:3], dual_a - dual_b)  # Motions.rows
         rows = np.concatenate([side[:, kept] for side in sides])
-        sums = motion_moments(rows)
-        AA, BA, BB, used = AA + sums.AA, BA + sums.BA, BB + sums.BB, used + rows.shape[1]
+        total, used = total + gram(rows), used + rows.shape[1]
     if used < 2:
         raise UnderdeterminedError(
             f"{used} motions between the poses are far enough from half a turn, and two are needed; add poses that "
             "turn less"
         )
-    moments = MotionMoments(AA, BA, BB, used)
+    moments = MotionMoments.of(total, used)
     # The first alpha: a translation as long as the motions' weighs as much as a rotation of about a radian.
-    alpha = np.sqrt(used / max(float(np.trace(BB)), np.finfo(float).tiny))
+    alpha = np.sqrt(used / max(float(np.trace(moments.BB)), np.finfo(float).tiny))
     found = minimum(moments.cost(alpha))
     for _ in range(ROUNDS):
         rotation, translation = squared_sums(moments, found)

@@ -163,15 +163,15 @@ def bad_calls():
     R_G, t_G, R_C, t_C = parts(gripper, seen)
     mirror = np.diag([1.0, 1.0, -1.0])
     yield "two poses", (R_G[:2], t_G[:2], R_C[:2], t_C[:2]), CountError, "at least 3"
-    yield "none", ([], [], [], []), CountError, "R_gripper2base: no rotations"
+    yield "none", ([], [], [], []), CountError, "R_gripper2base: no poses"
     yield "fewer rotations", (R_G[:5], t_G, R_C, t_C), CountError, "5 rotations and t_gripper2base 6"
     yield "fewer in the camera", (R_G, t_G, R_C[:5], t_C[:5]), CountError, "6 poses and R_target2cam 5"
     yield "matrices 4x4", (list(gripper), t_G, R_C, t_C), PoseError, r"R_gripper2base: shape \(6, 4, 4\)"
     yield "translations of 4", (R_G, [np.zeros(4)] * 6, R_C, t_C), PoseError, r"t_gripper2base: shape \(6, 4\)"
     yield "one of another shape", ([*R_G[:5], np.zeros((2, 2))], t_G, R_C, t_C), PoseError, r"R_gripper2base\[5\]"
-    yield "not a number", (R_G, t_G, R_C, [np.full(3, np.nan), *t_C[1:]]), PoseError, "t_target2cam: pose 0"
-    yield "no rotation", ([2.0 * R_G[0], *R_G[1:]], t_G, R_C, t_C), PoseError, "pose 0 is off by 3"
-    yield "left-handed", ([*R_G[:5], R_G[5] @ mirror], t_G, R_C, t_C), PoseError, "pose 5 is left-handed"
+    yield "not a number", (R_G, t_G, R_C, [np.full(3, np.nan), *t_C[1:]]), PoseError, "t_target2cam: measurement 0"
+    yield "no rotation", ([2.0 * R_G[0], *R_G[1:]], t_G, R_C, t_C), PoseError, "measurement 0 is off by 3"
+    yield "left-handed", ([*R_G[:5], R_G[5] @ mirror], t_G, R_C, t_C), PoseError, "measurement 5 is left-handed"
     yield "words", (["a"] * 6, t_G, R_C, t_C), PoseError, "R_gripper2base"
     yield "one rotation only", ([R_G[0]] * 6, t_G, [R_C[0]] * 6, t_C), UnderdeterminedError, "no motion rotates"
     about_z = list(Rotation.from_rotvec(np.outer(np.arange(6.0), [0, 0, 0.3])).as_matrix())
