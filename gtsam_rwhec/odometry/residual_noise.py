@@ -153,7 +153,9 @@ def outlying(windows: WindowMotions, linear: Linear, W: Array, noise_is_known: n
     """
     squares = deletion_squares(linear, W)
     squares[~windows.used] = 0.0
-    medians = np.array([np.median(own[used]) if used.any() else MEDIAN for own, used in zip(squares, windows.used, strict=True)])
+    medians = np.array(
+        [np.median(own[used]) if used.any() else MEDIAN for own, used in zip(squares, windows.used, strict=True)]
+    )
     factor = np.maximum(medians / MEDIAN, np.where(noise_is_known, 1.0, 1e-3))
     relative = squares / (factor * float(chdtri(6.0, SIGNIFICANCE)))[:, None]
     worst = relative == relative.max(axis=0)
