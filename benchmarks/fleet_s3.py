@@ -36,13 +36,14 @@ def rows(arguments: argparse.Namespace) -> list[Row]:
             url = f"s3://{BUCKET}/{seed}.mcap"
             stores.write_once(url, path.read_bytes())
             before = server.sent, server.asked
-            copy = local_copy_of_topics(url, TOPICS, folder)
-            assert copy.bytes_read == server.sent - before[0]
-            sent, asked = sent + copy.bytes_read, asked + server.asked - before[1]
-            with open_log(copy.path) as log:
+            with stores.counted_bytes() as count:
+                copy = local_copy_of_topics(url, TOPICS, folder)
+            assert count.count == server.sent - before[0]
+            sent, asked = sent + count.count, asked + server.asked - before[1]
+            with open_log(copy) as log:
                 counts = {topic.name: topic.count for topic in log.topics()}
             assert counts["/tf"] == counts["/detections"] == 200 * (arguments.seconds // 10)
-            copy.path.unlink()
+            copy.unlink()
     return [
         Row("bytes read over the needed topics' chunks", f"{sent / chunks:.3f}x", "<= 1.2x", sent <= 1.2 * chunks),
         Row("  bytes read, of the logs' bytes", f"{sent:,} of {whole:,} ({sent / whole:.1%})"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -133,32 +133,13 @@ _NAMES = {
 
 def event_fields(event: Event) -> dict[str, Any]:
     """The fields of an event's line."""
-    fields: dict[str, Any] = {"event": _NAMES[type(event)], "robot": event.robot, **time_fields("when", event.when_ns)}
-    match event:
-        case NightEvent():
-            fields |= {"nights": event.nights, "chance": event.chance, "limit": event.limit}
-        case NoAnswerEvent():
-            fields |= {"reason": event.reason}
-        case FramesEvent():
-            fields |= {"appeared": event.appeared, "missing": event.missing}
-        case FreeEvent():
-            fields |= {"free": dict(event.free)}
-        case AlarmEvent():
-            for name in ("last_unchanged", "first_changed", "earliest", "latest"):
-                fields |= time_fields(name, getattr(event, f"{name}_ns"))
-            fields["frames"] = [
-                {
-                    "name": frame.name,
-                    "translation_mm": frame.translation_mm,
-                    "rotation_deg": frame.rotation_deg,
-                    "deviations": frame.deviations if math.isfinite(frame.deviations) else None,
-                    "xi": frame.xi,
-                }
-                for frame in event.frames
-            ]
-            for name in ("is_of_all", "kind", "drift_gain", "chance", "limit", "is_back", "unit"):
-                fields[name] = getattr(event, name)
-            fields["words"] = str(event)
+    fields: dict[str, Any] = {"event": _NAMES[type(event)]}
+    for name, value in asdict(event).items():
+        fields |= time_fields(name[:-3], value) if name.endswith("_ns") else {name: value}
+    if isinstance(event, AlarmEvent):
+        for frame in fields["frames"]:
+            frame["deviations"] = frame["deviations"] if math.isfinite(frame["deviations"]) else None
+        fields["words"] = str(event)
     return fields
 
 

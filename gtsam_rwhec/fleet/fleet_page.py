@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +14,15 @@ from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.drift_events import AlarmEvent, day_text
-from gtsam_rwhec.fleet.fleet_report import drift_remarks, drift_verdict, summary, worst_first
+from gtsam_rwhec.fleet.fleet_report import (
+    drift_remarks,
+    drift_verdict,
+    some,
+    summary,
+    tone_of,
+    verdict_cell,
+    worst_first,
+)
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.stores import write_once
 from gtsam_rwhec.fleet.tasks import below
@@ -37,7 +45,6 @@ MADE_BY = "Written by gtsam-rwhec fleet."
 BLUE = "#2C8CC9"
 #: Chances below this are drawn at this value.
 LEAST_CHANCE = 1e-16
-_WORDS = {Verdict.USE: "use", Verdict.CARE: "with care", Verdict.DO_NOT_USE: "do not use"}
 
 
 def put_page(rows: Sequence[RobotRow], output: str) -> str:
@@ -62,11 +69,9 @@ def fleet_page(
     rows: Sequence[RobotRow], watched: Watched | None = None, since_ns: int = 0, *, has_results: bool = False
 ) -> Page:
     """The page. With `has_results` it is in a run's output, and links to the results of `rows` there."""
-    counts = Counter(row.verdict for row in rows)
     alarms = [] if watched is None else [one for one in reversed(watched.alarms) if one.when_ns >= since_ns]
-    is_bad = bool(counts[None] or counts[Verdict.DO_NOT_USE])
-    needs_care = bool(counts[Verdict.CARE] or alarms or not rows) or any(row.failed_logs for row in rows)
-    tone: Literal["good", "care", "bad"] = "bad" if is_bad else "care" if needs_care else "good"
+    tone = tone_of(rows)
+    tone = "care" if tone == "good" and alarms else tone
     steps = _what_to_do(rows, has_moved=bool(alarms))
     sections = [
         Section("verdict", "The verdict", (Paragraph(summary(rows), tone), *([Listing(tuple(steps))] if steps else [])))
@@ -105,7 +110,7 @@ def _what_to_do(rows: Sequence[RobotRow], *, has_moved: bool) -> list[Words]:
 
 def _worst(rows: Sequence[RobotRow], *, has_results: bool) -> Table:
     more = f"{len(rows) - MOST_WORST} more are in the table of all calibrations." if len(rows) > MOST_WORST else ""
-    cells = tuple((_name(row, has_results), _verdict(row), row.reason) for row in rows[:MOST_WORST])
+    cells = tuple((_name(row, has_results), verdict_cell(row), row.reason) for row in rows[:MOST_WORST])
     return Table("Poses not to be used first, the least certain first", ("calibration", "verdict", "why"), cells, more)
 
 
@@ -116,7 +121,7 @@ def _failures(rows: Sequence[RobotRow]) -> tuple[Block, ...]:
         if row.verdict is None:
             reasons.setdefault(row.failure or row.reason or "no reason is known", []).append(shown(row.unit))
     if reasons:
-        cells = tuple((reason, _some(names)) for reason, names in reasons.items())
+        cells = tuple((reason, some(names, most=MOST_NAMES)) for reason, names in reasons.items())
         blocks.append(Table("Without a calibration, by reason", ("reason", "which"), cells))
     logs = tuple((shown(log.url), shown(row.unit), log.reason) for row in rows for log in row.failed_logs)
     if logs:
@@ -149,7 +154,7 @@ def _table(rows: Sequence[RobotRow], *, has_results: bool) -> Table:
         known = row.covariance is not None and len(row.covariance) > 0
         return (
             _name(row, has_results),
-            _verdict(row),
+            verdict_cell(row),
             *([row.site or ""] if has_site else []),
             *(["" if row.begin_ns is None else day_text(row.begin_ns)] if several else []),
             number("covariance", moved, 1e3) if known else "",
@@ -179,14 +184,6 @@ def _table(rows: Sequence[RobotRow], *, has_results: bool) -> Table:
 
 def _name(row: RobotRow, has_results: bool) -> Words:
     return Link(shown(row.unit), row.result) if row.result and has_results else shown(row.unit)
-
-
-def _verdict(row: RobotRow) -> str:
-    return "failed" if row.verdict is None else _WORDS[row.verdict]
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:MOST_NAMES]) + (f", and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else "")
 
 
 def _alarm_table(alarms: list[AlarmEvent]) -> Table:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from gtsam_rwhec.calibration.verdict import Ground, Verdict
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.fleet.fleet_rows import (
@@ -21,15 +20,13 @@ from gtsam_rwhec.fleet.fleet_rows import (
     FORMAT_VERSION,
     PARQUET_FILE,
     ROWS_FILE,
-    FailedLog,
     RobotRow,
-    RowFrame,
     check_format,
     read_rows,
+    row_of,
 )
 from gtsam_rwhec.fleet.store_requests import shown
 from gtsam_rwhec.fleet.stores import exists, read_bytes
-from gtsam_rwhec.solver.certificate import Status
 
 #: Column, type, meaning, and the row's attribute if the value is kept unchanged. A type is the name of a pyarrow
 #: function, or is made in `_schema`.
@@ -176,27 +173,22 @@ def _fields(row: RobotRow) -> dict[str, Any]:
 
 
 def _row(fields: dict[str, Any]) -> RobotRow:
-    frames = tuple(
-        RowFrame(name, kind, np.array(T).reshape(4, 4))
+    frames = [
+        {"name": name, "kind": kind, "T": np.reshape(T, (4, 4))[:3]}
         for name, kind, T in zip(fields["frame_names"], fields["frame_kinds"], fields["frame_poses_m"], strict=True)
-    )
+    ]
     covariance, m = fields["covariance_rad_m"], 6 * len(frames)
     logs = zip(fields["failed_log_urls"], fields["failed_log_reasons"], strict=True)
     own = {name: fields[column] for column, _, _, name in COLUMNS if name}
-    return RobotRow(
-        **own
+    return row_of(
+        own
         | {
-            "verdict": None if fields["verdict"] is None else Verdict(fields["verdict"]),
-            "grounds": tuple(map(Ground, fields["grounds"])),
-            "status": None if fields["status"] is None else Status(fields["status"]),
-            "constant_errors": tuple(map(tuple, fields["constant_errors_rad_m"])),
-            "findings": tuple(fields["findings"]),
-        },
-        frames=frames,
-        covariance=None if covariance is None else np.array(covariance).reshape(m, m),
-        scale=dict(fields["scales"]) if fields["scale"] is None else fields["scale"],
-        failed_logs=tuple(FailedLog(url, reason) for url, reason in logs),
-        removed=dict(fields["removed_measurements"]),
+            "frames": frames,
+            "covariance": None if covariance is None else np.reshape(covariance, (m, m)),
+            "scale": dict(fields["scales"]) if fields["scale"] is None else fields["scale"],
+            "failed_logs": [{"url": url, "reason": reason} for url, reason in logs],
+            "removed": fields["removed_measurements"],
+        }
     )
 
 

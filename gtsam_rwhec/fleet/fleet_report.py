@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections import Counter
 from collections.abc import Sequence
 from datetime import UTC, date, datetime
+from typing import Literal
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief, shown
-from gtsam_rwhec.fleet.drift_events import AlarmEvent, NoAnswerEvent, day_text
+from gtsam_rwhec.fleet.drift_events import NoAnswerEvent, day_text
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.fleet_run import FleetRun
 from gtsam_rwhec.fleet.watching import Watched
 from gtsam_rwhec.report.report_blocks import Table
 from gtsam_rwhec.report.terminal_report import (
-    STYLES,
+    TONE_STYLES,
     print_heading,
     print_list,
     print_sentence,
@@ -34,12 +36,13 @@ LEGEND = (
     "one axis; - where the motion leaves it free."
 )
 _WORDS = {Verdict.USE: "may be used", Verdict.CARE: "to be used with care", Verdict.DO_NOT_USE: "not to be used"}
+_CELLS = {None: "failed", Verdict.USE: "use", Verdict.CARE: "with care", Verdict.DO_NOT_USE: "do not use"}
 
 
 def print_fleet(run: FleetRun) -> None:
     """Print a run: verdicts first, then the worst, failures, places and costs."""
     console = report_console()
-    print_sentence(console, summary(run.rows), STYLES[_worst(run.rows)])
+    print_sentence(console, summary(run.rows), TONE_STYLES[tone_of(run.rows)])
     named = worst_first(run.rows)[:MOST_NAMED]
     if named:
         console.print()
@@ -92,10 +95,11 @@ def remarks_of(rows: Sequence[RobotRow]) -> list[str]:
     return [f"{_name(row)}: {_short(words)}" for row in rows if row.verdict is Verdict.USE for words in row.findings]
 
 
-def _worst(rows: Sequence[RobotRow]) -> Verdict:
-    if not rows or any(row.failure is not None or row.verdict is Verdict.DO_NOT_USE for row in rows):
-        return Verdict.DO_NOT_USE
-    return Verdict.USE if all(row.is_fine and row.verdict is Verdict.USE for row in rows) else Verdict.CARE
+def tone_of(rows: Sequence[RobotRow]) -> Literal["good", "care", "bad"]:
+    """The tone of the worst row."""
+    if any(row.verdict in (None, Verdict.DO_NOT_USE) for row in rows):
+        return "bad"
+    return "good" if rows and all(row.is_fine and row.verdict is Verdict.USE for row in rows) else "care"
 
 
 def _name(row: RobotRow) -> str:
@@ -108,27 +112,28 @@ def _cells(rows: Sequence[RobotRow]) -> dict[str, tuple[str, ...]]:
         turned, moved = row.largest_deviations("sensor")
         deviations = ("-" if math.isinf(value) else f"{value:.3g}" for value in (1e3 * moved, math.degrees(turned)))
         logs = str(row.logs) if not row.failed_logs else f"{row.logs} of {row.logs + len(row.failed_logs)}"
-        words = "" if row.verdict is None else row.verdict.value.replace("_", " ")
-        cells[_name(row)] = (words, logs, str(row.measurements), *deviations)
+        cells[_name(row)] = (verdict_cell(row), logs, str(row.measurements), *deviations)
     return cells
 
 
+def verdict_cell(row: RobotRow) -> str:
+    """The verdict in a table."""
+    return _CELLS[row.verdict]
+
+
 def _short(words: str | None) -> str:
-    text = words or ""
-    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}..."
+    return textwrap.shorten(words or "", LONGEST_REASON, placeholder="...")
 
 
 def _done(run: FleetRun) -> str:
-    if not run.new_tasks and any(not row.is_fine and (row.failure or row.failed_logs) for row in run.rows):
-        return f"Nothing new was computed; {run.earlier_tasks} files were there already. {run.seconds:.1f} s."
+    earlier = f"{run.earlier_tasks} files were there already. {run.seconds:.1f} s."
     if not run.new_tasks:
-        return f"Everything was done already ({run.earlier_tasks} files); nothing was computed. {run.seconds:.1f} s."
-    earlier = f" {run.earlier_tasks} were there already." if run.earlier_tasks else ""
+        return f"Nothing new was computed; {earlier}"
     read = sum(row.bytes_read for row in run.rows)
     peak = max((row.peak_bytes for row in run.rows), default=0)
     return (
-        f"{run.new_tasks} tasks done in {run.seconds:.1f} s ({run.cpu_s:.1f} s of processors).{earlier} "
-        f"{read / 1e6:.3g} MB of logs read, {peak / 1e6:.0f} MB of memory at most."
+        f"{run.new_tasks} tasks done ({run.cpu_s:.1f} s of processors, {read / 1e6:.3g} MB of logs read, "
+        f"{peak / 1e6:.0f} MB of memory at most); {earlier}"
     )
 
 
@@ -149,7 +154,7 @@ def drift_verdict(watched: Watched, since_ns: int = 0) -> str:
     if not changed:
         return f"Nothing moved by more than chance{since}: {of}."
     return (
-        f"Moved by more than chance{since}: {len(changed)} of {of}: {_some(list(map(shown, changed)))}. "
+        f"Moved by more than chance{since}: {len(changed)} of {of}: {some(list(map(shown, changed)))}. "
         "Look at the mounts of the frames that are named, and use the calibrations since the date of the change."
     )
 
@@ -178,20 +183,19 @@ def drift_remarks(watched: Watched) -> tuple[str, ...]:
             f"{'' if event.when_ns is None else f' {day_text(event.when_ns)}'} ({shown(event.reason)})"
             for event in missing
         ]
-        found.append(f"{len(missing)} nights say nothing and are left out: {_some(named, '; ')}.")
+        found.append(f"{len(missing)} nights say nothing and are left out: {some(named, '; ')}.")
     once = [name for name, robot in watched.robots.items() if len(robot.tests) == 1]
     if once:
-        found.append(f"One night only, so nothing is tested: {_some(list(map(shown, once)))}.")
+        found.append(f"One night only, so nothing is tested: {some(list(map(shown, once)))}.")
     several = [name for name, count in Counter(alarm.robot for alarm in watched.alarms).items() if count > 2]
     if several:
-        found.append(f"More than two alarms: {_some(list(map(shown, several)))}. Something moves again and again.")
+        found.append(f"More than two alarms: {some(list(map(shown, several)))}. Something moves again and again.")
     return tuple(found)
 
 
 def alarm_lines(watched: Watched, since_ns: int = 0) -> tuple[str, ...]:
     """One sentence for each alarm, the latest first."""
-    alarms: list[AlarmEvent] = [alarm for alarm in reversed(watched.alarms) if alarm.when_ns >= since_ns]
-    return tuple(map(str, alarms))
+    return tuple(str(alarm) for alarm in reversed(watched.alarms) if alarm.when_ns >= since_ns)
 
 
 def day_ns_of(text: str | None) -> int:
@@ -205,6 +209,7 @@ def day_ns_of(text: str | None) -> int:
     return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * 1_000_000_000
 
 
-def _some(names: list[str], between: str = ", ") -> str:
-    more = len(names) - SAID
-    return between.join(names[:SAID]) + (f"{between}and {more} more" if more > 0 else "")
+def some(names: Sequence[str], between: str = ", ", most: int = SAID) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - most
+    return between.join(names[:most]) + (f"{between}and {more} more" if more > 0 else "")

@@ -126,7 +126,7 @@ def read_rows(content: bytes, where: str) -> tuple[RobotRow, ...]:
     try:
         tree = json.loads(content.decode("utf-8", "surrogateescape"))
         check_format(tree["format"], tree["format_version"], where)
-        return tuple(map(_row, tree["rows"]))
+        return tuple(map(row_of, tree["rows"]))
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise FileFormatError(f"{where} cannot be read as rows of a fleet: {error!r}") from error
 
@@ -159,7 +159,8 @@ def _tree(row: RobotRow) -> dict[str, Any]:
     }
 
 
-def _row(tree: dict[str, Any]) -> RobotRow:
+def row_of(tree: dict[str, Any]) -> RobotRow:
+    """The row of what `rows_json` writes for it."""
     covariance, scale = tree["covariance"], tree["scale"]
     return RobotRow(
         **{name: tree[name] for name in PLAIN},
@@ -172,7 +173,7 @@ def _row(tree: dict[str, Any]) -> RobotRow:
         degrees_of_freedom=_float(tree["degrees_of_freedom"]),
         scale=math.nan if scale is None else scale,
         failed_logs=tuple(FailedLog(log["url"], log["reason"]) for log in tree["failed_logs"]),
-        removed=tree["removed"],
+        removed=dict(tree["removed"]),
         findings=tuple(tree["findings"]),
     )
 

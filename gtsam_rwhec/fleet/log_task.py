@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -18,8 +15,8 @@ from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, Sto
 from gtsam_rwhec.fleet.manifest import RigSource
 from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION, LogFacts, PairMeasurements, PartialResult, camera_fields
 from gtsam_rwhec.fleet.store_requests import shown
-from gtsam_rwhec.fleet.stores import stamp_of, write_once
-from gtsam_rwhec.fleet.tasks import Receipt, below, costs_of, keep_receipt, kept_receipt
+from gtsam_rwhec.fleet.stores import stamp_of
+from gtsam_rwhec.fleet.tasks import Receipt, filed, key_of
 from gtsam_rwhec.fleet.topic_copy import local_copy_of_topics
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
@@ -52,8 +49,7 @@ class LogTask:
     @property
     def key(self) -> str:
         """A checksum of all that the partial result depends on."""
-        parts = [self.url, self.stamp, self.rig.sha256, FORMAT_VERSION, version("gtsam-rwhec")]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:40]
+        return key_of(self.url, self.stamp, self.rig.sha256, FORMAT_VERSION, version("gtsam-rwhec"))
 
     @property
     def file(self) -> str:
@@ -71,14 +67,7 @@ def map_log(task: LogTask, output: str) -> Receipt:
     OSError
         The store broke off.
     """
-    earlier = kept_receipt(output, task.key, task.file)
-    if earlier is not None:
-        return earlier
-    with costs_of(task.key) as costs, TemporaryDirectory(prefix="gtsam-rwhec-") as temporary:
-        content = _partial(task, Path(temporary)).packed()
-        write_once(below(output, task.file), content)
-        receipt = costs.receipt(task.file, hashlib.sha256(content).hexdigest())
-    return keep_receipt(output, receipt)
+    return filed(output, task.key, task.file, lambda folder: _partial(task, folder).packed())
 
 
 def _partial(task: LogTask, folder: Path) -> PartialResult:
@@ -97,7 +86,7 @@ def _partial(task: LogTask, folder: Path) -> PartialResult:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", RwhecWarning)
         try:
-            path, _ = local_copy_of_topics(task.url, wanted_topics(rig), folder)
+            path = local_copy_of_topics(task.url, wanted_topics(rig), folder)
             places.append(str(path))
             if stamp_of(task.url) != task.stamp:
                 raise LogError(f"{shown(task.url)} changed while it was read; run again when it is whole")

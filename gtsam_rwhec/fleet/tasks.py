@@ -7,6 +7,7 @@ would write: no work is done twice, and two runs at the same time write the same
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import sys
@@ -14,13 +15,14 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from gtsam_rwhec.errors import FileFormatError, RwhecError
 from gtsam_rwhec.fleet.store_requests import without_secrets
-from gtsam_rwhec.fleet.stores import ByteCount, counted_bytes, exists, read_bytes, write_once
+from gtsam_rwhec.fleet.stores import counted_bytes, exists, read_bytes, write_once
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 
 try:
@@ -137,44 +139,46 @@ def kept_receipt(output: str, key: str, file: str) -> Receipt | None:
         raise FileFormatError(f"{url} is no receipt of a fleet; remove it, and run again") from error
 
 
-def keep_receipt(output: str, receipt: Receipt) -> Receipt:
-    """Write the receipt after its file, so that a file with a receipt is complete."""
-    write_once(below(output, _place(receipt.file)), json.dumps(asdict(receipt), sort_keys=True).encode())
+def filed(output: str, key: str, file: str, content: Callable[[Path], bytes]) -> Receipt:
+    """The receipt of a task's file, which has the bytes that `content` makes in a temporary folder.
+
+    Without work if another run has made it. The receipt is written last, so that a file with a receipt is complete.
+    """
+    kept = kept_receipt(output, key, file)
+    if kept is not None:
+        return kept
+    with costs_of(key) as receipt_of, TemporaryDirectory(prefix="gtsam-rwhec-") as folder:
+        data = content(Path(folder))
+        write_once(below(output, file), data)
+        receipt = receipt_of(file, hashlib.sha256(data).hexdigest())
+    write_once(below(output, _place(file)), json.dumps(asdict(receipt), sort_keys=True).encode())
     return receipt
+
+
+def key_of(*parts: object) -> str:
+    """The key of a task whose file depends on these parts."""
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:40]
 
 
 def _place(file: str) -> str:
     return f"{file}.receipt.json"
 
 
-@dataclass
-class Costs:
-    """What a task has cost so far, and its receipt at the end."""
-
-    key: str
-    _bytes: ByteCount
-    _cpu_s: float = field(default_factory=lambda: _cpu_s())
-    _began_s: float = field(default_factory=time.monotonic)
-
-    def receipt(self, file: str, sha256: str) -> Receipt:
-        """The task's receipt, with its costs from the beginning until now."""
-        return Receipt(
-            key=self.key,
-            file=file,
-            sha256=sha256,
-            cpu_s=_cpu_s() - self._cpu_s,
-            seconds=time.monotonic() - self._began_s,
-            bytes_read=self._bytes.count,
+@contextmanager
+def costs_of(key: str) -> Iterator[Callable[[str, str], Receipt]]:
+    """Measure what a task costs in the block; yields what makes its receipt from a file and its checksum."""
+    _forget_peak()
+    cpu_s, began_s = _cpu_s(), time.monotonic()
+    with counted_bytes() as count:
+        yield lambda file, sha256: Receipt(
+            key,
+            file,
+            sha256,
+            cpu_s=_cpu_s() - cpu_s,
+            seconds=time.monotonic() - began_s,
+            bytes_read=count.count,
             peak_bytes=peak_bytes(),
         )
-
-
-@contextmanager
-def costs_of(key: str) -> Iterator[Costs]:
-    """Measure what a task costs in the block."""
-    _forget_peak()
-    with counted_bytes() as count:
-        yield Costs(key, count)
 
 
 def peak_bytes() -> int:

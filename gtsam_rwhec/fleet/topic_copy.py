@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeAlias
+from typing import BinaryIO, TypeAlias
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -21,7 +21,7 @@ from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
 from gtsam_rwhec.files.budgets import Spending
 from gtsam_rwhec.files.whole_files import atomic_stream
 from gtsam_rwhec.fleet.store_requests import shown
-from gtsam_rwhec.fleet.stores import count_bytes, counted_bytes, local_path, read_ranges, size_of
+from gtsam_rwhec.fleet.stores import count_bytes, local_path, read_ranges, size_of
 from gtsam_rwhec.logs.mcap_file import FAULTS, MAGIC, RECORD, read_index
 from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
@@ -38,13 +38,6 @@ REQUEST, TOGETHER = 8 << 20, 32 << 20
 _OWN = "gtsam_rwhec."
 #: The stages write these files beside the log.
 _OF_STAGES = ("detected.mcap", "calibration.mcap")
-
-
-class LocalCopy(NamedTuple):
-    """A log on this machine's disk (the file itself or a copy), and the bytes that were read for it."""
-
-    path: Path
-    bytes_read: int
 
 
 #: First byte, end, and the places (offset, length) that it holds.
@@ -66,8 +59,8 @@ class Needed:
         return sum(chunk.chunk_length for chunk in self.chunks)
 
 
-def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> LocalCopy:
-    """A log on disk that has all messages of some topics, and possibly others.
+def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> Path:
+    """A log on this machine's disk (the file itself or a copy) with all messages of some topics, and possibly others.
 
     ``/tf`` or ``/tf_static`` stand for all topics of transforms. A copy is made in `folder`.
 
@@ -82,21 +75,18 @@ def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> Loc
     size = size_of(url)
     if path is not None and size < SMALL:
         count_bytes(size)
-        return LocalCopy(path, size)
-    with counted_bytes() as count:
-        needed = needed_of(url, size, topics)
-        is_worth_it = not isinstance(needed, str) and needed.chunk_bytes < SHARE * size
-        if path is not None and not is_worth_it:
-            count_bytes(size)
-            return LocalCopy(path, size)
-        name = shown(url).removesuffix("?...").rpartition("/")[2]
-        copy = folder / (f"log_{name}" if name in _OF_STAGES else name)
-        if not isinstance(needed, str):
-            needed = _copied(url, needed, copy)
-        if needed:
-            warnings.warn(f"{shown(url)}: {needed}; all of its {size} bytes are read", LogWarning, stacklevel=2)
-            _copied_whole(url, size, copy)
-    return LocalCopy(copy, count.count)
+        return path
+    needed = needed_of(url, size, topics)
+    if path is not None and (isinstance(needed, str) or needed.chunk_bytes >= SHARE * size):
+        count_bytes(size)
+        return path
+    name = shown(url).removesuffix("?...").rpartition("/")[2]
+    copy = folder / (f"log_{name}" if name in _OF_STAGES else name)
+    fault = needed if isinstance(needed, str) else _copied(url, needed, copy)
+    if fault:
+        warnings.warn(f"{shown(url)}: {fault}; all of its {size} bytes are read", LogWarning, stacklevel=2)
+        _copied_whole(url, size, copy)
+    return copy
 
 
 def needed_of(url: str, size: int, topics: Collection[str]) -> Needed | str:

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
@@ -31,7 +30,7 @@ from gtsam_rwhec.fleet.partial_result import (
     with_sensor_names,
 )
 from gtsam_rwhec.fleet.stores import read_bytes, write_once
-from gtsam_rwhec.fleet.tasks import Receipt, below, costs_of, keep_receipt, kept_receipt
+from gtsam_rwhec.fleet.tasks import Receipt, below, filed, key_of
 from gtsam_rwhec.fleet.unit_problem import UnitLog, UnitProblem, check_rigs, disagreeing_logs, sensor_name, unit_problem
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import LogFields, TimeOffsetFields
@@ -59,8 +58,7 @@ class UnitTask:
         """A checksum of everything that the answer depends on."""
         rigs = [(robot, source.sha256) for robot, source in self.rigs]
         logs = [(robot, receipt.file) for robot, receipt in self.logs]
-        parts = [FORMAT_VERSION, version("gtsam-rwhec"), self.name, self.site, self.each, rigs, logs]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:40]
+        return key_of(FORMAT_VERSION, version("gtsam-rwhec"), self.name, self.site, self.each, rigs, logs)
 
     @property
     def file(self) -> str:
@@ -105,16 +103,13 @@ def solve_unit(task: UnitTask, output: str) -> Receipt:
     RwhecError
         As ``calibrate`` does.
     """
-    kept = kept_receipt(output, task.key, task.file)
-    if kept is not None:
-        return kept
-    with costs_of(task.key) as costs, TemporaryDirectory(prefix="gtsam-rwhec-") as temporary:
-        answer = _answer(task, output, Path(temporary))
-        content = answer.packed()
+
+    def content(folder: Path) -> bytes:
+        answer = _answer(task, output, folder)
         write_results(output, answer)
-        write_once(below(output, task.file), content)
-        receipt = costs.receipt(task.file, hashlib.sha256(content).hexdigest())
-    return keep_receipt(output, receipt)
+        return answer.packed()
+
+    return filed(output, task.key, task.file, content)
 
 
 def write_results(output: str, answer: Answer) -> None:

@@ -49,18 +49,21 @@ class RobotFrames:
     groups: dict[str, slice]
     reference: dict[str, Array]  #: The pose of its first night
     unit: Array  #: (m,): the deviation of each number at its first night, rad and m: the numbers are multiples of it
+    names: dict[tuple[str, str], str]  #: The name of each frame and kind
 
     @staticmethod
     def of(rows: Sequence[RobotRow]) -> RobotFrames:
         """Make it from usable rows in order of time."""
         reference: dict[str, Array] = {}
         units: dict[str, Array] = {}
-        names = _names(rows)
+        names: dict[tuple[str, str], str] = {}
         for row in rows:
             assert row.covariance is not None
             variances = np.diagonal(row.covariance)
             for i, frame in enumerate(row.frames):
-                name = names[frame.name, frame.kind]
+                taken = any(name == frame.name and kind != frame.kind for name, kind in names)
+                own_name = f"{frame.name} ({frame.kind})" if taken else frame.name
+                name = names.setdefault((frame.name, frame.kind), own_name)
                 reference.setdefault(name, frame.T)
                 own = variances[6 * i : 6 * i + 6]
                 known = np.isfinite(own) & (own > 0.0)
@@ -68,14 +71,14 @@ class RobotFrames:
                 fresh = known & (unit == 0.0)
                 unit[fresh] = np.sqrt(own[fresh])
         unit = np.concatenate([np.where(each > 0.0, each, 1.0) for each in units.values()] or [np.zeros(0)])
-        return RobotFrames({name: slice(6 * i, 6 * i + 6) for i, name in enumerate(reference)}, reference, unit)
+        return RobotFrames({name: slice(6 * i, 6 * i + 6) for i, name in enumerate(reference)}, reference, unit, names)
 
-    def night(self, row: RobotRow, names: dict[tuple[str, str], str]) -> Night:
+    def night(self, row: RobotRow) -> Night:
         """The numbers of one row."""
         assert row.covariance is not None
         m = len(self.unit)
         x, J, rows = np.zeros(m), np.zeros((m, 6 * len(row.frames))), np.zeros(m, bool)
-        called = [names[frame.name, frame.kind] for frame in row.frames]
+        called = [self.names[frame.name, frame.kind] for frame in row.frames]
         before = np.stack([self.reference[name] for name in called])
         xi = se3.logmap(se3.inverse(before) @ np.stack([frame.T for frame in row.frames]))
         inward = se3.right_jacobian_inverse(xi)
@@ -120,11 +123,6 @@ class Night:
     seen: np.ndarray  #: (m,): rows that it determines
 
 
-def names_of(rows: Iterable[RobotRow]) -> dict[tuple[str, str], str]:
-    """The chart's name of each frame and kind."""
-    return _names(list(rows))
-
-
 def why_not(row: RobotRow) -> str:
     """Why a row does not determine where the frames are; empty if it does."""
     if row.verdict is None or not row.frames:
@@ -145,15 +143,6 @@ def why_not(row: RobotRow) -> str:
     if row.begin_ns is None:
         return "its measurements have no time"
     return ""
-
-
-def _names(rows: Iterable[RobotRow]) -> dict[tuple[str, str], str]:
-    names: dict[tuple[str, str], str] = {}
-    for row in rows:
-        for frame in row.frames:
-            taken = any(name == frame.name and kind != frame.kind for name, kind in names)
-            names.setdefault((frame.name, frame.kind), f"{frame.name} ({frame.kind})" if taken else frame.name)
-    return names
 
 
 def _without_constant_errors(row: RobotRow) -> Array:
@@ -217,7 +206,6 @@ class RobotChart:
 
     number: int
     frames: RobotFrames
-    names: dict[tuple[str, str], str]
     chart: Chart
     when_ns: list[int] = field(default_factory=list)  #: Of each night
     #: Each night's numbers, in the frames' units; nan if the night does not determine a number
@@ -249,34 +237,36 @@ def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
         rows_of.setdefault(row.robot, []).append(row)
     for name, own in rows_of.items():
         frames = RobotFrames.of(own)
-        robots[name] = RobotChart(len(robots), frames, names_of(own), Chart(Nights.none(frames.groups)))
+        robots[name] = RobotChart(len(robots), frames, Chart(Nights.none(frames.groups)))
     events: list[Event] = []
-    pool, spread = SpreadPool(), SpreadPool().found()
+    pool = SpreadPool()
+    spread = pool.found()
     fresh: list[tuple[int, int, Array, Array]] = []
     day = None
+
+    def pooled() -> FoundSpread:
+        """The spread with the differences of the day that ends."""
+        for each in fresh:
+            pool.add(*each)
+        fresh.clear()
+        return pool.found()
+
     for row in given:
         if row.begin_ns is not None and row.begin_ns // DAY_NS != day:
-            day = row.begin_ns // DAY_NS
-            for each in fresh:
-                pool.add(*each)
-            if fresh:
-                spread = pool.found()
-            fresh = []
+            day, spread = row.begin_ns // DAY_NS, pooled()
         why = why_not(row)
         if why:
             events.append(NoAnswerEvent(row.robot, row.begin_ns, why))
             continue
         robot = robots[row.robot]
-        night = robot.frames.night(row, robot.names)
+        night = robot.frames.night(row)
         said = _night_events(robot, row, night, spread, rate)
         events += said
         if said and isinstance(said[-1], AlarmEvent):  # differences across a change do not show the noise
             robot.last = [each for each in robot.last if each.when_ns >= said[-1].first_changed_ns]
         fresh += _differences(robot, night)
         robot.last = [*robot.last[-1:], night]
-    for each in fresh:
-        pool.add(*each)
-    return Watched(rate, tuple(events), robots, pool.found())
+    return Watched(rate, tuple(events), robots, pooled())
 
 
 def _one_for_each_time(rows: list[RobotRow]) -> list[RobotRow]:

@@ -34,11 +34,13 @@ class Freedom:
     left: Array  #: (p, l): directions that prior knowledge leaves free too
     information: Array  #: (p, p): H - N along determined directions, plus that of prior knowledge
     score: Array  #: (p, p): H plus that of prior knowledge: the covariance of the gradient
-    weakest: float  #: The smallest ratio of information over its threshold
 
     def complement(self) -> Array:
         """An orthonormal basis (p, p - l) of the directions that are determined."""
-        return _complement(self.left)
+        if not self.left.shape[1]:
+            return np.eye(len(self.left))
+        rest: Array = np.linalg.svd(self.left, full_matrices=True)[0][:, self.left.shape[1] :]
+        return rest
 
     def covariance(self) -> Array:
         """(p, p), zero along the directions that are left free."""
@@ -81,8 +83,7 @@ def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, s
     by_data = np.zeros((layout.size, int(is_free.sum())))
     by_data[data] = V[:, is_free] * unit[:, None]
     by_data = np.linalg.qr(by_data)[0] if by_data.size else by_data
-    weakest = float(1.0 / (share.max() * threshold)) if share.max() > 0.0 else np.inf
-    return Freedom(by_data, _left(by_data, given, layout), informed + given, H + given, weakest)
+    return Freedom(by_data, _left(by_data, given, layout), informed + given, H + given)
 
 
 def _left(by_data: Array, given: Array, layout: Layout) -> Array:
@@ -90,24 +91,13 @@ def _left(by_data: Array, given: Array, layout: Layout) -> Array:
     if not by_data.shape[1]:
         return by_data
     g = layout.ground
-    held = given
-    if len(g):
-        inner = np.linalg.inv(given[np.ix_(g, g)] + RIDGE * np.eye(len(g)))
-        held = given - given[:, g] @ inner @ given[g]
+    inner = np.linalg.inv(given[np.ix_(g, g)] + RIDGE * np.eye(len(g)))
+    held = given - given[:, g] @ inner @ given[g]
     clocks = layout.at[layout.open[:, 7], 7]
-    held = held.copy()
     held[clocks] = held[:, clocks] = 0.0
     values, vectors = np.linalg.eigh(by_data.T @ held @ by_data)
     left: Array = by_data @ vectors[:, values <= HOLDS]
     return left
-
-
-def _complement(directions: Array) -> Array:
-    if not directions.shape[1]:
-        return np.eye(len(directions))
-    U = np.linalg.svd(directions, full_matrices=True)[0]
-    rest: Array = U[:, directions.shape[1] :]
-    return rest
 
 
 def seven_each(directions: Array, layout: Layout) -> Array:

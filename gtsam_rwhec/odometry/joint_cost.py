@@ -180,16 +180,8 @@ REGION_M = 1000.0
 TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True)
-class JointSolution:
-    """The answer y (d,) of a joint form and its certificate; uniqueness is tested elsewhere."""
-
-    y: Array
-    certificate: JointCertificate
-
-
-def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -> JointSolution:
-    """The best result of descents from rotations (K, 3, 3), and the best bound found for it.
+def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -> tuple[Array, JointCertificate]:
+    """The best y (d,) of descents from rotations (K, 3, 3), and the best bound found for it; it may not be unique.
 
     An answer with a negative scale is the mirror image of one with a positive scale (design fact 5), which costs about
     as much if the vehicle turned about one ``axis`` (3,). The sensor is then turned by half a turn
@@ -205,7 +197,7 @@ def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -
     best, y, certificate = _best(form, starts)
     negative = y[12 * form.sensors : -1] < 0.0
     if axis is None or not negative.any():
-        return JointSolution(y, certificate)
+        return y, certificate
     R = best.R.copy()
     R[form.scaled[negative]] = (2.0 * np.outer(axis, axis) - np.eye(3)) @ R[form.scaled[negative]]
     scale = np.ones(form.sensors)
@@ -221,7 +213,7 @@ def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -
             "positive ones: the motion of a sensor of unknown scale is the mirror image of the others'; are its poses "
             "inverted, or its axes left-handed?"
         )
-    return JointSolution(y, replace(with_positive, scales_held=True))
+    return y, replace(with_positive, scales_held=True)
 
 
 def _best(form: JointForm, starts: list[Array]) -> tuple[Descent, Array, JointCertificate]:

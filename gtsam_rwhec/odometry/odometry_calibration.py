@@ -109,18 +109,15 @@ def calibrate_odometries(
     offsets = np.array([clock.offset_s for clock in clocks])
     scaled = np.array([track.has_unknown_scale for track in tracks])
 
-    def sampled() -> list[SampledTrack]:
-        return [
-            SampledTrack(gate.track, origin, float(offset), gate.good)
-            for offset, gate in zip(offsets, gates, strict=True)
-        ]
-
     tell("choosing windows")
     answer: Answer | None = None
     seconds = options.window_s
     variances: Array = np.zeros((0, 2))
     for _ in range(CLOCK_ROUNDS):
-        samples = sampled()
+        samples = [
+            SampledTrack(gate.track, origin, float(offset), gate.good)
+            for offset, gate in zip(offsets, gates, strict=True)
+        ]
         seconds = seconds or best_length(samples, options.max_gap_s)
         edges = edges_near(samples, seconds)
         windows = WindowMotions.of(samples, edges, options.max_gap_s, clocks=options.estimate_time_offsets)
@@ -139,8 +136,7 @@ def calibrate_odometries(
         offsets = offsets + change
         if float(np.abs(change).max()) < SAME_CLOCK_S:
             break
-    if answer is None:
-        raise UnderdeterminedError("no windows were solved")
+    assert answer is not None
     _check_agreement(answer, names)
     removed = {
         name: gate.removed + _outlying(answer, windows, k, origin)
@@ -201,8 +197,8 @@ def _first_variances(windows: WindowMotions, tracks: list[OdometryTrack]) -> Arr
         variances[k, 1] = (WAY_SHARE * max(float(np.median(way)), 1e-3)) ** 2
         if track.noise is not None:
             variances[k] = track.noise.rotation_rad_per_sqrt_s**2, track.noise.translation_m_per_sqrt_s**2
-    floor: Array = np.maximum(variances, 1e-16)
-    return floor
+    positive: Array = np.maximum(variances, 1e-16)
+    return positive
 
 
 def _check_turning(samples: list[SampledTrack], options: OdometryOptions, variances: Array) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +55,7 @@ def calibration_of(
     back = float(offsets[names.index(reference)])
     clock_at = [int(layout.at[k, OFFSET]) for k in range(len(names))]
     sigmas = _clock_sigmas(C, clock_at, names, reference) if layout.open[:, OFFSET].any() else {}
-    window = answer.windows
+    window, sizes = answer.windows, _residual_sizes(answer, names)
     return OdometryCalibration(
         reference=reference,
         sensors=sensors,
@@ -77,14 +77,10 @@ def calibration_of(
         noise={name: OdometryNoise(*(float(x) for x in np.sqrt(answer.variances[k]))) for k, name in enumerate(names)},
         noise_was_found=frozenset(name for k, name in enumerate(names) if not task.stated[k]),
         removed=removed,
-        residuals=_residual_sizes(answer, names),
+        residuals=sizes,
         influences=_influences(answer, task, change, order),
         others=others,
-        findings=(
-            *(Finding(Ground.CONTRADICTED, words) for words in inverted_in_words(tracks)),
-            *(Finding(Ground.CONTRADICTED, words) for words in _contradictions(answer, task)),
-            *(Finding(Ground.COVARIANCE_DOUBTED, words) for words in _doubts(answer, task, tracks, clocks, sigmas)),
-        ),
+        findings=tuple(_findings(answer, task, tracks, clocks, sigmas, sizes)),
         remarks=_remarks(task),
     )
 
@@ -130,15 +126,14 @@ def _free_directions(answer: Answer, task: Task) -> tuple[FreeDirection, ...]:
         return ()
     names = task.names[1:]
     windows, fit = answer.windows, answer.fit
-    length = 1.0
     variance = 1.0 / float((1.0 / answer.variances[:, 0]).sum())
     turned, squares, _ = axes_turned(windows, fit.state.motion, variance)
     residual = float(np.sqrt((fit.linear.r[..., :3] ** 2).sum(axis=2)[windows.used].mean()))
     reason = reason_for(min(turned, 2), float(np.sqrt(squares.sum())), residual, len(windows))
     if reason is FreeReason.CONTRADICTION:
         reason = FreeReason.NOISE
-    basis = sparse_basis(seven_each(left, task.layout), length)
-    return free_directions_of(names, basis, length, dict.fromkeys(names, reason))
+    basis = sparse_basis(seven_each(left, task.layout), 1.0)
+    return free_directions_of(names, basis, 1.0, dict.fromkeys(names, reason))
 
 
 def _influences(answer: Answer, task: Task, change: Array, order: tuple[str, ...]) -> tuple[Influence, ...]:
@@ -200,84 +195,82 @@ def _residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[f
     V = np.linalg.inv(answer.W + ~windows.used[:, :, None, None] * np.eye(6))
     fused = np.linalg.inv(answer.fit.normal.D)
     expected = np.einsum("mnii->mni", V - B @ fused @ np.swapaxes(B, 2, 3))
-    sizes = {}
-    for k, name in enumerate(names):
-        used = windows.used[k]
-        square, mean = (r[k, used] ** 2).sum(axis=0), np.maximum(expected[k, used], 0.0).sum(axis=0)
-        sizes[name] = tuple(
-            float(np.sqrt(square[part].sum() / max(mean[part].sum(), 1e-300))) for part in (slice(0, 3), slice(3, 6))
-        )
-    return sizes  # type: ignore[return-value]
+    is_used = windows.used[..., None]
+    squares, means = (
+        (x * is_used).reshape(*x.shape[:2], 2, 3).sum(axis=(1, 3)) for x in (r**2, np.maximum(expected, 0))
+    )
+    sizes = np.sqrt(squares / np.maximum(means, 1e-300))
+    return {name: (float(turn), float(way)) for name, (turn, way) in zip(names, sizes, strict=True)}
 
 
-def _doubts(
-    answer: Answer, task: Task, tracks: Sequence[OdometryTrack], clocks: Sequence[Clock], sigmas: dict[str, float]
-) -> tuple[str, ...]:
-    """Sentences about doubtful results; ``sigmas``: standard deviations of time offsets, s."""
-    said: list[str] = []
-    sizes = _residual_sizes(answer, task.names)
+def _findings(
+    answer: Answer,
+    task: Task,
+    tracks: Sequence[OdometryTrack],
+    clocks: Sequence[Clock],
+    sigmas_s: dict[str, float],
+    sizes: dict[str, tuple[float, float]],
+) -> Iterator[Finding]:
+    """What speaks against the poses: ``sigmas_s`` of time offsets, ``sizes`` of residuals over the expected ones."""
+
+    def doubted(words: str) -> Finding:
+        return Finding(Ground.COVARIANCE_DOUBTED, words)
+
+    def contradicted(words: str) -> Finding:
+        return Finding(Ground.CONTRADICTED, words)
+
+    yield from map(contradicted, inverted_in_words(tracks))
     for k, name in enumerate(task.names):
         if task.stated[k] and not 1.0 / DOUBTED < max(sizes[name]) < DOUBTED:
-            said.append(
+            yield doubted(
                 f"the residuals of {name} are {max(sizes[name]):.2g} times what its stated noise makes; state its true "
                 "noise, or leave it out: it is estimated then"
             )
-        share = max(_correlations(answer, k))
-        if share > CORRELATED and not _misfit(answer, k):
+        shares = _correlations(answer, k)
+        if part := _misfit(answer, k, shares):
+            yield contradicted(
+                f"the motions of {name} do not fit the other sensors': what differs is the same from window to window, "
+                f"and {100 * part:.0f} % of the motion itself"
+            )
+        elif (share := max(shares)) > CORRELATED:
             factor = np.sqrt((1.0 + share) / (1.0 - share))
-            said.append(
+            yield doubted(
                 f"the errors of {name} are alike from window to window (correlation {share:.2f}): they are no random "
                 f"walk but drift (a wrong scale or a bias), and standard deviations may be {factor:.1f} times too small"
             )
-        lost = int(answer.left_out[k].sum())
-        if lost > MANY * answer.left_out.shape[1]:
-            said.append(f"{name} contradicts the other sensors in {lost} of {answer.left_out.shape[1]} windows")
-    said += [
-        f"the clock of {track.sensor} was not found from its turning, and its offset was searched near "
-        f"zero: {clock.unknown}"
-        for track, clock in zip(tracks, clocks, strict=True)
-        if clock.unknown and sigmas.get(track.sensor, 0.0) > CLOCK_KNOWN_S
-    ]
+        lost, there = int(answer.left_out[k].sum()), answer.left_out.shape[1]
+        if lost > MANY * there:
+            yield doubted(f"{name} contradicts the other sensors in {lost} of {there} windows")
+    for track, clock in zip(tracks, clocks, strict=True):
+        if clock.unknown and sigmas_s.get(track.sensor, 0.0) > CLOCK_KNOWN_S:
+            yield doubted(
+                f"the clock of {track.sensor} was not found from its turning, and its offset was searched near "
+                f"zero: {clock.unknown}"
+            )
     C = answer.freedom.covariance()
     for k, name in enumerate(task.names[1:], 1):
         sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
-        if not task.given.given.distances_m and (apart := _apart(answer, task, k, sigma)):
-            said.append(f"the exact likelihood moved {name} by {apart}: the proof is of another answer")
+        apart = _apart(answer, task, k, sigma)
+        if apart and task.given.given.distances_m:
+            yield contradicted(f"the given distances contradict the motions: they moved {name} by {apart}")
+        elif apart:
+            yield doubted(f"the exact likelihood moved {name} by {apart}: the proof is of another answer")
         if sigma[3:].max() > LOOSE_M or sigma[:3].max() > LOOSE_RAD:
-            said.append(
+            yield doubted(
                 f"{name} is known only to {sigma[3:].max():.2g} m and {np.degrees(sigma[:3].max()):.2g} degrees (one "
                 "standard deviation): drive longer, with more turns about the axes that it lacks, or give what is known"
             )
     if not answer.fit.converged:
-        said.append("the refinement stopped before it converged; the poses may be off by more than they say")
-    return tuple(said)
-
-
-def _contradictions(answer: Answer, task: Task) -> tuple[str, ...]:
-    """Sentences about tracks that do not fit, and about given distances that moved poses from the certified answer."""
-    said = [
-        f"the motions of {name} do not fit the other sensors': what differs is the same from window to window, and "
-        f"{100 * part:.0f} % of the motion itself"
-        for k, name in enumerate(task.names)
-        if (part := _misfit(answer, k))
-    ]
+        yield doubted("the refinement stopped before it converged; the poses may be off by more than they say")
     if task.given.has_ground and task.given.given.ground is None:
         other_way = upside_down(task.given.normal, answer.fit.state.T)
         if other_way.sum() >= 0.0 and (other_way > 0.0).any():
             named = ", ".join(name for name, down in zip(task.names, other_way, strict=True) if down > 0.0)
-            said.append(
+            yield contradicted(
                 f"heights count upwards as {task.names[0]} stands, and beside it {named} would hang upside down. If it "
                 f"is {task.names[0]} that hangs, all heights have the wrong sign: give the ground, with its up in the "
                 f"axes of {task.names[0]}"
             )
-    if not task.given.given.distances_m:
-        return tuple(said)
-    C = answer.freedom.covariance()
-    for k, name in enumerate(task.names[1:], 1):
-        sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
-        if apart := _apart(answer, task, k, sigma):
-            said.append(f"the given distances contradict the motions: they moved {name} by {apart}")
-    return tuple(said)
 
 
 def _apart(answer: Answer, task: Task, k: int, sigma: Array) -> str:
@@ -317,12 +310,12 @@ def _remarks(task: Task) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _misfit(answer: Answer, k: int) -> float:
-    """Residuals as a share of the sensor's motion, if they are large and correlated; else zero."""
+def _misfit(answer: Answer, k: int, shares: tuple[float, float]) -> float:
+    """Residuals as a share of the sensor's motion, if they are large and correlate by large ``shares``; else zero."""
     windows, r = answer.windows, answer.fit.linear.r[k]
     motion = se3.logmap(windows.M[k])
     used, found = windows.used[k], 0.0
-    for part, share in zip((slice(0, 3), slice(3, 6)), _correlations(answer, k), strict=True):
+    for part, share in zip((slice(0, 3), slice(3, 6)), shares, strict=True):
         of_motion = np.sqrt((r[used, part] ** 2).sum() / max(float((motion[used, part] ** 2).sum()), 1e-300))
         if share > SAME and of_motion > SAME_PART:
             found = max(found, float(of_motion))
@@ -361,7 +354,7 @@ def other_answers(answer: Answer, task: Task, named: Callable[[Array], dict[str,
     found: list[OtherAnswer] = []
     state = answer.fit.state
     determined = free.complement()
-    for (first, second), _ in given.distances_m.items():
+    for first, second in given.distances_m:
         j, k = task.given.place[first], task.given.place[second]
         for moving, fixed in ((k, j), (j, k)):
             if moving == 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -202,9 +201,8 @@ def _contradicted(found: OdometryCalibration) -> list[Finding]:
     if not wrong:
         return []
     named = ", ".join(f"{one.what} = {one.value:g} {one.unit} ({one.off_by:.1f})" for one in wrong[:NAMED])
-    words = f"what is given contradicts the motions (by so many standard deviations): {named}"
-    if len(wrong) > NAMED:
-        words += f" and {len(wrong) - NAMED} more"
+    more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+    words = f"what is given contradicts the motions (by so many standard deviations): {named}{more}"
     return [Finding(Ground.POSE_DOUBTED, words)]
 
 
@@ -213,11 +211,8 @@ def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:
     said: list[str] = []
     heights: dict[str, list[str]] = {}
     for direction in found.free_directions:
-        if not direction.frames and not direction.own_scales:
-            said.append(str(direction))
-            continue
         said += _of_frames(direction, found, heights)
-        said += [f"the scale of {name} is not determined: {_why(direction)}" for name in direction.own_scales]
+        said += [f"the scale of {name} is not determined: {direction.reason.words}" for name in direction.own_scales]
     of_heights = [_of_heights(axis, list(dict.fromkeys(names)), found.reference) for axis, names in heights.items()]
     return tuple(dict.fromkeys((*of_heights, *said)))
 
@@ -226,19 +221,18 @@ def _of_frames(direction: FreeDirection, found: OdometryCalibration, heights: di
     """The sentences for a direction. Heights that a planar drive leaves free are added to `heights`, by their axis."""
     turns, shifts = (
         {
-            name: _in_reference(found.T_reference_sensor, name, np.array(twist)[part])
+            name: found.T_reference_sensor[name][:3, :3] @ np.array(twist)[part]
             for name, twist in direction.frames.items()
         }
         for part in (slice(0, 3), slice(3, 6))
     )
     said = []
-    largest_turn = max((float(np.linalg.norm(v)) for v in turns.values()), default=0.0)
-    largest_shift = max((float(np.linalg.norm(v)) for v in shifts.values()), default=0.0)
+    largest_turn, largest_shift = (max(map(np.linalg.norm, each.values()), default=0.0) for each in (turns, shifts))
     for name in direction.frames:
         if largest_turn > TAKES_PART and np.linalg.norm(turns[name]) > TAKES_PART * largest_turn:
             said.append(
                 f"the turn of {name} about {_axis(turns[name])} of {found.reference} is not determined: "
-                f"{_why(direction)}"
+                f"{direction.reason.words}"
             )
         elif largest_turn <= TAKES_PART and np.linalg.norm(shifts[name]) > TAKES_PART * largest_shift:
             axis = _axis(shifts[name])
@@ -247,7 +241,7 @@ def _of_frames(direction: FreeDirection, found: OdometryCalibration, heights: di
                 heights.setdefault(axis, []).append(name)
             else:
                 place = f"the place of {name} along {axis} of {found.reference}"
-                said.append(f"{place} is not determined: {_why(direction)}")
+                said.append(f"{place} is not determined: {direction.reason.words}")
     return said
 
 
@@ -256,15 +250,6 @@ def _of_heights(axis: str, names: list[str], reference: str) -> str:
     listed = f"{', '.join(names[:-1])} and {names[-1]}" if many else names[0]
     heights = f"the height{'s' * many} of {listed} over {reference} (along {axis} of {reference})"
     return f"{heights} {'are' if many else 'is'} not determined: the vehicle moved in a plane"
-
-
-def _why(direction: FreeDirection) -> str:
-    return "unknown why" if direction.reason is None else direction.reason.words
-
-
-def _in_reference(T_reference_sensor: Mapping[str, Array], name: str, v: Array) -> Array:
-    turned: Array = T_reference_sensor[name][:3, :3] @ v
-    return turned
 
 
 def _axis(v: Array) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import gtsam
@@ -24,21 +24,13 @@ from gtsam_rwhec.report.report_blocks import (
     Table,
     Words,
 )
-from gtsam_rwhec.report.terminal_report import (
-    STYLES,
-    print_heading,
-    print_list,
-    print_sections,
-    print_sentence,
-    print_tables,
-    report_console,
-)
+from gtsam_rwhec.report.terminal_report import STYLES, print_list, print_sections, print_sentence, report_console
 from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, POSE_HEADINGS
 
 #: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.
 FREE_SHARE = 0.1
-#: So many sentences say what is not used.
-MOST_REMOVED = 4
+#: The sections that a report without details has.
+BRIEF = ("poses", "given", "noise", "proof")
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along "
     "and about the sensor's own axes; free: not determined."
@@ -51,19 +43,10 @@ def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path 
     print_sentence(console, str(result.judgement), STYLES[result.verdict])
     if page is not None:
         print_sentence(console, f"The report: {shown_path(page)}")
-    if verbose:
-        print_sections(console, odometry_page(result).sections[1:])
-        return
-    console.print()
-    print_tables(console, [pose_table(result)], tight=True)
-    print_list(console, scales_and_clocks(result))
-    if result.given:
-        print_heading(console, "What was given, and how the answer depends on it", tight=True)
-        print_list(console, given_in_words(result))
-    print_heading(console, "The proof and the noise", tight=True)
-    print_list(console, proof_in_words(result))
-    print_list(console, removed_in_words(result)[:MOST_REMOVED])
-    print_list(console, [f"{words[:1].upper()}{words[1:]}." for words in result.remarks])
+    sections = odometry_page(result).sections[1:]
+    print_sections(console, sections if verbose else [one for one in sections if one.name in BRIEF and one.blocks])
+    if not verbose:
+        print_list(console, [f"{words[:1].upper()}{words[1:]}." for words in result.remarks])
 
 
 def pose_table(result: OdometryResult) -> Table:
@@ -131,31 +114,6 @@ def given_in_words(result: OdometryResult) -> list[str]:
     return said
 
 
-def proof_in_words(result: OdometryResult) -> list[str]:
-    """The certificate, the windows, and the noise of each sensor."""
-    said = [
-        f"{result.certificate.sentence}.",
-        f"{result.windows} windows of {result.window_s:.3g} s, all sensors at once.",
-    ]
-    for one in result.tracks:
-        noise, how = one.noise, "found" if one.noise.was_found else "stated"
-        said.append(
-            f"noise of {one.sensor} ({how}): {noise.rotation_deg_per_sqrt_s:.2g}° and "
-            f"{noise.translation_mm_per_sqrt_s:.3g} mm after a second; residuals {one.residual_rotation:.2f} and "
-            f"{one.residual_translation:.2f} times it, in {one.windows} windows."
-        )
-    return said
-
-
-def removed_in_words(result: OdometryResult) -> list[str]:
-    """What is not used, by sensor and reason."""
-    return [
-        f"not used of {one.sensor}: {', '.join(f'{why}: {count}' for why, count in one.removed.items())}."
-        for one in result.tracks
-        if one.removed
-    ]
-
-
 #: Before the name of a field in a result file.
 OF = "result.json#"
 
@@ -186,30 +144,32 @@ def odometry_page(result: OdometryResult) -> Page:
     tone = TONES[result.verdict]
     free = result.not_determined or tuple(one.sentence for one in result.free_directions)
     others = tuple(f"{one.why}: its cost is {one.cost_above:.2g} above the answer's." for one in result.other_answers)
+    said = (*result.findings, *result.remarks)
     determined = "The motions, with what was given, determine every pose and scale."
     open_ = (Listing((*free, *others)),) if free or others else (Paragraph(determined, "good"),)
-    given: tuple[Block, ...] = (Listing(tuple(given_in_words(result))),)
+    proof: list[Block] = [Paragraph(f"{result.certificate.sentence}.")]
+    if result.free_directions:
+        records = Listing(tuple(one.sentence for one in result.free_directions))
+        proof.append(Folded("Free directions as records", (records,)))
     sections = (
-        Section("verdict", "Verdict", (Paragraph(str(result.judgement), tone), *_findings(result))),
-        Section("poses", f"Poses in the frame of {result.reference}", tuple(_poses(result))),
+        Section("verdict", "Verdict", (Paragraph(str(result.judgement), tone), *_listed(said))),
+        Section(
+            "poses",
+            f"Poses in the frame of {result.reference}",
+            (pose_table(result), *_listed(scales_and_clocks(result))),
+        ),
         Section("determines", "What the motions determine", open_),
-        Section("given", "What was given", given if result.given else (), "" if result.given else "nothing was given."),
+        Section(
+            "given", "What was given", _listed(given_in_words(result)), "" if result.given else "nothing was given."
+        ),
         Section("noise", "Noise and windows", tuple(_noise(result))),
-        Section("proof", "The proof", tuple(_proof(result))),
+        Section("proof", "The proof", tuple(proof)),
     )
     return Page("Calibration of odometries", tone, sections, f"Written by {result.written_by}.")
 
 
-def _findings(result: OdometryResult) -> Iterator[Block]:
-    if result.findings or result.remarks:
-        yield Listing((*result.findings, *result.remarks))
-
-
-def _poses(result: OdometryResult) -> Iterator[Block]:
-    yield pose_table(result)
-    said = scales_and_clocks(result)
-    if said:
-        yield Listing(tuple(said))
+def _listed(said: Sequence[str]) -> tuple[Block, ...]:
+    return (Listing(tuple(said)),) if said else ()
 
 
 def _noise(result: OdometryResult) -> Iterator[Block]:
@@ -228,11 +188,10 @@ def _noise(result: OdometryResult) -> Iterator[Block]:
     headings = ("sensor", "noise", "° after 1 s", "mm after 1 s", "residuals, turn", "residuals, way", "windows")
     legend = "Residuals are root mean squares in standard deviations: 1 is expected."
     yield Table("How errors grow, and how well the motions agree", headings, rows, legend)
-    removed = removed_in_words(result)
+    yield Paragraph(f"{result.windows} windows of {result.window_s:.3g} s, all sensors at once.")
+    removed = [
+        f"not used of {one.sensor}: {', '.join(f'{why}: {count}' for why, count in one.removed.items())}."
+        for one in result.tracks
+        if one.removed
+    ]
     yield Listing(tuple(removed)) if removed else Paragraph("No pose is left out, and no window as an outlier.")
-
-
-def _proof(result: OdometryResult) -> Iterator[Block]:
-    yield Paragraph(proof_in_words(result)[0])
-    if result.free_directions:
-        yield Folded("Free directions as records", (Listing(tuple(one.sentence for one in result.free_directions)),))

@@ -21,7 +21,7 @@ from gtsam_rwhec.errors import FileFormatError, FrameError
 from gtsam_rwhec.files.whole_files import read_whole, write_atomically
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import of_rotations
-from gtsam_rwhec.odometry.odometry_record import JointCertificate, OdometryCalibration, free_in_words
+from gtsam_rwhec.odometry.odometry_record import OdometryCalibration, free_in_words
 
 FORMAT: Final = "gtsam-rwhec odometry result"
 FORMAT_VERSION: Final = 1
@@ -216,7 +216,7 @@ def result_of(
             lower_bound=_finite(found.certificate.lower_bound),
             tolerance=found.certificate.tolerance,
             region_m=_finite(found.certificate.region_m),
-            sentence=_proof(found.certificate),
+            sentence=str(found.certificate),
         ),
         sources=sources,
     )
@@ -290,14 +290,6 @@ def _track(found: OdometryCalibration, name: str) -> TrackRecord:
         residual_translation=found.residuals[name][1],
         windows=found.windows.used[name],
         removed=dict(Counter(str(one.reason) for one in found.removed.get(name, ()))),
-    )
-
-
-def _proof(found: JointCertificate) -> str:
-    where = "no answer" if np.isinf(found.region_m) else f"no answer within {found.region_m:g} m"
-    held = ", with scales held near their values, as a mirror image fits as well" if found.scales_held else ""
-    return (
-        f"{found.status}: the joint cost is {found.cost:.6g}, and {where} costs less than {found.lower_bound:.6g}{held}"
     )
 
 

@@ -182,14 +182,17 @@ class GivenRows:
 
     @property
     def first_height(self) -> float:
-        """The initial height of sensor 0, metres."""
-        ground = self.given.ground
-        named = [name for name, k in self.place.items() if k == 0]
-        if named[0] in self.given.heights_m:
-            return self.given.heights_m[named[0]][0]
-        return (
-            ground.distance_m if ground is not None else float(np.mean([h for h, _ in self.given.heights_m.values()]))
-        )
+        """The initial height of sensor 0, metres; zero without heights."""
+        heights, ground = self.given.heights_m, self.given.ground
+        if not heights:
+            return 0.0
+        if self._first in heights:
+            return heights[self._first][0]
+        return ground.distance_m if ground is not None else float(np.mean([height for height, _ in heights.values()]))
+
+    @property
+    def _first(self) -> str:
+        return next(name for name, k in self.place.items() if k == 0)
 
     def rows(self, state: State, layout: Layout, *, distances: bool = True) -> Rows:
         """All residuals at a state."""
@@ -267,7 +270,6 @@ class GivenRows:
         which = np.flatnonzero(scaled[1:])
         d = 12 * K + len(which) + 1
         rows = []
-        reference = self.first_height if self.has_ground else 0.0
         for name, (value, sigma) in self.given.heights_m.items():
             k = self.place[name]
             if k == 0:
@@ -278,7 +280,7 @@ class GivenRows:
             # For a scaled sensor the form has t' = alpha t: the row is multiplied by the estimated scale.
             row = np.zeros(d)
             row[9 * K + 3 * k - 3 : 9 * K + 3 * k] = self.normal
-            row[-1] = -state.scale[k] * (value - reference)
+            row[-1] = -state.scale[k] * (value - self.first_height)
             rows.append(row / (whole * state.scale[k]))
         for known in self.given.directions:
             k, across = self.place[known.sensor], _across(_unit(known.direction))
@@ -301,11 +303,9 @@ class GivenRows:
 
     @property
     def _reference_sigma(self) -> float:
-        ground = self.given.ground
-        named = [name for name, k in self.place.items() if k == 0]
-        sigmas = [self.given.heights_m[name][1] for name in named if name in self.given.heights_m]
-        sigmas += [ground.sigma_m] if ground is not None else []
-        return min(sigmas, default=0.0)
+        heights, ground = self.given.heights_m, self.given.ground
+        sigmas = [heights[self._first][1]] if self._first in heights else []
+        return min([*sigmas, *([ground.sigma_m] if ground is not None else [])], default=0.0)
 
 
 def _unit(direction: tuple[float, float, float] | Array) -> Array:

@@ -27,12 +27,22 @@ ROUNDS = 30
 PRIOR = 4.0
 
 
-def groups_of(stated: np.ndarray) -> np.ndarray:
-    """The noise group (m,) of each sensor: each has its own; two sensors without stated noise share one."""
-    groups = np.arange(len(stated))
+def _groups(stated: np.ndarray) -> Array:
+    """Ones (g, m) at the sensors of each noise that is estimated: two sensors without stated noise share one."""
     if len(stated) == 2 and not stated.any():
-        groups[:] = 0
-    return groups
+        return np.ones((1, 2))
+    return np.eye(len(stated))[~stated]
+
+
+def _by_logarithm(groups: Array, variances: Array) -> Array:
+    """Derivatives (2 g, 2 m) of all variances (m, 2) by the logarithms of each group's."""
+    derivatives: Array = np.einsum("gm,mc,cd->gcmd", groups, variances, np.eye(2))
+    return derivatives.reshape(2 * len(groups), -1)
+
+
+def _unit(scale: Array) -> Array:
+    """The units (m, 2) of the variances: a translation's is the metric variance times the sensor's scale squared."""
+    return np.c_[np.ones(len(scale)), scale**2]
 
 
 def found_variances(
@@ -43,38 +53,24 @@ def found_variances(
     ``variances`` (m, 2) are the initial values; those of sensors with ``stated`` noise (m,) do not change. The
     translation variance of a sensor of unknown scale is in its own unit of length; ``scale`` (m,) converts it.
     """
-    m, n = windows.used.shape
-    parts = np.array(windows.covariance_parts())  # (2, m, n, 6, 6)
-    groups = groups_of(stated)
-    names = [group for group in np.unique(groups) if not stated[groups == group].all()]
-    if not names or n == 0:
+    groups, unit = _groups(stated), _unit(scale)
+    if not len(groups) or not len(windows):
         return variances
-    # A sensor's translation variance is the metric variance times its scale squared.
-    unit = np.ones((m, 2))
-    unit[:, 1] = scale**2
+    parts = np.array(windows.covariance_parts())  # (2, m, n, 6, 6)
     current = variances / unit
     equations = 6.0 * float((windows.used.sum(axis=0) - 1).sum())
     taken = equations / max(equations - unknowns, 1.0)
-    previous = np.log(current.copy())
+    members = groups / groups.sum(axis=1, keepdims=True)
+    previous = np.log(current)
+    limit = 2.0 * np.log(LARGEST_CHANGE)
     for _ in range(ROUNDS):
         W = weights(windows, *(current * unit).T)
         score, information = _score(windows, linear, W, parts, unit, taken)
-        # by the logarithm of each group's variance
-        rows = np.array([[np.where((groups == g), current[:, c], 0.0) for c in range(2)] for g in names]).reshape(-1, m)
-        component = np.tile([0, 1], len(names))
-        by_sensor = np.zeros((len(rows), m, 2))
-        by_sensor[np.arange(len(rows)), :, component] = rows
-        select = by_sensor.reshape(len(rows), 2 * m)
-        gradient = select @ score.ravel()
-        curvature = select @ information @ select.T
-        first = [np.argmax(groups == g) for g in names]
-        deviation = np.array([np.log(current[f, c]) - previous[f, c] for f in first for c in range(2)])
-        gradient -= deviation / PRIOR**2
-        curvature += np.eye(len(rows)) / PRIOR**2
-        limit = 2.0 * np.log(LARGEST_CHANGE)
+        select = _by_logarithm(groups, current)
+        gradient = select @ score.ravel() - (members @ (np.log(current) - previous)).ravel() / PRIOR**2
+        curvature = select @ information @ select.T + np.eye(len(select)) / PRIOR**2
         step = np.clip(np.linalg.solve(curvature, gradient), -limit, limit).reshape(-1, 2)
-        for g, change in zip(names, step, strict=True):
-            current[groups == g] *= np.exp(change)
+        current = current * np.exp(groups.T @ step)
         if np.abs(step).max() < CONVERGED:
             break
     result: Array = current * unit
@@ -86,27 +82,23 @@ def uncertain_by(windows: WindowMotions, linear: Linear, variances: Array, state
 
     Among several sensors, the noise of the best one is small against the others' and is poorly known.
     """
-    m = windows.sensors
-    unit = np.ones((m, 2))
-    unit[:, 1] = scale**2
+    groups, unit = _groups(stated), _unit(scale)
     parts = np.array(windows.covariance_parts())
     _, information = _score(windows, linear, weights(windows, *variances.T), parts, unit, 1.0)
-    own = (variances / unit).ravel()
-    groups = groups_of(stated)
-    open_ones = np.flatnonzero(~stated)
-    deviation = np.zeros((m, 2))
-    if not len(open_ones):
-        return deviation
-    shared = bool((groups == groups[0]).all())
-    at = np.array([[2 * k, 2 * k + 1] for k in open_ones]).ravel()
-    by_log = own[:, None] * information * own
-    if shared:  # two sensors with one noise
-        both = by_log.reshape(m, 2, m, 2).sum(axis=(0, 2))
-        deviation[:] = np.sqrt(np.diagonal(np.linalg.inv(both + np.eye(2) / PRIOR**2)))
-        return deviation
-    inverse = np.linalg.inv(by_log[np.ix_(at, at)] + np.eye(len(at)) / PRIOR**2)
-    deviation[open_ones] = np.sqrt(np.diagonal(inverse)).reshape(-1, 2)
-    return deviation
+    select = _by_logarithm(groups, variances / unit)
+    inverse = np.linalg.inv(select @ information @ select.T + np.eye(len(select)) / PRIOR**2)
+    deviations: Array = groups.T @ np.sqrt(np.diagonal(inverse)).reshape(-1, 2)
+    return deviations
+
+
+def _contrasts(linear: Linear, W: Array) -> tuple[Array, Array, Array, Array]:
+    """W B (m, n, 6, 6), (B' W B)^-1 (n, 6, 6), S r (m, n, 6), and the blocks S_kk (m, n, 6, 6)."""
+    WB = W @ linear.B
+    inner = np.linalg.inv(np.einsum("mnia,mnib->nab", linear.B, WB, optimize=True))
+    Wr = np.einsum("mnij,mnj->mni", W, linear.r)
+    fitted = np.einsum("nab,mnib,mni->na", inner, linear.B, Wr, optimize=True)
+    Sr = Wr - np.einsum("mnia,na->mni", WB, fitted)
+    return WB, inner, Sr, W - WB @ inner @ np.swapaxes(WB, 2, 3)
 
 
 def _score(
@@ -114,15 +106,10 @@ def _score(
 ) -> tuple[Array, Array]:
     """Score (m, 2) and expected information (2 m, 2 m) of the variances, over all windows."""
     m = windows.sensors
-    WB = W @ linear.B
-    inner = np.linalg.inv(np.einsum("mnia,mnib->nab", linear.B, WB, optimize=True))
+    WB, inner, Sr, S_own = _contrasts(linear, W)
     parts = parts * unit.T[:, :, None, None, None]
-    Wr = np.einsum("mnij,mnj->mni", W, linear.r)
-    fitted = np.einsum("nab,mnib,mni->na", inner, linear.B, Wr, optimize=True)
-    Sr = Wr - np.einsum("mnia,na->mni", WB, fitted)
     squares = taken * np.einsum("mni,cmnij,mnj->mc", Sr, parts, Sr, optimize=True)
     # S V_c has the blocks S_jk V_c,k; its trace needs S_kk.
-    S_own = W - WB @ inner @ np.swapaxes(WB, 2, 3)
     traces = np.einsum("mnij,cmnji->mc", S_own, parts, optimize=True)
     information = np.zeros((m, 2, m, 2))
     for j in range(m):
@@ -148,12 +135,7 @@ def deletion_squares(linear: Linear, W: Array) -> Array:
 
     With S the contrasts' information and u = S r, a sensor's part u_k has the covariance S_kk.
     """
-    m, n = W.shape[:2]
-    WB = W @ linear.B
-    inner = np.linalg.inv(np.einsum("mnia,mnib->nab", linear.B, WB, optimize=True))
-    Wr = np.einsum("mnij,mnj->mni", W, linear.r)
-    u = Wr - np.einsum("mnia,na->mni", WB, np.einsum("nab,mnib,mni->na", inner, linear.B, Wr, optimize=True))
-    S = W - WB @ inner @ np.swapaxes(WB, 2, 3)
+    _, _, u, S = _contrasts(linear, W)
     alone = np.abs(np.einsum("mnii->mn", S)) <= 1e-9 * np.einsum("mnii->mn", W)
     S[alone] = np.eye(6)
     u[alone] = 0.0
@@ -161,7 +143,7 @@ def deletion_squares(linear: Linear, W: Array) -> Array:
     unit = 1.0 / np.sqrt(np.maximum(np.einsum("mnii->mni", S), 1e-300))
     scaled = S * unit[..., :, None] * unit[..., None, :] + 1e-9 * np.eye(6)
     squares: Array = np.einsum("mni,mni->mn", u * unit, np.linalg.solve(scaled, (u * unit)[..., None])[..., 0])
-    return squares.reshape(m, n)
+    return squares
 
 
 def outlying(windows: WindowMotions, linear: Linear, W: Array, noise_is_known: np.ndarray) -> np.ndarray:
@@ -171,10 +153,10 @@ def outlying(windows: WindowMotions, linear: Linear, W: Array, noise_is_known: n
     """
     squares = deletion_squares(linear, W)
     squares[~windows.used] = 0.0
-    factor = np.ones(windows.sensors)
-    for k in range(windows.sensors):
-        if windows.used[k].any():
-            factor[k] = max(float(np.median(squares[k, windows.used[k]])) / MEDIAN, 1.0 if noise_is_known[k] else 1e-3)
+    medians = np.array(
+        [np.median(own[used]) if used.any() else MEDIAN for own, used in zip(squares, windows.used, strict=True)]
+    )
+    factor = np.maximum(medians / MEDIAN, np.where(noise_is_known, 1.0, 1e-3))
     relative = squares / (factor * float(chdtri(6.0, SIGNIFICANCE)))[:, None]
     worst = relative == relative.max(axis=0)
     left_out: np.ndarray = worst & (relative > 1.0)

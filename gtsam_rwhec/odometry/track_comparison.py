@@ -178,7 +178,7 @@ def first_offset(reference: OdometryTrack, track: OdometryTrack, options: Odomet
         return Clock(0.0, f"no piece of its track has {FEWEST_POSES} poses without a gap")
     unknown = ""
     few = max(1, len(stamps) // ENOUGH)
-    for every in {few: None, 1: None}:
+    for every in dict.fromkeys((few, 1)):
         pieces = _pieces(stamps[::every], T[::every], options.max_gap_s)
         if not pieces:
             continue

@@ -34,17 +34,11 @@ class SampledTrack:
         return stamps
 
     @cached_property
-    def _bad_before(self) -> np.ndarray:
-        """The number (N,) of unusable steps that end at or before each pose."""
-        counts: np.ndarray = np.r_[0, np.cumsum(~self.good)]
-        return counts
-
-    @cached_property
     def _sums(self) -> tuple[Array, Array, Array]:
         """Integrals of dt, p dt and p p' dt up to each pose. p is a step's end, relative to the track's mean."""
         p = self.track.T_start_sensor[:, :3, 3] - self.centre
         dt = np.r_[0.0, np.diff(self.times)]
-        return self.times, np.cumsum(p * dt[:, None], axis=0), np.cumsum(_outer(p) * dt[:, None, None], axis=0)
+        return self.times, np.cumsum(p * dt[:, None], axis=0), np.cumsum(_outer(p, p) * dt[:, None, None], axis=0)
 
     @cached_property
     def centre(self) -> Array:
@@ -56,19 +50,16 @@ class SampledTrack:
         """T_start_sensor (M, 4, 4) at times (M,), by cubics through the four nearest poses in their tangent space."""
         times, T = self.times, np.asarray(self.track.T_start_sensor)
         i = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
-        if len(times) < POINTS:
-            share = ((at - times[i]) / (times[i + 1] - times[i]))[:, None]
-            return T[i] @ se3.expmap(share * se3.logmap(se3.inverse(T[i]) @ T[i + 1]))
-        first = np.clip(i - 1, 0, len(times) - POINTS)
-        weights = np.ones((len(at), POINTS))
-        for a in range(POINTS):  # Lagrange's polynomials
-            for b in range(POINTS):
-                if a != b:
-                    weights[:, a] *= (at - times[first + b]) / (times[first + a] - times[first + b])
+        points = min(POINTS, len(times))
+        first = np.clip(i - 1, 0, len(times) - points)
         from_here = se3.inverse(T[i])
         tangent = np.zeros((len(at), 6))
-        for a in range(POINTS):
-            tangent += weights[:, a, None] * se3.logmap(from_here @ T[first + a])
+        for a in range(points):
+            weight = np.ones(len(at))  # Lagrange's polynomial
+            for b in range(points):
+                if a != b:
+                    weight *= (at - times[first + b]) / (times[first + a] - times[first + b])
+            tangent += weight[:, None] * se3.logmap(from_here @ T[first + a])
         poses: Array = T[i] @ se3.expmap(tangent)
         return poses
 
@@ -78,8 +69,8 @@ class SampledTrack:
         inside = (start >= times[0] - 1e-9) & (end <= times[-1] + 1e-9)
         a = np.clip(np.searchsorted(times, start + 1e-9, side="right") - 1, 0, len(times) - 1)
         b = np.clip(np.searchsorted(times, end - 1e-9, side="left"), 0, len(times) - 1)
-        gaps = np.r_[0, np.cumsum(np.diff(times) > max_gap_s)]
-        clean: np.ndarray = inside & (self._bad_before[b] == self._bad_before[a]) & (gaps[b] == gaps[a])
+        bad_before = np.r_[0, np.cumsum(~self.good | (np.diff(times) > max_gap_s))]  # steps that end there or earlier
+        clean: np.ndarray = inside & (bad_before[b] == bad_before[a])
         return clean
 
     def velocities(self, at: Array) -> Array:
@@ -99,7 +90,8 @@ class SampledTrack:
         length, first, second = (_between(self.times, sums, start, end) for sums in self._sums)
         R, at_end = T_end[:, :3, :3], T_end[:, :3, 3] - self.centre
         # relative to p_end, then rotated into the end's frame
-        second = second - _outer_sum(first, at_end) + length[:, None, None] * _outer(at_end)
+        across = _outer(first, at_end)
+        second = second - across - np.swapaxes(across, 1, 2) + length[:, None, None] * _outer(at_end, at_end)
         first = first - length[:, None] * at_end
         turned = np.swapaxes(R, 1, 2)
         return length, np.einsum("nij,nj->ni", turned, first), turned @ second @ R
@@ -119,13 +111,8 @@ def _between(times: Array, sums: Array, start: Array, end: Array) -> Array:
     return difference
 
 
-def _outer(p: Array) -> Array:
-    product: Array = p[:, :, None] * p[:, None, :]
-    return product
-
-
-def _outer_sum(p: Array, q: Array) -> Array:
-    product: Array = p[:, :, None] * q[:, None, :] + q[:, :, None] * p[:, None, :]
+def _outer(p: Array, q: Array) -> Array:
+    product: Array = p[:, :, None] * q[:, None, :]
     return product
 
 
@@ -193,20 +180,12 @@ class WindowMotions:
         of_translation[..., 3:, 3:] = by_length
         return of_rotation, of_translation
 
-    def selected(self, windows: np.ndarray) -> WindowMotions:
-        """The windows that a mask or indices select."""
-        return WindowMotions(
-            self.start[windows],
-            self.end[windows],
-            *(part[:, windows] for part in (self.M, self.used, self.length, self.first, self.second, self.by_offset)),
-        )
-
     def without(self, left_out: np.ndarray) -> WindowMotions:
         """The same motions, without those of sensor and window (m, n) where ``left_out`` is true."""
         used = self.used & ~left_out
-        return WindowMotions(
-            self.start, self.end, self.M, used, self.length, self.first, self.second, self.by_offset
-        ).selected(used.sum(axis=0) >= 2)
+        kept = used.sum(axis=0) >= 2
+        parts = (self.M, used, self.length, self.first, self.second, self.by_offset)
+        return WindowMotions(self.start[kept], self.end[kept], *(part[:, kept] for part in parts))
 
 
 def _of_track(track: SampledTrack, start: Array, end: Array, *, clocks: bool) -> tuple[Array, ...]:
@@ -235,9 +214,7 @@ def first_rotation_variances(windows: WindowMotions) -> Array:
             if both.sum() < 5:
                 continue
             length = 0.5 * (windows.length[j] + windows.length[k])[both]
-            row = np.zeros(m)
-            row[[j, k]] = 1.0
-            rows.append(row)
+            rows.append(np.eye(m)[j] + np.eye(m)[k])
             right.append((np.median(np.abs(angles[j, both] - angles[k, both]) / np.sqrt(length)) / 0.6745) ** 2)
     if not rows:
         return np.full(m, 1e-6)
@@ -245,8 +222,7 @@ def first_rotation_variances(windows: WindowMotions) -> Array:
     # A weak pull towards the mean: two sensors determine only the sum.
     ridge = 1e-3 * np.eye(m)
     found = np.linalg.lstsq(np.vstack([rows, ridge]), np.r_[right, np.full(m, 1e-3 * mean)], rcond=None)[0]
-    floor = max(0.05 * mean, 1e-16)
-    result: Array = np.maximum(found, floor)
+    result: Array = np.maximum(found, max(0.05 * mean, 1e-16))
     return result
 
 

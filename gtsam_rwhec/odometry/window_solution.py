@@ -46,7 +46,7 @@ class Fit:
     normal: Eliminated
     rows: Rows  #: What was given
     cost: float  #: Half the weighted squares of all residuals
-    converged: bool
+    converged: bool = False
 
 
 def motions_fitted(windows: WindowMotions, W: Array, state: State, layout: Layout, steps: int = 3) -> State:
@@ -60,10 +60,9 @@ def motions_fitted(windows: WindowMotions, W: Array, state: State, layout: Layou
 
 def refined(windows: WindowMotions, W: Array, state: State, layout: Layout, given: GivenRows, determined: Array) -> Fit:
     """Minimise the cost from a state, along the orthonormal columns of ``determined`` (p, q) only."""
-    state = motions_fitted(windows, W, state, layout, steps=2)
-    converged = False
+    fit = _at(windows, W, motions_fitted(windows, W, state, layout, steps=2), layout, given)
     for _ in range(MAX_STEPS):
-        linear, normal, rows, cost = _at(windows, W, state, layout, given)
+        normal, rows = fit.normal, fit.rows
         H, g = normal.H + rows.information, normal.g - rows.J.T @ rows.r
         inner, right = determined.T @ H @ determined, determined.T @ g
         unit = 1.0 / np.sqrt(np.maximum(np.diagonal(inner), 1e-300))
@@ -74,21 +73,18 @@ def refined(windows: WindowMotions, W: Array, state: State, layout: Layout, give
         )
         largest = float(np.abs(step).max(initial=0.0))
         step *= min(1.0, LARGEST_STEP / max(largest, 1e-300))
-        state = state.moved(layout, step, normal.motions(step))
-        if expected < CONVERGED * max(1.0, cost):
-            converged = True
-            break
-    linear, normal, rows, cost = _at(windows, W, state, layout, given)
-    return Fit(state, linear, normal, rows, cost, converged)
+        is_still = expected < CONVERGED * max(1.0, fit.cost)
+        fit = _at(windows, W, fit.state.moved(layout, step, normal.motions(step)), layout, given)
+        if is_still:
+            return replace(fit, converged=True)
+    return fit
 
 
-def _at(
-    windows: WindowMotions, W: Array, state: State, layout: Layout, given: GivenRows
-) -> tuple[Linear, Eliminated, Rows, float]:
+def _at(windows: WindowMotions, W: Array, state: State, layout: Layout, given: GivenRows) -> Fit:
     linear = linearised(windows, state)
     normal = eliminated(linear, W, layout)
     rows = given.rows(state, layout)
-    return linear, normal, rows, normal.cost + 0.5 * float(rows.r @ rows.r)
+    return Fit(state, linear, normal, rows, normal.cost + 0.5 * float(rows.r @ rows.r))
 
 
 def settled(state: State, free: Array, layout: Layout) -> State:
@@ -154,37 +150,62 @@ def solve_windows(
 ) -> Answer:
     """Solve, certify and refine on one set of windows; ``start`` is a solution on other windows."""
     progress("solving jointly")
-    every = windows
-    left_out = np.zeros_like(windows.used)
-    state, certificate, variances, left_out, windows = _certified(every, left_out, variances, task, start)
-    certified = state
+    used = Used(windows, np.zeros_like(windows.used), windows, variances)
+    certified, certificate, used = _certified(used, task, start)
+    state = certified
     progress("refining the joint likelihood")
     for _ in range(REFINED):
-        W = weights(windows, *variances.T)
-        free = freedom_at(windows, W, variances, motions_fitted(windows, W, state, task.layout), task)
+        W = used.W
+        free = freedom_at(used, motions_fitted(used.windows, W, state, task.layout), task)
         state = settled(state, free.left, task.layout)
         determined = free.complement()
-        fit = refined(windows, W, state, task.layout, task.given, determined)
-        state = fit.state
-        new = outlying(windows, fit.linear, W, task.stated) if task.reject else np.zeros_like(windows.used)
-        found = found_variances(windows, fit.linear, variances, task.stated, state.scale, task.layout.size)
-        change = float(np.abs(np.log(found / variances)).max())
-        variances = found
-        if new.any():
-            left_out, windows = _left_out(every, windows, left_out, new, task)
-            state = State.at(state.T, state.scale, windows, state.height)
-        elif change < 0.2 * SETTLED:
+        fit = refined(used.windows, W, state, task.layout, task.given, determined)
+        state, used, change = _reweighed(used, fit.state, fit.linear, W, task)
+        if change < 0.2 * SETTLED:
             break
-    W = weights(windows, *variances.T)
-    fit = refined(windows, W, state, task.layout, task.given, determined)
-    free = freedom_at(windows, W, variances, fit.state, task)
-    return Answer(windows, left_out, variances, fit, W, free, certificate, certified)
+    fit = refined(used.windows, used.W, state, task.layout, task.given, determined)
+    free = freedom_at(used, fit.state, task)
+    return Answer(used.windows, used.left_out, used.variances, fit, used.W, free, certificate, certified)
 
 
-def _certified(
-    every: WindowMotions, left_out: np.ndarray, variances: Array, task: Task, start: State | None
-) -> tuple[State, JointCertificate, Array, np.ndarray, WindowMotions]:
-    windows = every
+@dataclass(frozen=True)
+class Used:
+    """The windows that are used, and their noise."""
+
+    every: WindowMotions  #: With those that are not used
+    left_out: np.ndarray  #: (m, n') booleans: outlying windows of ``every``
+    windows: WindowMotions
+    variances: Array  #: (m, 2)
+
+    @property
+    def W(self) -> Array:
+        """The windows' inverse covariances (m, n, 6, 6)."""
+        return weights(self.windows, *self.variances.T)
+
+
+def _reweighed(used: Used, state: State, linear: Linear, W: Array, task: Task) -> tuple[State, Used, float]:
+    """Find noise and new outlying windows; the largest change of a log variance, infinite with a new outlier."""
+    windows = used.windows
+    variances = found_variances(windows, linear, used.variances, task.stated, state.scale, task.layout.size)
+    new = outlying(windows, linear, W, task.stated) if task.reject else np.zeros_like(windows.used)
+    if not new.any():
+        return state, replace(used, variances=variances), float(np.abs(np.log(variances / used.variances)).max())
+    left_out = used.left_out.copy()
+    left_out[:, np.searchsorted(used.every.start, windows.start)] |= new
+    windows = used.every.without(left_out)
+    for k, name in enumerate(task.names):
+        still, had = int(windows.used[k].sum()), int(used.every.used[k].sum())
+        if len(windows) < FEWEST or still < LEAST_SHARE * had:
+            raise OutlierError(
+                f"{name} contradicts the other sensors in {had - still} of {had} windows; does its track belong to "
+                "this drive, is its clock the same, are its poses T_start_sensor and not inverted?"
+            )
+    state = State.at(state.T, state.scale, windows, state.height)
+    return state, Used(used.every, left_out, windows, variances), np.inf
+
+
+def _certified(used: Used, task: Task, start: State | None) -> tuple[State, JointCertificate, Used]:
+    windows = used.windows
     w, s = windows.rotation_vectors(), windows.M[..., :3, 3]
     starts = star_starts(w, s, windows.used)
     if start is None:
@@ -196,43 +217,33 @@ def _certified(
         if not (scale > 0.0).all():
             name = task.names[int(np.argmin(scale))]
             raise ScaleError(f"the track of {name} does not move, so its scale cannot be told; is it the right topic?")
-        state = State.at(rough, scale, windows, _height(task.given))
+        state = State.at(rough, scale, windows, task.given.first_height)
     else:
         state = State.at(start.T, start.scale, windows, start.height)
         state = replace(state, tilt=start.tilt)
         starts = [start.T[1:, :3, :3], *starts]
-    certificate = None
     for _ in range(ROUNDS):
-        axis = _main_axis(state.motion)
-        form = joint_form(windows, state, variances, task.scaled, task.given.form_rows(state, task.scaled))
-        solution = solved(form, starts, axis=axis)
-        T, scales = form.poses(solution.y)
+        form = joint_form(used.windows, state, used.variances, task.scaled, task.given.form_rows(state, task.scaled))
+        y, certificate = solved(form, starts, axis=_main_axis(state.motion))
+        T, scales = form.poses(y)
         if not (scales > 0.0).all():
             raise ScaleError(
                 f"the scale of {task.names[1 + int(np.argmin(scales))]} is {scales.min():.3g} at the optimum; its "
                 "motion does not fit the others': are its poses inverted?"
             )
-        certificate = solution.certificate
-        state = State.at(np.concatenate([np.eye(4)[None], T]), np.r_[1.0, scales], windows, state.height)
-        W = weights(windows, *variances.T)
-        state = motions_fitted(windows, W, state, task.layout)
-        linear = linearised(windows, state)
-        new = outlying(windows, linear, W, task.stated) if task.reject else np.zeros_like(windows.used)
-        found = found_variances(windows, linear, variances, task.stated, state.scale, task.layout.size)
-        change = float(np.abs(np.log(found / variances)).max())
-        variances = found
+        state = State.at(np.concatenate([np.eye(4)[None], T]), np.r_[1.0, scales], used.windows, state.height)
+        W = used.W
+        state = motions_fitted(used.windows, W, state, task.layout)
+        state, used, change = _reweighed(used, state, linearised(used.windows, state), W, task)
         starts = [T[:, :3, :3], *starts[:3]]
-        if new.any():
-            left_out, windows = _left_out(every, windows, left_out, new, task)
-            state = State.at(state.T, state.scale, windows, state.height)
-        elif change < SETTLED:
+        if change < SETTLED:
             break
-    assert certificate is not None
-    return state, certificate, variances, left_out, windows
+    return state, certificate, used
 
 
-def freedom_at(windows: WindowMotions, W: Array, variances: Array, state: State, task: Task) -> Freedom:
+def freedom_at(used: Used, state: State, task: Task) -> Freedom:
     """The free directions at a state."""
+    windows, W, variances = used.windows, used.W, used.variances
     linear = linearised(windows, state)
     normal = eliminated(linear, W, task.layout)
     still = linear.r - np.einsum("mnij,nj->mni", linear.B, normal.motions(np.zeros(task.layout.size)))
@@ -255,28 +266,6 @@ def freedom_at(windows: WindowMotions, W: Array, variances: Array, state: State,
     rows = task.given.rows(state, task.layout)
     squares = 2.0 * len(windows)
     return freedom(normal.H, known, possible, rows.information, task.layout, squares, spare)
-
-
-def _left_out(
-    every: WindowMotions, windows: WindowMotions, left_out: np.ndarray, new: np.ndarray, task: Task
-) -> tuple[np.ndarray, WindowMotions]:
-    """Add new outlying windows to ``left_out``, which has the indices of all windows; return both."""
-    at = np.searchsorted(every.start, windows.start)
-    left_out = left_out.copy()
-    left_out[:, at] |= new
-    windows = every.without(left_out)
-    for k, name in enumerate(task.names):
-        used, had = int(windows.used[k].sum()), int(every.used[k].sum())
-        if len(windows) < FEWEST or used < LEAST_SHARE * had:
-            raise OutlierError(
-                f"{name} contradicts the other sensors in {had - used} of {had} windows; does its track belong to this "
-                "drive, is its clock the same, are its poses T_start_sensor and not inverted?"
-            )
-    return left_out, windows
-
-
-def _height(given: GivenRows) -> float:
-    return given.first_height if given.has_ground else 0.0
 
 
 def _main_axis(motion: Array) -> Array:

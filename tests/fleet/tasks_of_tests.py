@@ -19,9 +19,9 @@ def tried(folder: str, name: str) -> int:
 
 
 def writes(folder: str, name: str) -> Receipt:
-    with costs_of(name) as costs:
+    with costs_of(name) as receipt_of:
         tried(folder, name)
-        return costs.receipt(f"{name}.bin", str(os.getpid()))
+        return receipt_of(f"{name}.bin", str(os.getpid()))
 
 
 def refuses(folder: str, name: str) -> Receipt:

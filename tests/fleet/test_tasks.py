@@ -29,12 +29,12 @@ def test_failures_in_this_process(tmp_path: Path) -> None:
 
 def test_a_receipt_has_what_the_task_cost(tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(bytes(1000))
-    with costs_of("a") as costs:
+    with costs_of("a") as receipt_of:
         before = time.process_time()
         read_bytes(str(tmp_path / "log"))
         while time.process_time() < before + 0.02:
             pass
-        receipt = costs.receipt("partials/a", "00ff")
+        receipt = receipt_of("partials/a", "00ff")
     assert (receipt.key, receipt.file, receipt.sha256, receipt.was_there) == ("a", "partials/a", "00ff", False)
     assert receipt.bytes_read == 1000
     assert receipt.cpu_s >= 0.02
