@@ -1,4 +1,4 @@
-"""Find what a log's corners contradict in the rig file: intrinsics, and boards whose tags are elsewhere or never seen."""
+"""What a log's corners contradict in the rig file: intrinsics, and boards with tags elsewhere or never seen."""
 
 from __future__ import annotations
 
