@@ -27,8 +27,7 @@ from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.cleaning_stage import clean_log
 from gtsam_rwhec.runs.clocks_by_turning import late_clocks
 from gtsam_rwhec.runs.detection_stage import detect_log
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
-from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
+from gtsam_rwhec.runs.doubted_statements import continued_boards, doubted_intrinsics, doubted_shapes, finding_against
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, poses_used, read_pairs
 from gtsam_rwhec.runs.run_log import CALIBRATION_LOG, DETECTED_LOG, LogMetadata, is_from_stage, read_metadata

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +22,13 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning
 from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
-from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, pair_records
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, detected_pairs, pair_records
 from gtsam_rwhec.runs.odometry_cleaning import odometry_steps
 from gtsam_rwhec.runs.odometry_motions import odometry_pairs
 from gtsam_rwhec.runs.odometry_tracks import read_odometry
 from gtsam_rwhec.runs.output_folder import check_writable
 from gtsam_rwhec.runs.pair_consensus import ConsensusOptions, find_consensus
 from gtsam_rwhec.runs.run_log import RunLog, read_cleaning_report, write_run_log
-from gtsam_rwhec.runs.tracks import Track, read_tracks
 
 #: Nanoseconds. The carriers' speed at a stamp is measured from this time before it to this time after it.
 SPEED_STEP_NS = 20_000_000
@@ -92,7 +92,7 @@ def cleaned(log: Log, rig: Rig | None = None, progress: Progress | None = None) 
     unknown: dict[str, StampError] = {}
     for sensor in rig.sensors:
         tell(f"synchronising {sensor}")
-        tracks = read_tracks(log, rig, sensor)
+        tracks = detected_pairs(log, rig, sensor)
         try:
             offsets_s[sensor], sigma_s = _time_offset(rig, sensor, path, tracks)
         except StampError as error:  # the other sensors have an answer without this one
@@ -130,13 +130,13 @@ def cleaned(log: Log, rig: Rig | None = None, progress: Progress | None = None) 
     return RunLog.with_pairs(log, report, rig, pair_records(pairs))
 
 
-def clean_track(track: Track, path: Trajectory, rig: Rig, offset_s: float) -> MeasuredPairs:
+def clean_track(track: MeasuredPairs, path: Trajectory, rig: Rig, offset_s: float) -> MeasuredPairs:
     """Synchronise a track with the carriers' path, and give a reason to each measurement that is not used."""
     options = rig.cleaning
     A, kept = synchronise(
         path, track.stamps_ns, time_offset_s=offset_s, max_gap_s=rig.carriers.max_gap_s, needs_overlap=False
     )
-    pairs = MeasuredPairs(**vars(track), A=A).marked(kept, np.arange(len(A)))
+    pairs = replace(track, A=A).marked(kept, np.arange(len(A)))
     stamps = pairs.stamps_ns
     if options.max_rotation_deg_s is not None or options.max_translation_m_s is not None:
         at = np.flatnonzero(pairs.used)
@@ -180,7 +180,7 @@ def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
     )
 
 
-def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -> tuple[float, float | None]:
+def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[MeasuredPairs]) -> tuple[float, float | None]:
     """A sensor's time offset, as stated or estimated from rotations, and an estimate's standard deviation."""
     given = rig.sensors[sensor].time_offset
     if given != "estimate":
@@ -195,7 +195,7 @@ def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -
     return found.offset_s, found.sigma_s
 
 
-def _check_overlap(tracks: list[Track], path: Trajectory, sensor: str, offset_s: float) -> None:
+def _check_overlap(tracks: list[MeasuredPairs], path: Trajectory, sensor: str, offset_s: float) -> None:
     """Refuse a sensor if all its stamps are outside the carriers' path. A single target may be outside."""
     if tracks:
         stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))

@@ -16,7 +16,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.image_pictures import check_drawable, draw_images, has_images, write_contact_sheet
+from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
@@ -27,21 +27,23 @@ from gtsam_rwhec.runs.topics_of_rig import check_topics
 from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_detections
 
 
-def check_image_options(log: Log, rig: Rig | None, *, images: Images, workers: int | None) -> None:
-    """Raise `OptionError` for `workers` without images to search, and for images to copy from a log without any.
+def check_image_options(
+    log: Log, rig: Rig | None, *, images: Images, workers: int | None, draw: str | Path | None = None
+) -> None:
+    """Raise `OptionError` for `workers` and `draw` without images to search, and for images to copy without any.
 
     `rig` is the rig file for detection; None if the log already has detections.
     """
     path = log.files[0].path
-    if workers is not None and rig is None:
+    given = f"workers={workers} (--workers)" if workers is not None else f"{draw} (--draw)" if draw is not None else ""
+    if given and rig is None:
         raise OptionError(
-            f"workers={workers} (--workers) counts only in detection, and the detections are already in {path}: leave "
-            "the option out, or give the raw log"
+            f"{given} counts only in detection, and the detections are already in {path}: leave the option out, or "
+            "give the raw log"
         )
-    if workers is not None and rig is not None and not has_images(rig):
+    if given and rig is not None and not has_images(rig):
         raise OptionError(
-            f"workers={workers} (--workers) counts only for images, and no sensor of the rig file has images: leave "
-            "the option out"
+            f"{given} counts only for images, and no sensor of the rig file has images: leave the option out"
         )
     if images == "copy" and not any(topic.has_images for topic in log.topics()):
         other = "the raw log, if it has images" if rig is None else "a log with images"
@@ -96,7 +98,7 @@ def detect_log(
     check_writable(out_path)
     with open_log(log_path) as log:
         check_is_not_read(log, out_path)
-        check_image_options(log, rig, images=images, workers=workers)
+        check_image_options(log, rig, images=images, workers=workers, draw=draw)
         found = detected(log, rig, workers=workers, sheet=sheet, draw=draw, progress=progress)
         (progress or silent)("writing detections")
         write_run_log(found, out_path, images)
@@ -119,8 +121,6 @@ def detected(
     """
     tell = progress or silent
     check_topics(log, rig)
-    if draw is not None:
-        check_drawable(rig, draw)
     cameras = read_intrinsics(log, rig)
     tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
     motion = read_carrier_motion(log, rig)

@@ -14,14 +14,14 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.detect.contact_sheet import WIDTH, Band, Detail, Outcome, Outline, Tile, contact_sheet, detail_of
 from gtsam_rwhec.detect.images import Gray, decode_gray, decode_small
 from gtsam_rwhec.detect.pictures import draw
-from gtsam_rwhec.errors import ImageError, OptionError
+from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.output_folder import made_folder
 from gtsam_rwhec.runs.run_log import image_name, image_names, picture_file
-from gtsam_rwhec.runs.sensor_detections import SensorDetections
+from gtsam_rwhec.runs.sensor_detections import SensorDetections, image_count, images_at, spread
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4
@@ -55,23 +55,24 @@ def write_contact_sheet(
         outcomes = {stamp: outcome_of(records[stamp], looked.fault) for stamp, looked in of_sensor.images.items()}
         shown = sample(outcomes, max(LEAST, MOST // len(sensors)))
         outlines = {stamp: _outlines(records[stamp], cameras[sensor]) for stamp in shown}
-        small = _small_pictures(log, topic, {stamp: of_sensor.images[stamp].logged_ns for stamp in shown}, outlines)
-        tiles = tuple(
-            Tile(
-                outcomes[stamp][0],
-                Path(image_name(names, topic, stamp)).name,
-                outcomes[stamp][1],
-                small[stamp][0] if stamp in small else None,
-                outlines[stamp],
-                small[stamp][1] if stamp in small else None,
-            )
-            for stamp in shown
-        )
-        bands.append(Band(sensor, _counts(outcomes, len(shown)), tiles))
-    is_written, data = cv2.imencode(".png", contact_sheet(bands), COMPRESSED)
+        images = images_at(log, topic, of_sensor, shown)
+        with ThreadPoolExecutor(THREADS) as threads:
+            pictures = list(threads.map(_small_picture, images, [outlines[image.stamp_ns] for image in images]))
+        small = {image.stamp_ns: picture for image, picture in zip(images, pictures, strict=True)}
+        tiles = []
+        for stamp in shown:
+            (outcome, words), (gray, detail) = outcomes[stamp], small.get(stamp, (None, None))
+            name = Path(image_name(names, topic, stamp)).name
+            tiles.append(Tile(outcome, name, words, gray, outlines[stamp], detail))
+        bands.append(Band(sensor, _counts(outcomes, len(shown)), tuple(tiles)))
+    _write_png(path, contact_sheet(bands), COMPRESSED)
+    return True
+
+
+def _write_png(path: Path, picture: np.ndarray, how: Sequence[int] = ()) -> None:
+    is_written, data = cv2.imencode(".png", picture, how)
     assert is_written
     write_atomically(path, data.tobytes())
-    return True
 
 
 def outcome_of(records: Sequence[DetectionRecord], fault: str) -> tuple[Outcome, str]:
@@ -102,9 +103,9 @@ def sample(outcomes: Mapping[int, tuple[Outcome, str]], most: int) -> list[int]:
     for_bad = min(many_bad, max(most // 2, most - many))
     for_nothing = min(len(nothing), max((most - for_bad) // 2, most - for_bad - len(good)))
     for_good = min(len(good), most - for_bad - for_nothing)
-    chosen = [stamp for members, k in zip(bad, _in_turn(list(map(len, bad)), for_bad), strict=True)
-              for stamp in _spread(members, k)]  # fmt: skip
-    return sorted(chosen + _spread(nothing, for_nothing) + _spread(good, for_good))
+    of_bad = zip(bad, _in_turn(list(map(len, bad)), for_bad), strict=True)
+    chosen = [stamp for members, count in of_bad for stamp in spread(members, count)]
+    return sorted(chosen + spread(nothing, for_nothing) + spread(good, for_good))
 
 
 def _in_turn(counts: list[int], most: int) -> list[int]:
@@ -117,39 +118,19 @@ def _in_turn(counts: list[int], most: int) -> list[int]:
     return given
 
 
-def _spread(members: Sequence[int], count: int) -> list[int]:
-    """Choose `count` members, spread evenly, with the first and the last."""
-    if count == 1:
-        return [members[len(members) // 2]]
-    return [members[i] for i in np.linspace(0, len(members) - 1, count).round().astype(int).tolist()] if count else []
-
-
-def _by_stamp(records: Sequence[DetectionRecord]) -> dict[int, list[DetectionRecord]]:
+def _by_stamp(records: Iterable[DetectionRecord]) -> dict[int, list[DetectionRecord]]:
     of_stamp: dict[int, list[DetectionRecord]] = defaultdict(list)
     for record in records:
         of_stamp[record.stamp_ns].append(record)
     return of_stamp
 
 
-def _small_pictures(
-    log: Log, topic: str, logged_ns: Mapping[int, int], outlines: Mapping[int, tuple[Outline, ...]]
-) -> dict[int, tuple[Gray, Detail | None]]:
-    """Small pictures by stamp, with a larger detail of a small first target. Undecodable images are missing."""
-    images = [
-        record
-        for record in log.records_logged_at([topic], logged_ns.values())
-        if isinstance(record, ImageRecord) and record.stamp_ns in logged_ns
-    ]
-    with ThreadPoolExecutor(THREADS) as threads:
-        small = list(threads.map(_small_picture, images, [outlines[image.stamp_ns] for image in images]))
-    return {image.stamp_ns: pictures for image, pictures in zip(images, small, strict=True) if pictures is not None}
-
-
-def _small_picture(image: ImageRecord, outlines: tuple[Outline, ...]) -> tuple[Gray, Detail | None] | None:
+def _small_picture(image: ImageRecord, outlines: tuple[Outline, ...]) -> tuple[Gray | None, Detail | None]:
+    """An image's small picture, with a larger detail of a small first target; neither if it cannot be decoded."""
     try:
         large = decode_small(image, LARGE * WIDTH)
     except ImageError:
-        return None  # the report names it, and the sheet says so
+        return None, None  # the report names it, and the sheet says so
     height = max(1, round(large.shape[0] / LARGE))
     small = np.asarray(cv2.resize(large, (WIDTH, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     return small, detail_of(large, outlines[0]) if outlines else None
@@ -181,15 +162,6 @@ def _counts(outcomes: Mapping[int, tuple[Outcome, str]], shown: int) -> str:
     return f"{len(outcomes)} images ({some}): {' | '.join(parts)}"
 
 
-def check_drawable(rig: Rig, folder: str | Path) -> None:
-    """Raise `OptionError` if no sensor has images in which detections can be drawn."""
-    if not has_images(rig):
-        raise OptionError(
-            f"{folder} (--draw): no sensor of the rig file has images in which detections can be drawn. Leave the "
-            "option out"
-        )
-
-
 def has_images(rig: Rig) -> bool:
     """Whether a sensor of the rig file has images."""
     return any(source.images is not None for source in rig.sensors.values())
@@ -207,16 +179,13 @@ def draw_images(
 
     Files are ``<sensor>_<name>.png``, where the name is that of the image's file, or its stamp.
     """
-    check_drawable(rig, folder)
     folder = made_folder(folder)
     names = image_names(log)
     drawn = {sensor: source.images for sensor, source in rig.sensors.items() if source.images is not None}
-    total = sum(topic.count for topic in log.topics() if topic.name in drawn.values())
+    total = image_count(log, rig)
     count, taken = 0, set[str]()
     for sensor, topic in drawn.items():
-        of_stamp: dict[int, list[DetectionRecord]] = defaultdict(list)
-        for record in records[sensor]:
-            of_stamp[record.stamp_ns].append(record)
+        of_stamp = _by_stamp(records[sensor])
         for image in log.records([topic]):
             if not isinstance(image, ImageRecord):
                 continue
@@ -230,9 +199,7 @@ def draw_images(
                 file = picture_file(sensor, f"{name} {image.stamp_ns}.")
             taken.add(file)
             picture = draw(gray, seen, cameras[sensor], f"{sensor}, {name}: {_in_words(seen)}")
-            is_written, data = cv2.imencode(".png", picture)
-            assert is_written
-            write_atomically(folder / file, data.tobytes())
+            _write_png(folder / file, picture)
             count += 1
             tell(Counted("drawing: image", count, total))
     return count

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from rwhec_factors.se3 import inverse, so3_logmap
 
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
+from gtsam_rwhec.runs.run_log import image_name
 
 #: A point whose 95 % radius exceeds this share of its distance counts as unknown.
 LARGEST_SHARE = 0.25
@@ -35,7 +41,9 @@ def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading
     others = [one for one, left_out in zip(misreadings, is_B, strict=True) if one not in exchanged and not left_out]
     if rig.carriers.poses.euler is not None and any(one.mistake.is_of_rotations for one in others):
         of_angles = next(one for one in others if one.mistake.is_of_rotations)
-        return (*said, replace(of_angles, likely=_other_angles(rig), cure=OTHER_ANGLES))
+        place = rig.source.place(("carriers", "poses", "euler"))
+        likely = f"the files' angles are not euler: {rig.carriers.poses.euler} ({place})"
+        return (*said, replace(of_angles, likely=likely, cure=OTHER_ANGLES))
     return (*said, *(replace(one, cure=_cure(one, rig)) for one in others))
 
 
@@ -50,11 +58,6 @@ def _is_exchange(misreading: Misreading, rig: Rig) -> bool:
 def _exchange(rig: Rig) -> str:
     place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
     return f"exchange `sensors` and `targets` in the rig file ({place})"
-
-
-def _other_angles(rig: Rig) -> str:
-    poses = rig.carriers.poses
-    return f"the files' angles are not euler: {poses.euler} ({rig.source.place(('carriers', 'poses', 'euler'))})"
 
 
 def _unless_carried(rig: Rig) -> str:
@@ -89,9 +92,8 @@ def _cure(misreading: Misreading, rig: Rig) -> str:
         return cure + also
     if misreading.mistake is Mistake.INVERTED:
         topics = ", ".join(sensor.detections for sensor in rig.sensors.values() if sensor.detections is not None)
-        return f"let the driver publish the target's pose in the sensor's frame (topics {topics})" if topics else (
-            misreading.cure
-        )  # fmt: skip
+        if topics:
+            return f"let the driver publish the target's pose in the sensor's frame (topics {topics})"
     if misreading.mistake is Mistake.ROWS_SHIFTED:
         lines = place(*(("sensors", name, "time_offset") for name in rig.sensors))
         return f"write time_offset: estimate ({lines})"
@@ -160,4 +162,46 @@ def known_to_nothing(points: Iterable[PointUncertainty], rig: Rig) -> list[Findi
                 f"that is no noise of a camera: intrinsics ({place}), sizes and the carriers' poses do not fit together"
             )
             findings.append(Finding(Ground.IMPLAUSIBLE, words))
+    return findings
+
+
+#: An image is upside down if its pose is half a turn about the optical axis from the expected one, within this angle.
+#: It is not exact: the principal point is not the middle of the image, so the turned target is some pixels off.
+NEAR_RAD = float(np.radians(6.0))
+#: At most this number of images is named.
+MOST_NAMED = 5
+
+
+def turned_images(
+    pairs: Mapping[Pair, MeasuredPairs], refined: Refined, rig: Rig, names: Mapping[str, str]
+) -> list[Finding]:
+    """A finding for each sensor with images that are upside down: left out, but right after half a turn.
+
+    An image viewer that rotates and saves, or a camera that rotates images by gravity, turns single images. Their poses
+    are then turned by 180 degrees about the optical axis. No wrong corner and no wrong arm pose does this. `names` are
+    those of the images' files, as `image_names` returns them.
+    """
+    stamps: dict[str, set[int]] = defaultdict(set)
+    of_all: dict[str, set[int]] = defaultdict(set)
+    for pair, one in pairs.items():
+        X, Y = refined.X.get(pair.target), refined.Y.get(pair.sensor)
+        if X is None or Y is None or rig.sensors[pair.sensor].images is None:
+            continue
+        of_all[pair.sensor].update(one.stamps_ns.tolist())
+        expected = inverse(Y.matrix()[None]) @ one.A @ X.matrix()
+        error = one.B[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)
+        beside_half_a_turn = np.linalg.norm(so3_logmap(error @ np.diag([-1.0, -1.0, 1.0])), axis=1)
+        is_turned = (beside_half_a_turn < NEAR_RAD) & ~one.used
+        stamps[pair.sensor].update(one.stamps_ns[is_turned].tolist())
+    findings = []
+    for sensor, found in stamps.items():
+        if not found:
+            continue
+        named = [image_name(names, str(rig.sensors[sensor].images), stamp) for stamp in sorted(found)[:MOST_NAMED]]
+        more = f" and {len(found) - MOST_NAMED} others" if len(found) > MOST_NAMED else ""
+        words = (
+            f"{len(found)} of the {len(of_all[sensor])} images of {sensor} in which a target is read "
+            f"{'is' if len(found) == 1 else 'are'} upside down and not used: {', '.join(named)}{more}"
+        )
+        findings.append(Finding(Ground.IMAGE_TURNED, words))
     return findings

@@ -1,36 +1,61 @@
-"""Measured pairs (A, B): written into a cleaned log, read back as arrays, and stated as a problem."""
+"""Measured pairs (A, B): made of detections, written into a cleaned log, read back, and stated as a problem."""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
+from gtsam_rwhec.cameras.targets import Bundle, Tag, Target, is_same_print
 from gtsam_rwhec.detect.detections import Rejection
-from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.errors import FrameError, NoiseError
 from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.logs import Log, LogWriter, PairRecord
+from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, PairRecord
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.results.linear_model import MeasuredRows
+from gtsam_rwhec.results.log_history import TrackCount
+from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.run_log import pairs_topic, records_of
-from gtsam_rwhec.runs.tracks import Track
+from gtsam_rwhec.runs.carrier_motion import check_order
+from gtsam_rwhec.runs.run_log import detections_topic, pairs_topic, records_of
 
 #: Noise of a target's poses where nothing is known yet: 5 mm and half a degree. It is estimated from there.
 BEFORE_ESTIMATE = {"sigma": 0.005, "kappa": 1.0 / (2.0 * np.radians(0.5) ** 2)}
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredPairs(Track):
-    """A track with the carriers' pose at each stamp: A (N, 4, 4), T_sensorcarrier_targetcarrier, metres.
+class MeasuredPairs(MeasuredRows):
+    """All measurements of one target by one sensor, in order of time, with the reason if one is not used.
 
-    For a sensor with odometry, A and B are motions over windows that end at the stamps; `target` is the sensor's name.
+    A is nan before synchronisation, and B the identity for a measurement without a pose. For a sensor with odometry, A
+    and B are motions over windows that end at the stamps; `target` is the sensor's name.
     """
 
-    A: Array
+    stamps_ns: np.ndarray  #: (N,) integers: the sensor's stamps
+    target: str
+    sensor: str
+
+    @property
+    def count(self) -> TrackCount:
+        """How many measurements are used, and how many are removed for each reason."""
+        removed = Counter(self.reasons)
+        return TrackCount(target=self.target, sensor=self.sensor, used=removed.pop("", 0), removed=dict(removed))
+
+    def without(self, reason: str) -> MeasuredPairs:
+        """All measurements removed, for this reason if they had none before."""
+        return replace(self, reasons=tuple(why or reason for why in self.reasons))
+
+    def marked(self, kept: Kept, at: np.ndarray) -> MeasuredPairs:
+        """After a step of cleaning on the measurements `at`; a measurement keeps its first reason."""
+        reasons = list(self.reasons)
+        for item in kept.removed:
+            i = int(at[item.index])
+            reasons[i] = reasons[i] or item.reason
+        return replace(self, reasons=tuple(reasons))
 
     def at(self, path: Trajectory, offset_s: float) -> MeasuredPairs:
         """The pairs with A at another time offset: the sensor's stamp t is the carriers' t + offset."""
@@ -58,6 +83,65 @@ def at_offsets(
         pair: measured.at(path, offsets_s[pair.sensor]) if pair.sensor in sensors else measured
         for pair, measured in pairs.items()
     }
+
+
+def detected_pairs(log: Log, rig: Rig, sensor: str) -> list[MeasuredPairs]:
+    """The detections of a sensor, by target, not synchronised yet. Raises `StampError` as `check_order`."""
+    of_target: dict[str, list[DetectionRecord]] = defaultdict(list)
+    stamps = []
+    targets = rig.target_list
+    for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
+        stamps.append(record.stamp_ns)
+        target = target_of(record, targets)
+        if target is not None:
+            of_target[target.name].append(record)
+    # All tags of an image have the same stamp.
+    check_order(np.array([stamp for stamp, _ in groupby(stamps)], dtype=np.int64), f"detections of {sensor}")
+    return [_of_detections(name, sensor, of_target[name]) for name in sorted(of_target)]
+
+
+def _of_detections(target: str, sensor: str, records: list[DetectionRecord]) -> MeasuredPairs:
+    records = sorted(records, key=lambda record: record.stamp_ns)
+    stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
+    poses = [record.T_camera_tag for record in records]
+    reasons = [r.reason or (Rejection.NO_POSE if r.T_camera_tag is None else "") for r in records]
+    usable = Counter(stamp for stamp, reason in zip(stamps.tolist(), reasons, strict=True) if not reason)
+    # If a message has two measurements of one target, at least one of them is wrong.
+    reasons = [
+        RemovalReason.SEEN_TWICE if not why and usable[s] > 1 else why
+        for s, why in zip(stamps.tolist(), reasons, strict=True)
+    ]
+    known = [r.covariance for r, why in zip(records, reasons, strict=True) if not why]
+    covariance = None
+    if known and all(c is not None for c in known):
+        covariance = np.array([np.eye(6) if r.covariance is None else r.covariance for r in records])
+    B = np.array([np.eye(4) if pose is None else pose for pose in poses])
+    return MeasuredPairs(np.full(B.shape, np.nan), B, stamps, covariance, tuple(reasons), target, sensor)
+
+
+def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | None:
+    """The target of a detection, found by its name (which this library writes), by family and id, or a bundle's ids.
+
+    Raises `FrameError` if the driver does not say the family, and two targets have the id.
+    """
+    targets = list(targets)
+    mine = [t for t in targets if t.name == record.id] or [
+        t
+        for t in targets
+        if isinstance(t, Tag)
+        and record.id == str(t.id)
+        and (not record.family or is_same_print(record.family, t.family))
+    ]
+    if "," in record.id:  # a bundle of apriltag_ros, whose pose is of the layout's frame
+        ids = record.id.split(",")
+        mine = mine or [t for t in targets if isinstance(t, Bundle) and sorted(map(str, t.ids)) == sorted(ids)]
+    if len(mine) > 1:
+        raise FrameError(
+            f"topic {record.topic}: a tag with id {record.id} and no family could be "
+            f"{' or '.join(t.name for t in mine)}; have the driver say the family, or leave one "
+            "of these targets out of the rig file"
+        )
+    return mine[0] if mine else None
 
 
 def pair_records(pairs: Iterable[MeasuredPairs]) -> list[PairRecord]:

@@ -12,10 +12,10 @@ import heapq
 import json
 import re
 from collections import defaultdict
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, PairRecord, Record
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.logs.records import MEASURED_PAIR, TAG_DETECTIONS, Topic, transforms
@@ -353,21 +352,3 @@ def _report(log: Log, name: str, kind: type[Report]) -> Report:
         return kind.model_validate_json(found["json"])
     except ValidationError as error:
         raise LogError(f"{where} cannot be read: {error.errors()[0]['msg']}") from error
-
-
-class SeenCorners(NamedTuple):
-    """A target's corners in an image: their numbers (n,), pixels (n, 2), and T_camera_target (4, 4), metres."""
-
-    target: str
-    indices: np.ndarray
-    corners_px: Array
-    T: Array
-
-
-def seen_corners(log: Log, sensor: str, targets: Container[str]) -> Iterator[SeenCorners]:
-    """The corners of a sensor's detections of some targets that were not rejected, and have corners and a pose."""
-    for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
-        indices, pixels, T = record.corner_indices, record.corners_px, record.T_camera_tag
-        if record.reason or record.id not in targets or indices is None or pixels is None or T is None:
-            continue
-        yield SeenCorners(record.id, np.array(indices), pixels, T)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -30,8 +30,8 @@ from gtsam_rwhec.results.log_history import DetectionReport, TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.measured_pairs import target_of
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA, detections_topic, image_key
-from gtsam_rwhec.runs.tracks import target_of
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,21 @@ class SensorDetections:
     corner_px: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()  #: what was found out about targets
     images: Mapping[int, LookedAt] = field(default_factory=dict)  #: every image, by stamp; none of a driver's
+
+
+def images_at(log: Log, topic: str, of_sensor: SensorDetections, stamps: Iterable[int]) -> list[ImageRecord]:
+    """The images of a sensor at some stamps, in the log's order; messages that cannot be read are missing."""
+    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in stamps}
+    found = log.records_logged_at([topic], wanted.values())
+    return [record for record in found if isinstance(record, ImageRecord) and record.stamp_ns in wanted]
+
+
+def spread(members: Sequence[int], count: int) -> list[int]:
+    """At most `count` members, spread evenly, with the first and the last."""
+    count = min(count, len(members))
+    if count == 1:
+        return [members[len(members) // 2]]
+    return [members[i] for i in np.linspace(0, len(members) - 1, count).round().astype(int).tolist()] if count else []
 
 
 def detection_report(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> DetectionReport:

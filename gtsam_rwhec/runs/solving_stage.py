@@ -37,10 +37,15 @@ from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_solving
 from gtsam_rwhec.runs.clocks_by_turning import late_clocks
 from gtsam_rwhec.runs.comparable_noise import with_comparable_noise
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
-from gtsam_rwhec.runs.doubted_shapes import continued_boards, doubted_shapes
+from gtsam_rwhec.runs.doubted_statements import continued_boards, doubted_intrinsics, doubted_shapes, finding_against
 from gtsam_rwhec.runs.log_corners import LogCorners
-from gtsam_rwhec.runs.log_findings import estimated_sizes, in_rig_file, known_to_nothing, may_be_exchanged
+from gtsam_rwhec.runs.log_findings import (
+    estimated_sizes,
+    in_rig_file,
+    known_to_nothing,
+    may_be_exchanged,
+    turned_images,
+)
 from gtsam_rwhec.runs.measured_pairs import (
     MeasuredPairs,
     Pairs,
@@ -51,7 +56,6 @@ from gtsam_rwhec.runs.measured_pairs import (
     without_marks,
 )
 from gtsam_rwhec.runs.run_log import CLEANING_METADATA, LogMetadata, read_cleaning_report, read_metadata
-from gtsam_rwhec.runs.turned_images import turned_images
 from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Reasons for which cleaning removes a measurement that does not agree with the carriers' motion.

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,11 +19,11 @@ from gtsam_rwhec.detect.clues import About, Clue, clues, edge_blur_px, motion_bl
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import RECORDED_LOG
-from gtsam_rwhec.runs.sensor_detections import SensorDetections
+from gtsam_rwhec.runs.sensor_detections import SensorDetections, images_at, spread
 
 #: At most this number of images is looked at, of several targets at least `LEAST` for each; nothing more is tried after
 #: this number of seconds of the processor.
@@ -35,14 +34,6 @@ MOST_TARGETS, MOST_NAMED = 4, 10
 SHARE = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """The clues about a target in some images, and how many images there were."""
-
-    looked_at: int
-    of_image: Sequence[Sequence[Clue]]
-
-
 def likely_causes(
     log: Log, rig: Rig, cameras: Mapping[str, Camera], found: Mapping[str, SensorDetections]
 ) -> tuple[str, ...]:
@@ -51,7 +42,6 @@ def likely_causes(
     doubted = [target for target in rig.target_list if _is_doubted(target, found)]
     if not sensors or not doubted:
         return ()
-    until_s = time.thread_time() + SECONDS
     images = {
         sensor: _some_images(log, str(rig.sensors[sensor].images), cameras[sensor], found[sensor], MOST // len(sensors))
         for sensor in sensors
@@ -60,13 +50,11 @@ def likely_causes(
     unexplained: list[Target] = []
     is_any_used = any(not record.reason for of_sensor in found.values() for record in of_sensor.records)
     examined = doubted[:MOST_TARGETS]
-    for number, target in enumerate(examined):
-        now_s = time.thread_time()
-        ends_s = now_s + (until_s - now_s) / (len(examined) - number)
-        causes = of_rejections(rig, target, found, images)
+    for target in examined:
+        causes = list(of_rejections(rig, target, found, images))
         if not causes:
-            seen = _look(rig, target, cameras, found, images, max(LEAST, MOST // len(examined)), ends_s)
-            causes = _of_clues(rig, target, seen)
+            most, seconds = max(LEAST, MOST // len(examined)), SECONDS / len(examined)
+            causes = _of_clues(rig, target, _look(rig, target, cameras, found, images, most, seconds))
             if not causes and (not is_any_used or _records_of(target, found)):
                 unexplained.append(target)  # else it may not be in the images: it is among those that no sensor saw
         said += causes
@@ -92,26 +80,25 @@ def _some_images(log: Log, topic: str, camera: Camera, of_sensor: SensorDetectio
     """Images by stamp: those with rejected detections first, then those without any, each spread over time."""
     rejected = {record.stamp_ns for record in of_sensor.records if record.reason}
     used = {record.stamp_ns for record in of_sensor.records if not record.reason}
-    whole = [stamp for stamp, image in sorted(of_sensor.images.items()) if not image.fault]
-    chosen: list[int] = []
-    for members in ([s for s in whole if s in rejected - used], [s for s in whole if s not in rejected | used]):
-        count = min(len(members), max(most, 2) - len(chosen))
-        if count > 0:
-            places = np.linspace(0, len(members) - 1, count + 2)[1:-1] if count < len(members) else np.arange(count)
-            chosen += [members[i] for i in places.round().astype(int).tolist()]
+    whole = _whole(of_sensor)
+    chosen = spread([stamp for stamp in whole if stamp in rejected - used], max(most, 2))
+    chosen += spread([stamp for stamp in whole if stamp not in rejected | used], max(most, 2) - len(chosen))
     return _decoded(log, topic, camera, of_sensor, chosen)
+
+
+def _whole(of_sensor: SensorDetections) -> list[int]:
+    """The stamps of images that could be used, in order of time."""
+    return [stamp for stamp, image in sorted(of_sensor.images.items()) if not image.fault]
 
 
 def _decoded(
     log: Log, topic: str, camera: Camera, of_sensor: SensorDetections, stamps: Sequence[int]
 ) -> dict[int, Gray]:
     """The images of some stamps, in their order, that can be decoded."""
-    wanted = {stamp: of_sensor.images[stamp].logged_ns for stamp in stamps}
     images = {}
-    for record in log.records_logged_at([topic], wanted.values()):
-        if isinstance(record, ImageRecord) and record.stamp_ns in wanted:
-            with suppress(ImageError):  # its fault is in the report
-                images[record.stamp_ns] = decode_gray(record, (camera.width, camera.height))
+    for record in images_at(log, topic, of_sensor, stamps):
+        with suppress(ImageError):  # its fault is in the report
+            images[record.stamp_ns] = decode_gray(record, (camera.width, camera.height))
     return {stamp: images[stamp] for stamp in stamps if stamp in images}
 
 
@@ -122,9 +109,10 @@ def _look(
     found: Mapping[str, SensorDetections],
     images: Mapping[str, Mapping[int, Gray]],
     most: int,
-    until_s: float,
-) -> _Seen:
-    """The clues about a target in the images in which it was not read, one of each sensor in turn."""
+    seconds: float,
+) -> list[list[Clue]]:
+    """The clues about a target in each image in which it was not read, one image of each sensor in turn."""
+    until_s = time.thread_time() + seconds
 
     def is_late() -> bool:
         return time.thread_time() > until_s
@@ -136,113 +124,87 @@ def _look(
         if record.id == target.name and not record.reason
     }
     others = {(t.family, i) for t in rig.target_list if t.name != target.name for i in t.ids}
-    of_image: list[list[Clue]] = []
     turns = [
         (place, sensor, gray)
         for sensor, of_sensor in images.items()
         for place, (stamp, gray) in enumerate(of_sensor.items())
         if (sensor, stamp) not in used
     ]
+    of_image: list[list[Clue]] = []
     for _, sensor, gray in sorted(turns, key=lambda turn: turn[0])[:most]:
         if is_late():
             break
         seen = clues(gray, target, cameras[sensor], rig.detection_options, is_late)
         of_image.append([c for c in seen if c.about is not About.ID or (target.family, c.value) not in others])
-    return _Seen(len(of_image), of_image)
+    return of_image
 
 
-def _of_clues(rig: Rig, target: Target, seen: _Seen) -> list[str]:
+def _of_clues(rig: Rig, target: Target, of_image: Sequence[Sequence[Clue]]) -> list[str]:
     """The causes that enough images show, the commonest first."""
     figures: dict[tuple[About, object], list[float]] = defaultdict(list)
-    for of_image in seen.of_image:
-        for clue in set(of_image):
-            figures[clue.about, clue.value].append(clue.figure)
-    enough = max(2 if seen.looked_at > 2 else 1, SHARE * seen.looked_at)
-    common = sorted((key for key in figures if len(figures[key]) >= enough), key=lambda key: -len(figures[key]))
-    return [
-        sentence(rig, target, about, value, figures[about, value], seen.looked_at)
-        for number, (about, value) in enumerate(common)
-        if about not in [before for before, _ in common[:number]]  # of one thing, only the commonest value
-    ]
+    for clue in (clue for of_one in of_image for clue in set(of_one)):
+        figures[clue.about, clue.value].append(clue.figure)
+    enough = max(2 if len(of_image) > 2 else 1, SHARE * len(of_image))
+    causes: dict[About, str] = {}  # of one thing, only the commonest value
+    for (about, value), each in sorted(figures.items(), key=lambda item: -len(item[1])):
+        if len(each) >= enough and about not in causes:
+            of, figure = f"{len(each)} of {len(of_image)} images", float(np.median(each))
+            causes[about] = f"{target.name}: {_sentence(rig, target, about, value, of, figure)}"
+    return list(causes.values())
 
 
 #: A reason for rejection counts as a cause if at least this share of a target's detections has it.
 MOSTLY = 0.3
 _SHARPER = "Focus the lens, stand still for each image, or expose for a shorter time"
+#: What images show of a target that nothing else explains, and what to do.
+_OF_IMAGES = {
+    About.MARGIN: "in {of} it is read once the ground around it is made lighter: a tag needs a white margin around its "
+    "black square, one module wide and more. Print it with one, or put white paper behind it",
+    About.SMALL: "in {of} it is read only when the image is enlarged: its shortest side is about {figure:.0f} pixels "
+    "long there. Go nearer, take a larger one, or images of more pixels",
+    About.BLURRED: "in {of} it is read only when the image is made smaller: edges are blurred by about {figure:.1f} "
+    f"pixels (standard deviation; sharp ones by less than 1). {_SHARPER}",
+    About.DARK: "in {of} it is read only when the image is brightened: the brightest pixels have a gray value of about "
+    "{figure:.0f} of 255. More light, or a longer exposure while the robot stands still",
+    About.BRIGHT: "{of} are overexposed: {figure:.0%} of the pixels are saturated. Expose for a shorter time",
+}
 
 
-def sentence(rig: Rig, target: Target, about: About, value: object, figures: Sequence[float], looked_at: int) -> str:
-    """A sentence about what the images show, and what to do."""
-    name, of = target.name, f"{len(figures)} of {looked_at} images"
-    figure = float(np.median(figures))
+def _sentence(rig: Rig, target: Target, about: About, value: object, of: str, figure: float) -> str:
+    """What images show, and what to do."""
 
-    def write(key: str, text: object, old: str = "") -> str:
-        place = rig.source.place(("targets", name, key))
-        return f"write {key}: {text}{f' in place of {old}' if old else ''} ({place})"
+    def write(key: str, text: object) -> str:
+        return f"write {key}: {text} ({rig.source.place(('targets', target.name, key))})"
 
     match about:
         case About.COUNTS:
             assert isinstance(value, tuple)
             assert isinstance(target, (Checkerboard, CircleGrid))
-            key = "inner_corners" if isinstance(target, Checkerboard) else "circles"
-            things = "inner corners" if isinstance(target, Checkerboard) else "circles"
-            stated = (target.columns, target.rows)
-            why = ""
-            if isinstance(target, Checkerboard) and stated == (value[0] + 1, value[1] + 1):
+            is_checkerboard, stated = isinstance(target, Checkerboard), (target.columns, target.rows)
+            key, things = ("inner_corners", "inner corners") if is_checkerboard else ("circles", "circles")
+            shown = f"{of} show a board of {value[0]} x {value[1]} {things}"
+            if stated == value[::-1] and isinstance(target, CircleGrid) and target.larger_dot:
+                return (
+                    f"{shown}, or its larger dot at another corner than the {target.corner.replace('_', ' ')}: "
+                    f"{write(key, list(value))}, or larger_dot: {_beside(target.corner)}"
+                )
+            why = ": columns and rows are exchanged" if stated == value[::-1] else ""
+            if is_checkerboard and stated == (value[0] + 1, value[1] + 1):
                 why = " (it counts squares; inner corners are where four squares meet)"
-            elif stated == value[::-1]:
-                why = ": columns and rows are exchanged"
-                if isinstance(target, CircleGrid) and target.larger_dot:
-                    return (
-                        f"{name}: {of} show a board of {value[0]} x {value[1]} circles, or its larger dot at another "
-                        f"corner than the {target.corner.replace('_', ' ')}: {write(key, list(value))}, or larger_dot: "
-                        f"{_beside(target.corner)}"
-                    )
-            return (
-                f"{name}: {of} show a board of {value[0]} x {value[1]} {things}, and the rig file says {stated[0]} x "
-                f"{stated[1]}{why}: {write(key, list(value))}"
-            )
+            return f"{shown}, and the rig file says {stated[0]} x {stated[1]}{why}: {write(key, list(value))}"
         case About.DOT:
-            shown = f"with its larger dot at the {str(value).replace('_', ' ')}" if value else "without a larger dot"
-            return f"{name}: {of} show the grid {shown}: {write('larger_dot', value or 'false')}"
+            dot = f"with its larger dot at the {str(value).replace('_', ' ')}" if value else "without a larger dot"
+            return f"{of} show the grid {dot}: {write('larger_dot', value or 'false')}"
         case About.FAMILY:
             family = _family_of(str(value), target)
-            return f"{name}: {of} show tags of {family} and none of {target.family}: {write('family', family)}"
+            return f"{of} show tags of {family} and none of {target.family}: {write('family', family)}"
         case About.ID:
-            return f"{name}: {of} show the tag {value} of {target.family}, and none shows {target.ids[0]}: " + write(
-                "id", value
-            )
+            return f"{of} show the tag {value} of {target.family}, and none shows {target.ids[0]}: {write('id', value)}"
         case About.BORDER:
             lines = "a single black border, which Kalibr's AprilGrids do not have" if value == 1 else "a double border"
-            return (
-                f"{name}: {of} show its tags with {lines}. Change the type of the target "
-                f"({rig.source.place(('targets', name, 'type'))})"
-            )
-        case About.MARGIN:
-            return (
-                f"{name}: in {of} it is read once the ground around it is made lighter: a tag needs a white margin "
-                "around its black square, one module wide and more. Print it with one, or put white paper behind it"
-            )
-        case About.SMALL:
-            return (
-                f"{name}: in {of} it is read only when the image is enlarged: its shortest side is about {figure:.0f} "
-                "pixels long there. Go nearer, take a larger one, or images of more pixels"
-            )
-        case About.BLURRED:
-            return (
-                f"{name}: in {of} it is read only when the image is made smaller: edges are blurred by about "
-                f"{figure:.1f} pixels (standard deviation; sharp ones by less than 1). {_SHARPER}"
-            )
-        case About.DARK:
-            return (
-                f"{name}: in {of} it is read only when the image is brightened: the brightest pixels have a gray value "
-                f"of about {figure:.0f} of 255. More light, or a longer exposure while the robot stands still"
-            )
-        case About.BRIGHT:
-            return (
-                f"{name}: {of} are overexposed: {100.0 * figure:.0f} % of the pixels are saturated. Expose for a "
-                "shorter time"
-            )
+            place = rig.source.place(("targets", target.name, "type"))
+            return f"{of} show its tags with {lines}. Change the type of the target ({place})"
+    return _OF_IMAGES[about].format(of=of, figure=figure)
 
 
 def _beside(corner: str) -> str:
@@ -258,55 +220,49 @@ def _family_of(family: str, target: Target) -> str:
 
 def of_rejections(
     rig: Rig, target: Target, found: Mapping[str, SensorDetections], images: Mapping[str, Mapping[int, Gray]]
-) -> list[str]:
+) -> Iterator[str]:
     """Causes from the reasons of rejected detections, with the measured values and the limits."""
     records = [(sensor, r) for sensor, of in found.items() for r in of.records if r.id == target.name]
-    options, name = rig.detection_options, target.name
-
-    def with_reason(reason: Rejection) -> list[tuple[str, DetectionRecord]]:
-        those = [(sensor, r) for sensor, r in records if r.reason == reason]
-        return those if len(those) >= MOSTLY * len(records) else []
-
-    causes = []
-    small = [_side_px(target, r.corners_px) for _, r in with_reason(Rejection.SMALL) if r.corners_px is not None]
-    if small:
-        causes.append(
-            f"{name}: {len(small)} of {len(records)} detections are small: a side of about {np.median(small):.0f} "
-            f"pixels, and at least {options.min_side_px:g} are wanted. Go nearer, take a larger target, or images of "
-            "more pixels; or write detection: {min_side_px: ...}"
-        )
-    blurred = with_reason(Rejection.BLURRED)
-    if blurred:
-        widths = [edge_blur_px(images[s][r.stamp_ns]) for s, r in blurred if r.stamp_ns in images.get(s, {})]
-        much = f": the images' edges have a blur of about {np.median(widths):.1f} pixels" if widths else ""
-        causes.append(
-            f"{name}: {len(blurred)} of {len(records)} detections are blurred{much}, and at most "
-            f"{options.max_blur_px:g} (standard deviation) is wanted. {_SHARPER}"
-        )
-    off = [r.reprojection_px for _, r in with_reason(Rejection.REPROJECTION) if r.reprojection_px is not None]
-    if off:
-        sensors = dict.fromkeys(sensor for sensor, _ in with_reason(Rejection.REPROJECTION))
-        places = "; ".join(rig.source.place(("sensors", sensor, "intrinsics")) for sensor in sensors)
-        causes.append(
-            f"{name}: in {len(off)} of {len(records)} detections the corners are {np.median(off):.1f} pixels off those "
-            f"of a plane that this camera sees. Are the intrinsics those of these images ({places}), and is the target "
-            "flat?"
-        )
-    layouts = Counter(r.reason for _, r in records if r.reason.startswith(Rejection.LAYOUT))
-    if layouts and layouts.total() >= MOSTLY * len(records):
-        reason = layouts.most_common(1)[0][0]
-        causes.append(
-            f"{name}: in {layouts.total()} of {len(records)} detections the {reason} "
-            f"({rig.source.place(('targets', name))})"
-        )
-    unsure = len(with_reason(Rejection.AMBIGUOUS))
-    if unsure:
-        causes.append(
-            f"{name}: {unsure} of {len(records)} detections are ambiguous: two of its poses look alike, and the motion "
-            "does not tell which is right. Turn the carriers further between images, about different axes; look at the "
-            "target obliquely and from nearer"
-        )
-    return causes
+    options, place = rig.detection_options, rig.source.place
+    of_reason: dict[str, list[tuple[str, DetectionRecord]]] = defaultdict(list)
+    for sensor, record in records:
+        of_reason[record.reason.partition(":")[0]].append((sensor, record))
+    for reason, those in of_reason.items():
+        if len(those) < MOSTLY * len(records):
+            continue
+        said = f"{len(those)} of {len(records)} detections"
+        sides = [_side_px(target, r.corners_px) for _, r in those if r.corners_px is not None]
+        off_px = [r.reprojection_px for _, r in those if r.reprojection_px is not None]
+        match reason:
+            case Rejection.SMALL if sides:
+                what = (
+                    f"{said} are small: a side of about {np.median(sides):.0f} pixels, and at least "
+                    f"{options.min_side_px:g} are wanted. Go nearer, take a larger target, or images of more pixels; "
+                    "or write detection: {min_side_px: ...}"
+                )
+            case Rejection.BLURRED:
+                widths = [edge_blur_px(images[s][r.stamp_ns]) for s, r in those if r.stamp_ns in images.get(s, {})]
+                much = f": the images' edges have a blur of about {np.median(widths):.1f} pixels" if widths else ""
+                limit = f"at most {options.max_blur_px:g} (standard deviation) is wanted"
+                what = f"{said} are blurred{much}, and {limit}. {_SHARPER}"
+            case Rejection.REPROJECTION if off_px:
+                places = "; ".join(place(("sensors", s, "intrinsics")) for s in dict.fromkeys(s for s, _ in those))
+                what = (
+                    f"in {said} the corners are {np.median(off_px):.1f} pixels off those of a plane that this camera "
+                    f"sees. Are the intrinsics those of these images ({places}), and is the target flat?"
+                )
+            case Rejection.LAYOUT:
+                ((words, _),) = Counter(r.reason for _, r in those).most_common(1)
+                what = f"in {said} the {words} ({place(('targets', target.name))})"
+            case Rejection.AMBIGUOUS:
+                what = (
+                    f"{said} are ambiguous: two of its poses look alike, and the motion does not tell which is right. "
+                    "Turn the carriers further between images, about different axes; look at the target obliquely and "
+                    "from nearer"
+                )
+            case _:
+                continue
+        yield f"{target.name}: {what}"
 
 
 def nothing_explains(targets: Sequence[Target], found: Mapping[str, SensorDetections]) -> str:
@@ -380,10 +336,10 @@ def blurred_images(
     said = []
     for sensor, of_sensor in found.items():
         used = {record.stamp_ns for record in of_sensor.records if not record.reason}
-        whole = [stamp for stamp, image in sorted(of_sensor.images.items()) if not image.fault]
+        whole = _whole(of_sensor)
         unread = [stamp for stamp in whole if stamp not in used]
         hides = len(unread) >= max(FEWEST, UNREAD * of_sensor.count)
-        looked_at = _spread(unread if hides else whole)
+        looked_at = spread(unread if hides else whole, LOOKED_AT)
         if len(looked_at) < FEWEST:
             continue
         topic = str(rig.sensors[sensor].images)
@@ -401,11 +357,3 @@ def blurred_images(
             widths = f"{wide_px:.1f} pixels across the motion and {narrow_px:.1f} along it"
             said.append(f"{what} have edges with a blur of {widths}")
     return tuple(said)
-
-
-def _spread(stamps: list[int]) -> list[int]:
-    """At most `LOOKED_AT` of some stamps."""
-    if not stamps:
-        return []
-    places = np.unique(np.linspace(0, len(stamps) - 1, LOOKED_AT).round().astype(int))
-    return [stamps[place] for place in places.tolist()]

@@ -11,7 +11,7 @@ from rendered import pose, projected
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.shape_evidence import BoardView, ShapeEvidence, evidence_of_shape, never_seen
 from gtsam_rwhec.cameras.targets import AprilGrid, Bundle, BundleTag, Charuco, TagGrid, Target
-from gtsam_rwhec.runs.doubted_shapes import hypotheses_of
+from gtsam_rwhec.runs.doubted_statements import hypotheses_of
 
 CAMERA = Camera.of(640, 480, "", [[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]], (), "test")
 BUNDLE = Bundle(

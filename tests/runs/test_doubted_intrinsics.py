@@ -11,7 +11,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.rig import Rig, parse_rig
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics, finding_against
+from gtsam_rwhec.runs.doubted_statements import doubted_intrinsics, finding_against
 from gtsam_rwhec.runs.run_log import detections_topic
 
 RIG = """\

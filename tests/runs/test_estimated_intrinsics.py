@@ -20,7 +20,7 @@ from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.rig import parse_rig
 from gtsam_rwhec.runs import detect_source
-from gtsam_rwhec.runs.doubted_intrinsics import doubted_intrinsics
+from gtsam_rwhec.runs.doubted_statements import doubted_intrinsics
 from gtsam_rwhec.runs.kept_detections import inputs_of
 from gtsam_rwhec.runs.recorded_logs import write_folder_log
 from gtsam_rwhec.runs.run_log import read_cameras, read_embedded_rig

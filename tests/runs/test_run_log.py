@@ -11,7 +11,7 @@ import synthetic_logs as made
 from gtsam_rwhec.cameras.targets import Tag
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.runs import run_log as log_contract
-from gtsam_rwhec.runs.tracks import target_of
+from gtsam_rwhec.runs.measured_pairs import target_of
 
 OF_DETECTION = {
     log_contract.detections_topic("rig/cam_0"),

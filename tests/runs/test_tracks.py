@@ -8,7 +8,7 @@ import pytest
 from gtsam_rwhec.cameras.targets import Bundle, BundleTag, Tag
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.runs.tracks import target_of
+from gtsam_rwhec.runs.measured_pairs import target_of
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 BOX = Bundle("box", "tag36h11", tuple(BundleTag(i, 0.05, (0.1 * i, 0.0, 0.0), UPRIGHT) for i in (7, 8, 10)))

@@ -68,7 +68,7 @@ def test_a_drivers_detections_cannot_be_drawn(tmp_path: Path) -> None:
     arguments = ["detect", raw, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "d.mcap", "--draw", tmp_path / "pics"]
     done = CliRunner().invoke(app, list(map(str, arguments)))
     assert done.exit_code == 2
-    assert "(--draw): no sensor of the rig file has images" in " ".join(done.stderr.split())
+    assert "(--draw) counts only for images, and no sensor of the rig file has images" in " ".join(done.stderr.split())
     assert {path.name for path in tmp_path.iterdir()} == {"raw.mcap", "rig.yaml"}
 
 
