@@ -156,8 +156,8 @@ class PairsAlone:
 
     def reason(self, e: int) -> FreeReason:
         """Why a direction of a pair is free."""
-        of_pair = int(self.axes[e]), float(self.turned_rad[e]), float(self.residual_rad[e]), int(self.counts[e])
-        return reason_for(*of_pair)
+        of_noise = float(self.turned_rad[e]), float(self.residual_rad[e])
+        return reason_for(int(self.axes[e]), *of_noise, int(self.counts[e]))
 
     def reasons_of_frames(self) -> Mapping[str, FreeReason]:
         """A frame has the reason of its pair that turned about most axes; of several such pairs, of the last one."""

@@ -167,14 +167,9 @@ class Search:
         return answer_of(self.part, self.form, R).has_positive_scales
 
     def _relax(self) -> Relaxation:
-        options = self.options
+        limits = self.options.relaxation_tolerance, self.options.max_relaxation_iterations
         with self.stages.of("semidefinite relaxation"):
-            return solve_relaxation(
-                self.whole.reduced.Q,
-                options.relaxation_tolerance,
-                options.max_relaxation_iterations,
-                self.stages.progress,
-            )
+            return solve_relaxation(self.whole.reduced.Q, *limits, self.stages.progress)
 
     @property
     def form(self) -> SearchForm:
@@ -198,15 +193,12 @@ class Search:
         zero = OF_MOMENTS if self.part.given is None else OF_MEASUREMENTS
         # At rest a motion's equation cancels in the form, and its terms are of the size of kappa.
         magnitude = max(self.form.magnitude, float(self.part.moments.kappa.sum()))
-        floor = zero * self.form.size * magnitude + OF_ORIGIN * self._of_origin + 1e-250
-        return max(self.options.relative_tolerance * cost, floor)
-
-    @property
-    def _of_origin(self) -> float:
-        """The term that the gauge removed, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded relative to its size."""
+        # The term that the gauge removed, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded relative to its size.
         gauge = self.part.gauge
         squares = float((gauge.sensor_carrier**2).sum() + (gauge.target_carrier**2).sum())
-        return float(self.part.moments.weight.sum()) * squares
+        of_origin = float(self.part.moments.weight.sum()) * squares
+        floor = zero * self.form.size * magnitude + OF_ORIGIN * of_origin + 1e-250
+        return max(self.options.relative_tolerance * cost, floor)
 
     @property
     def rounding(self) -> float:
