@@ -22,6 +22,8 @@ from gtsam_rwhec.solver.elimination import Elimination, Group
 AT_ONCE = 1_000_000
 #: Up to this many numbers are summed one by one.
 FEW_NUMBERS = 4096
+#: Of up to this many rows it is asked whether each is named once.
+FEW_ROWS = 64
 #: `AT_ONCE` for frames with the same neighbours: these numbers fit in the processor's cache.
 ALIKE_AT_ONCE = 100_000
 
@@ -100,8 +102,8 @@ class BlockMatrix:
             return (np.abs(blocks) if absolute else blocks).astype(v.dtype, copy=False)
 
         n, m, _ = self.tails.shape
-        columns = v.reshape(len(v), -1)
-        of_frames, of_tail, tails = columns[: n * m].reshape(n, m, columns.shape[1]), columns[n * m :], of(self.tails)
+        columns, D = (v[:, None], 1) if v.ndim == 1 else (v, v.shape[1])
+        of_frames, of_tail, tails = columns[: n * m].reshape(n, m, D), columns[n * m :], of(self.tails)
         result = np.matmul(of(self.frames), of_frames) + tails @ of_tail
         last = of(self.tail) @ of_tail + np.einsum("niq,nid->qd", tails, of_frames)
         first, second = self.ends
@@ -109,7 +111,7 @@ class BlockMatrix:
             blocks = of(self.couplings[at])
             sum_into(result, first[at], np.matmul(blocks, of_frames[second[at]]))
             sum_into(result, second[at], np.matmul(blocks.transpose(0, 2, 1), of_frames[first[at]]))
-        return np.concatenate([result.reshape(n * m, -1), last]).reshape(v.shape)
+        return np.concatenate([result.reshape(n * m, D), last]).reshape(v.shape)
 
     def dense(self) -> Array:
         """As one array; for small matrices."""
@@ -314,6 +316,9 @@ def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.
     Rows may be named more than once.
     """
     k = len(index)
+    if k <= FEW_ROWS and len(set(index.tolist())) == k:
+        result[index] += factor * values if factor != 1.0 else values
+        return
     if values.size <= FEW_NUMBERS:
         np.add.at(result, index, factor * values if factor != 1.0 else values)
         return
