@@ -140,8 +140,8 @@ class GivenMeasurements:
                 )
             variances = np.einsum("nii->ni", covariances)
             sigma, kappa = np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
-        weights = (positive_weights(x, len(A), name, where) for name, x in (("sigma", sigma), ("kappa", kappa)))
-        return Measurements(A, B, *weights, stamps_ns, covariances, self.pixels)
+        sigma, kappa = (positive_weights(x, len(A), name, where) for name, x in (("sigma", sigma), ("kappa", kappa)))
+        return Measurements(A, B, sigma, kappa, stamps_ns, covariances, self.pixels)
 
 
 def positive_weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:
@@ -151,7 +151,9 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     try:
         array = np.array(real_array(value))
     except ValueError as error:
-        raise NoiseError(f"{where}: {name}={brief(value)} cannot be read as numbers ({error})") from error
+        raise NoiseError(
+            f"{where}: {name}={brief(value)} cannot be read as numbers ({error}); give a number"
+        ) from error
     if array.shape not in ((), (count,)) or count == 0 != array.ndim:
         many = f" or one for each of {count}" if count else ""
         raise CountError(f"{where}: {name} has shape {array.shape}; give one number{many}")

@@ -140,15 +140,17 @@ def small_stacks(measured: Measured) -> Iterator[Stack]:
             count += 1
         taken, small = small[:count], small[count:]
         filled = np.arange(longest) < np.array([len(raw.A) for _, raw in taken])[:, None]
-        A: Array = np.zeros((count, longest, 12))
-        B: Array = np.zeros((count, longest, 12))
-        weight: Array = np.zeros((count, longest))
-        kappa: Array = np.zeros((count, longest))
-        A[filled] = _rows(np.concatenate([raw.A for _, raw in taken]))
-        B[filled] = _rows(np.concatenate([raw.B for _, raw in taken]))
-        weight[filled] = 1.0 / np.concatenate([raw.sigma for _, raw in taken]) ** 2
-        kappa[filled] = np.concatenate([raw.kappa for _, raw in taken])
-        yield Stack(np.array([pair for pair, _ in taken]), A, B, weight, kappa)
+
+        def padded(values: Array, filled: np.ndarray = filled) -> Array:
+            result = np.zeros((*filled.shape, *values.shape[1:]))
+            result[filled] = values
+            return result
+
+        A, B, sigma, kappa = (
+            np.concatenate([getattr(raw, name) for _, raw in taken]) for name in ("A", "B", "sigma", "kappa")
+        )
+        pairs = np.array([pair for pair, _ in taken])
+        yield Stack(pairs, padded(_rows(A)), padded(_rows(B)), padded(1.0 / sigma**2), padded(kappa))
 
 
 def _rows(T: Array) -> Array:
