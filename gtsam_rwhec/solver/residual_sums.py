@@ -206,9 +206,10 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
             reach = _reach(poses)[:, :, None] * one_error
             of_errors.append(reach + rounding[:, :, None] * (of_ones * root).reshape(k, 1, outputs))
         values, bounds = (square, *of_poses, np.ones(m) @ flat), (error, *of_errors, one_error[:, 0])
-        for table, bound, size, value, of_value in zip(tables, errors, sizes, values, bounds, strict=True):
+        rows = places, *[stack.pairs] * 3
+        for at, table, bound, size, value, of_value in zip(rows, tables, errors, sizes, values, bounds, strict=True):
             for whole, of_stack in ((table, value), (bound, of_value), (size, np.abs(value))):
-                sum_into(whole, places if len(whole) == 1 else stack.pairs, of_stack)
+                sum_into(whole, at, of_stack)
     for bound, size in zip(errors, sizes, strict=True):
         bound += gamma(number + 2) * size
         bound *= 1.0 + 1e-9
