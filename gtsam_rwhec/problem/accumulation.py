@@ -52,9 +52,12 @@ class Accumulator:
         stacks: list[MomentStack] = []
         for _, group in groupby((self._held[pair] for pair in pairs), lambda row: id(row.many)):
             rows = list(group)
-            index = np.array([row.index for row in rows])
-            is_run = bool((np.diff(index) == 1).all())
-            stacks.append(rows[0].many.rows(slice(index[0], index[-1] + 1) if is_run else index))
+            many, index = rows[0].many, [row.index for row in rows]
+            if index == list(range(len(many))):
+                stacks.append(many)
+                continue
+            is_run = index == list(range(index[0], index[0] + len(index)))
+            stacks.append(many.rows(slice(index[0], index[-1] + 1) if is_run else np.array(index)))
         return MomentStack.joined(stacks)
 
     def added(self, batch: Sorted, *, with_R_B: bool) -> tuple[Accumulator, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -67,16 +67,11 @@ def check_camera(camera: object, known: Camera | None, sensor: str, where: str) 
     """The sensor's camera; a CameraError if there is none, or if a different one was given before."""
     if camera is None and known is not None:
         return known
-    if camera is None:
-        raise CameraError(
-            f"{where}: no camera is given, and {sensor} has none yet; give camera=rw.Camera.of(width, height, "
-            "'radtan', K, D, 'its name'). If nobody knows its intrinsics: rw.calibrate_corners with "
-            'rw.CornerOptions(stated="unknown")'
-        )
     if not isinstance(camera, Camera):
         raise CameraError(
-            f"{where}: camera is a {type(camera).__name__}; give {sensor} intrinsics: rw.Camera.of(width, height, "
-            "'radtan', K, D, 'its name')"
+            f"{where}: camera is {brief(camera)}; give {sensor} intrinsics: camera=rw.Camera.of(width, height, "
+            "'radtan', K, D, 'its name'). If nobody knows them: rw.calibrate_corners with "
+            'rw.CornerOptions(stated="unknown")'
         )
     if known is None:
         return camera
@@ -87,17 +82,11 @@ def check_camera(camera: object, known: Camera | None, sensor: str, where: str) 
             f"{before[1]} before; a sensor has one size of image: give each size a sensor of its own, or scale the "
             "corners and K"
         )
-    same = (
-        camera.model == known.model
-        and np.array_equal(camera.K, known.K)
-        and camera.D.shape == known.D.shape
-        and np.array_equal(camera.D, known.D)
-    )
-    if not same:
+    if camera.model != known.model or not (np.array_equal(camera.K, known.K) and np.array_equal(camera.D, known.D)):
         raise CameraError(
-            f"{where}: {sensor} had other intrinsics before ({known.model}, K {known.K[[0, 1, 0, 1], [0, 1, 2, 2]]} "
-            f"then, {camera.model}, K {camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]} now: fx, fy, cx, cy); give the same "
-            "camera, or leave camera out"
+            f"{where}: {sensor} had other intrinsics before ({known.model}, fx fy cx cy "
+            f"{known.K[[0, 1, 0, 1], [0, 1, 2, 2]]} then, {camera.model}, {camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]} now); "
+            "give the same camera, or leave camera out"
         )
     return known
 
@@ -138,17 +127,11 @@ def same_board(one: Array, other: Array) -> bool:
 
 
 def _each(image_points: Any, where: str) -> list[Any]:
-    if isinstance(image_points, np.ndarray) and image_points.ndim not in (3, 4):
-        raise CountError(
-            f"{where}: image_points has shape {image_points.shape}; give (N, n, 2), or a list of one (n, 2) an image"
-        )
-    try:
-        return list(image_points)
-    except TypeError as error:
-        raise CountError(
-            f"{where}: image_points is a {type(image_points).__name__}; give (N, n, 2), or a list of one (n, 2) an "
-            "image"
-        ) from error
+    is_flat = isinstance(image_points, np.ndarray) and image_points.ndim not in (3, 4)
+    if is_flat or not isinstance(image_points, Iterable):
+        what = f"has shape {image_points.shape}" if is_flat else f"is a {type(image_points).__name__}"
+        raise CountError(f"{where}: image_points {what}; give (N, n, 2), or a list of one (n, 2) an image")
+    return list(image_points)
 
 
 def _rows(values: Any, width: int, what: str) -> Array:
@@ -200,7 +183,7 @@ def _whole_board(board_points: Any, known: Array | None, where: str) -> Array:
     if known is not None and not same_board(known, points):
         raise TargetError(
             f"{where}: board_points are not those that the target had before ({_words(points)} now, {_words(known)} "
-            "before); give each board a name of its own, or leave board_points out"
+            "then); give each board a name of its own, or leave board_points out"
         )
     return points if known is None else known
 
@@ -226,7 +209,7 @@ def _by_points(
     if board is None:
         _, first = np.unique(every, axis=0, return_index=True)
         board = _checked_board(every[np.sort(first)], where)
-    off, nearest = (np.asarray(each) for each in cKDTree(board).query(every))
+    off, nearest = cKDTree(board).query(every)
     lost = np.flatnonzero(~(off <= SAME * _size(board)))
     if lost.size:
         raise TargetError(
@@ -341,13 +324,12 @@ def candidates_of(camera: Camera, board: Array, pixels: Array, corner_px: float,
     lost = np.flatnonzero(~np.isfinite(found.squared_px[:, 0]))
     _check_rays(lost, camera, pixels, known, where)
     extent = np.sqrt(np.nanvar(np.where(known[..., None], pixels, np.nan), axis=1).sum(axis=1))
-    off = np.nan_to_num(found.reprojection_px[:, 0], nan=np.inf) / extent
-    if np.median(off) > FARTHEST:
-        missed = f"miss it by {100.0 * np.median(off):.0f} % of its size or more" if np.isfinite(np.median(off)) else ""
+    off = float(np.median(np.nan_to_num(found.reprojection_px[:, 0], nan=np.inf) / extent))
+    if off > FARTHEST:
+        missed = f"miss it by {100.0 * off:.0f} % of its size or more" if np.isfinite(off) else "have no pose of it"
         raise TargetError(
-            f"{where}: the corners do not belong to the board: half of the images {missed or 'have no pose of it'}; "
-            "give image_points in the order of board_points, and check its numbers of rows and columns, and whether "
-            "it is another board"
+            f"{where}: the corners do not belong to the board: half of the images {missed}; give image_points in the "
+            "order of board_points, and check its numbers of rows and columns, and whether it is another board"
         )
     if lost.size:
         raise CameraError(f"{where}: the corners of image {lost[0]} have no pose; are they on one line?")

@@ -248,7 +248,7 @@ def _is_unicode(name: str) -> bool:
 def _both(sides: dict[str, Path], folder: Path) -> tuple[Path, Path]:
     if len(sides) == 1:
         ((side, path),) = sides.items()
-        other = path.name.removesuffix(f"{side}.csv") + ("B.csv" if side == "A" else "A.csv")
+        other = f"{path.name.removesuffix(f'{side}.csv')}{'B' if side == 'A' else 'A'}.csv"
         raise FileFormatError(f"{folder / other} is missing: {path.name} is there, and a pair needs both files.")
     return sides["A"], sides["B"]
 

@@ -246,10 +246,7 @@ class KeptMeasurements:
         batches = self.batches
         stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
         return Measurements(
-            np.concatenate([b.A for b in batches]),
-            np.concatenate([b.B for b in batches]),
-            np.concatenate([b.sigma for b in batches]),
-            np.concatenate([b.kappa for b in batches]),
+            *(np.concatenate([getattr(b, name) for b in batches]) for name in ("A", "B", "sigma", "kappa")),
             np.concatenate(stamps) if len(stamps) == len(batches) else None,
             np.concatenate([b.covariance_of_B() for b in batches]) if self.has_covariances else None,
             self._pixels(),
@@ -303,12 +300,9 @@ class GivenMany:
 
         stamps = whole_stamps(given.stamps_ns, count, self.where)
         result = Sorted(
-            pairs=pairs,
-            first=np.r_[0, np.cumsum(number)],
-            A=chosen(raw.A),
-            B=chosen(raw.B),
-            sigma=chosen(raw.sigma) if raw.sigma.ndim else raw.sigma,
-            kappa=chosen(raw.kappa) if raw.kappa.ndim else raw.kappa,
+            pairs,
+            np.r_[0, np.cumsum(number)],
+            *(chosen(x) if x.ndim else x for x in (raw.A, raw.B, raw.sigma, raw.kappa)),
             given=order,
             source=f" ({given.source})" if given.source else "",
             stamps_ns=None if stamps is None else chosen(stamps),
@@ -344,10 +338,10 @@ class GivenMany:
             raise FrameError(f"{self.where}: {twice} is given twice; give each pair once")
         both = {pair.target for pair in pairs} & {pair.sensor for pair in pairs}
         if both:
-            number, pair = next((n, pair) for n, pair in enumerate(pairs) if pair.target in both)
+            number = next(number for number, pair in enumerate(pairs) if pair.target in both)
             raise FrameError(
-                f"{self.where}: {pair.target!r} is a target in pair {number} and a sensor in another one; names are "
-                "unique across targets and sensors"
+                f"{self.where}: {pairs[number].target!r} is a target in pair {number} and a sensor in another one; "
+                "names are unique across targets and sensors"
             )
         return tuple(pairs)
 

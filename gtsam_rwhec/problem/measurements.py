@@ -140,15 +140,8 @@ class GivenMeasurements:
                 )
             variances = np.einsum("nii->ni", covariances)
             sigma, kappa = np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
-        return Measurements(
-            A,
-            B,
-            positive_weights(sigma, len(A), "sigma", where),
-            positive_weights(kappa, len(A), "kappa", where),
-            stamps_ns,
-            covariances,
-            self.pixels,
-        )
+        sigma, kappa = (positive_weights(x, len(A), name, where) for name, x in (("sigma", sigma), ("kappa", kappa)))
+        return Measurements(A, B, sigma, kappa, stamps_ns, covariances, self.pixels)
 
 
 def positive_weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:
@@ -164,16 +157,12 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     if array.shape not in ((), (count,)) or count == 0 != array.ndim:
         many = f" or one for each of {count}" if count else ""
         raise CountError(f"{where}: {name} has shape {array.shape}; give one number{many}")
-    bad = np.flatnonzero(~((array > 0.0) & np.isfinite(array)))
+    bad = np.flatnonzero(~((array >= SMALLEST_WEIGHT) & (array <= LARGEST_WEIGHT)))
     if bad.size:
         index = f" of measurement {bad[0]}" if array.ndim else ""
-        raise NoiseError(f"{where}: {name}{index} is {array.flat[bad[0]]}; it must be positive and finite")
-    unlikely = np.flatnonzero((array < SMALLEST_WEIGHT) | (array > LARGEST_WEIGHT))
-    if unlikely.size:
-        value_there = array.flat[unlikely[0]]
         raise NoiseError(
-            f"{where}: {name} is {value_there:.3g}; give a number from {SMALLEST_WEIGHT:g} to "
-            f"{LARGEST_WEIGHT:g}. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
+            f"{where}: {name}{index} is {array.flat[bad[0]]}; it must be positive and finite: a number from "
+            f"{SMALLEST_WEIGHT:g} to {LARGEST_WEIGHT:g}. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
         )
     return array
 
@@ -185,9 +174,8 @@ def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.nd
     may have equal stamps.
     """
     stamps = whole_stamps(stamps_ns, count, where)
-    back = np.flatnonzero(np.diff(stamps) < 0) if stamps is not None else np.zeros(0, dtype=int)
-    if stamps is not None and back.size:
-        i = int(back[0]) + 1
+    if stamps is not None and (np.diff(stamps) < 0).any():
+        i = int(np.argmax(np.diff(stamps) < 0)) + 1
         raise StampError(
             f"{where}: stamp {i} ({stamps[i]} ns) is before the stamp ahead of it ({stamps[i - 1]} ns): rows are out "
             "of order, or a clock was set back. Sort the measurements by stamp; where a clock was set back, correct "

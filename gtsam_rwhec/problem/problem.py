@@ -409,8 +409,8 @@ class Problem(Knowledge):
         """Raise a MeasurementsNotKeptError where raw measurements, which ``what`` needs, were not kept."""
         if not self.has_measurements:
             raise MeasurementsNotKeptError(
-                f"{what} needs the raw measurements, and they were not kept (keep_measurements=False); make the "
-                "problem with keep_measurements=True"
+                f"{what} needs the raw measurements, and they were not kept: make the problem with "
+                "keep_measurements=True"
             )
 
     @property
@@ -435,13 +435,11 @@ class Problem(Knowledge):
             The problem was made with ``keep_measurements=False``.
         """
         pair = self._pair(target, sensor)
-        kept = self._kept[pair]
-        if kept.count != self._accumulator.count(pair):
+        if self._kept[pair].count != self._accumulator.count(pair):
             raise MeasurementsNotKeptError(
-                f"the raw measurements of {pair} were not kept (keep_measurements=False); "
-                "make the problem with keep_measurements=True"
+                f"the raw measurements of {pair} were not kept: make the problem with keep_measurements=True"
             )
-        return kept.joined()
+        return self._kept[pair].joined()
 
     def batches(self, target: str, sensor: str) -> tuple[Measurements, ...]:
         """Raw measurements of a pair as they were added, batch by batch, without a copy; only what was kept."""
@@ -468,8 +466,8 @@ class Problem(Knowledge):
         if self.scale != other.scale:
             raise OptionError(f"a problem with scale={self.scale!r} cannot join one with scale={other.scale!r}")
         merged = copy.copy(self)
-        merged.keep_measurements = self.keep_measurements and other.keep_measurements
-        merged.is_relative = self.is_relative or other.is_relative
+        merged.keep_measurements &= other.keep_measurements
+        merged.is_relative |= other.is_relative
         merged.sensor_carrier = self.sensor_carrier or other.sensor_carrier
         merged.target_carrier = self.target_carrier or other.target_carrier
         merged._take_knowledge(self)

@@ -119,14 +119,9 @@ def nearer_poses(
         if raw.pixels is None or raw.covariances is None or pair.target not in X or pair.sensor not in Y:
             continue
         camera = (cameras or {}).get(pair.sensor)
-        rows = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2)))
-        both = candidates_of(
-            camera or problem.cameras[pair.sensor],
-            problem.boards[pair.target],
-            raw.pixels[rows],
-            problem.corner_px or 0.1,
-            pair.label,
-        )
+        rows, board = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2))), problem.boards[pair.target]
+        intrinsics, corner_px = camera or problem.cameras[pair.sensor], problem.corner_px or 0.1
+        both = candidates_of(intrinsics, board, raw.pixels[rows], corner_px, pair.label)
         predicted = np.linalg.inv(Y[pair.sensor].matrix()) @ raw.A[rows] @ X[pair.target].matrix()
         T, covariance = both.chosen(both.nearer(predicted))
         changed = np.abs(T[:, :3, :3] - raw.B[rows, :3, :3]).max(axis=(1, 2)) > SAME_POSE

@@ -12,7 +12,7 @@ import numpy as np
 
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.file_record import FileRecord, Row
-from gtsam_rwhec.solver.answers import given_answer, given_translations
+from gtsam_rwhec.solver.answers import given_answer, given_poses
 from gtsam_rwhec.solver.certificate import Certificate, Multipliers
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.part_form import PartForm
@@ -83,7 +83,7 @@ def _spectrum(part: Part, solution: Solution, certificate: Certificate) -> dict[
         return {"rows": rows, "why_not": "the multipliers of the relaxation were not kept"}
     form = PartForm.of(part)
     given = given_answer(part, solution.X, solution.Y, solution.scale)
-    evaluation = form.evaluated(given, given_translations(part, solution.X, solution.Y))
+    evaluation = form.evaluated(given, given_poses(part, solution.X, solution.Y)[:, :3, 3])
     if not abs(evaluation.cost - certificate.cost) <= SAME_COST * certificate.cost + certificate.tolerance:
         return {"rows": rows, "why_not": OTHER}
     R = evaluation.point.rotations

@@ -108,13 +108,13 @@ def answer_of(part: Part, form: SearchForm, R: Array) -> Answer:
 def answer_at(part: Part, R: Array, numbers: Array, alpha: float) -> Answer:
     """The answer at values of the form's variables: R (n, 3, 3), numbers (n, 4) as [t, own scale], and alpha."""
     t, s = numbers[:, :3], numbers[:, 3]
-    owners = set(part.scale_owners)
-    own = np.array([name in owners for name in part.free], dtype=bool)
     own_scale = np.full(len(R), np.nan)
     if part.kind == "direct":
         scale = alpha if part.scale == "shared" else 1.0
         return Answer(R, t / scale if scale else t, own_scale, scale)
     with np.errstate(divide="ignore"):
+        owners = frozenset(part.scale_owners)
+        own = np.array([name in owners for name in part.free], dtype=bool)
         own_scale[own] = 1.0 / s[own]
         scale = float(1.0 / np.float64(alpha)) if part.scale == "shared" else 1.0
     inverse_R = R.transpose(0, 2, 1)
@@ -155,33 +155,28 @@ def given_answer(
     part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float]
 ) -> Answer:
     """The user's poses as an answer, about the part's gauge."""
-    transforms = []
-    for name in part.free:
-        poses, what = (X, "X") if name in part.targets else (Y, "Y")
-        transforms.append(one_transform(poses[name], f"{what}[{name!r}]"))
-    stacked = np.array(transforms).reshape(-1, 4, 4)
+    stacked = given_poses(part, X, Y)
     shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
-    own = np.full(len(part.free), np.nan)
-    for i, name in enumerate(part.free):
-        if name in part.scale_owners:
-            own[i] = _scale_of(name, scale)
+    owners = set(part.scale_owners)
+    own = np.array([_scale_of(name, scale) if name in owners else np.nan for name in part.free])
     shared = checked_scale(scale, "the answer's scale of all targets") if part.scale == "shared" else 1.0
     return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
 
 
-def given_translations(part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]) -> Array:
-    """The translations (n, 3) of the user's poses as they were given, in metres about the user's origin."""
-    poses = [(X if name in part.targets else Y)[name] for name in part.free]
-    return np.array([one_transform(pose, "the answer")[:3, 3] for pose in poses]).reshape(-1, 3)
+def given_poses(part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]) -> Array:
+    """The user's poses of the free frames (n, 4, 4) as they were given, in metres about the user's origin."""
+    of_frames = [(X, "X") if name in part.targets else (Y, "Y") for name in part.free]
+    poses = [
+        one_transform(of[name], f"{what}[{name!r}]") for name, (of, what) in zip(part.free, of_frames, strict=True)
+    ]
+    return np.array(poses).reshape(-1, 4, 4)
 
 
 def _scale_of(name: str, scale: float | Mapping[str, float]) -> float:
     """A frame's own scale: its entry, or the one number for all."""
-    if isinstance(scale, Mapping):
-        if name not in scale:
-            raise ScaleError(f"the answer's scale lacks {name}; it has {', '.join(map(shown, scale)) or 'nothing'}")
-        return checked_scale(scale[name], f"the answer's scale of {name}")
-    return checked_scale(scale, f"the answer's scale of {name}")
+    if isinstance(scale, Mapping) and name not in scale:
+        raise ScaleError(f"the answer's scale lacks {name}; it has {', '.join(map(shown, scale)) or 'nothing'}")
+    return checked_scale(scale[name] if isinstance(scale, Mapping) else scale, f"the answer's scale of {name}")
 
 
 @dataclass(frozen=True, slots=True)

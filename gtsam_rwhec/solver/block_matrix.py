@@ -22,6 +22,8 @@ from gtsam_rwhec.solver.elimination import Elimination, Group
 AT_ONCE = 1_000_000
 #: Up to this many numbers are summed one by one.
 FEW_NUMBERS = 4096
+#: Of up to this many rows it is asked whether each is named once.
+FEW_ROWS = 64
 #: `AT_ONCE` for frames with the same neighbours: these numbers fit in the processor's cache.
 ALIKE_AT_ONCE = 100_000
 
@@ -88,29 +90,28 @@ class BlockMatrix:
         return (slice(begin, begin + step) for begin in range(0, len(self.couplings), step))
 
     def times(self, v: Array) -> Array:
-        """A v for v (n m + q,)."""
-        return self._product(v, self.frames, self.couplings, self.tails, self.tail)
+        """A v for v (n m + q,) or columns (n m + q, D), in the precision of v."""
+        return self._product(v, absolute=False)
 
     def sizes(self, v: Array) -> Array:
         """|A| |v|."""
-        return self._product(
-            np.abs(v), np.abs(self.frames), self.couplings, np.abs(self.tails), np.abs(self.tail), True
-        )
+        return self._product(np.abs(v), absolute=True)
 
-    def _product(
-        self, v: Array, frames: Array, couplings: Array, tails: Array, tail: Array, absolute: bool = False
-    ) -> Array:
+    def _product(self, v: Array, *, absolute: bool) -> Array:
+        def of(blocks: Array) -> Array:
+            return (np.abs(blocks) if absolute else blocks).astype(v.dtype, copy=False)
+
         n, m, _ = self.tails.shape
-        of_frames, of_tail = v[: n * m].reshape(n, m), v[n * m :]
-        result = np.matmul(frames, of_frames[:, :, None])[:, :, 0] + tails @ of_tail
-        last = tail @ of_tail + np.einsum("niq,ni->q", tails, of_frames)
+        columns, D = (v[:, None], 1) if v.ndim == 1 else (v, v.shape[1])
+        of_frames, of_tail, tails = columns[: n * m].reshape(n, m, D), columns[n * m :], of(self.tails)
+        result = np.matmul(of(self.frames), of_frames) + tails @ of_tail
+        last = of(self.tail) @ of_tail + np.einsum("niq,nid->qd", tails, of_frames)
         first, second = self.ends
         for at in self._portions():
-            blocks = np.abs(couplings[at]) if absolute else couplings[at]
-            sum_into(result, first[at], np.matmul(blocks, of_frames[second[at], :, None])[:, :, 0])
-            sum_into(result, second[at], np.matmul(of_frames[first[at], None, :], blocks)[:, 0])
-        whole: Array = np.concatenate([result.ravel(), last])
-        return whole
+            blocks = of(self.couplings[at])
+            sum_into(result, first[at], np.matmul(blocks, of_frames[second[at]]))
+            sum_into(result, second[at], np.matmul(blocks.transpose(0, 2, 1), of_frames[first[at]]))
+        return np.concatenate([result.reshape(n * m, D), last]).reshape(v.shape)
 
     def dense(self) -> Array:
         """As one array; for small matrices."""
@@ -315,6 +316,9 @@ def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.
     Rows may be named more than once.
     """
     k = len(index)
+    if k <= FEW_ROWS and len(set(index.tolist())) == k:
+        result[index] += factor * values if factor != 1.0 else values
+        return
     if values.size <= FEW_NUMBERS:
         np.add.at(result, index, factor * values if factor != 1.0 else values)
         return

@@ -69,11 +69,11 @@ class Room:
     @staticmethod
     def largest(Z: Curvature, scale: Array, value: float) -> Room | None:
         """The largest room that is proven; the margins tried are fractions of a diagonal ``scale`` (13 n + 1,)."""
-        for margin in (*(np.maximum(part * scale, 1e-290) for part in ROOMS), 0.25 * Z.allowance(scale)):
-            proven = Room.of(Z, margin, value)
+        for part in ROOMS:
+            proven = Room.of(Z, np.maximum(part * scale, 1e-290), value)
             if proven is not None:
                 return proven
-        return None
+        return Room.of(Z, 0.25 * Z.allowance(scale), value)
 
     @cached_property
     def _factor(self) -> BlockFactor | None:
@@ -249,10 +249,12 @@ class _Lagrangian:
         if self.is_homogeneous:
             return self._definite_but_for_the_point()
         room = self._room(self.Z)
-        if room is None:
-            return None
-        lower, value = self._lower(NullVectors.none(self.Z.size), room, None)
-        return Bound(lower, value, True, True, float(room.margin.min()), None, None)
+        return None if room is None else self._bound_of_definite(NullVectors.none(self.Z.size), room)
+
+    def _bound_of_definite(self, nulls: NullVectors, room: Room) -> Bound:
+        return Bound(
+            *self._lower(nulls, room, None), definite=True, semidefinite=True, eigenvalue=float(room.margin.min())
+        )
 
     def _definite_but_for_the_point(self) -> Bound | None:
         """The better of two bounds: from the multipliers, and from those that make the gradient vanish along x."""
@@ -265,9 +267,8 @@ class _Lagrangian:
             room = None if of_each is None else each._room(each.Z.with_held(of_each.held))
             if of_each is None or room is None:
                 continue
-            lower, value = each._lower(of_each, room, None)
-            bounds.append(Bound(lower, value, True, True, float(room.margin.min()), None, None))
-            if self.value - lower <= NEGLIGIBLE * abs(self.value):
+            bounds.append(each._bound_of_definite(of_each, room))
+            if self.value - bounds[-1].lower_bound <= NEGLIGIBLE * abs(self.value):
                 break
         return max(bounds, key=lambda bound: bound.lower_bound, default=None)
 
@@ -364,7 +365,9 @@ class _Lagrangian:
 
     def _lower(self, nulls: NullVectors, room: Room, region: Region | None) -> tuple[float, float]:
         """The lower bound, rounded down; and the same without any allowance for rounding: that of exact arithmetic."""
-        width = half_widths(self.form.part, self.evaluation.point, region or Region(0.0, 0.0))[nulls.held]
+        width = np.zeros(0)
+        if len(nulls.held):
+            width = half_widths(self.form.part, self.evaluation.point, region or Region(0.0, 0.0))[nulls.held]
         roots = np.array(root_of_loss(room, self.g, self.g_error, nulls.held))
         each = [root_of_loss(room, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held) for k in range(len(nulls.held))]
         of_nulls = np.array(each).reshape(-1, 2).T

@@ -7,7 +7,7 @@ the leaves. When the remaining frames are few, or almost all pairs of them are c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -158,8 +158,7 @@ class _Ordering:
             left = int(self.alive.sum())
             if left <= few or len(self.current) >= DENSE * left * (left - 1) / 2:
                 break
-            chosen = self._chosen()
-            groups += self._eliminated(chosen)
+            groups += self._eliminated(self._chosen())
         total = len(self.first)
         changed = np.full(total, total)
         changed[self.is_changed] = np.arange(int(self.is_changed.sum()))
@@ -169,9 +168,7 @@ class _Ordering:
             flipped = neighbours < frames[:, None]
             edges = order.couplings_of(np.minimum(frames[:, None], neighbours), np.maximum(frames[:, None], neighbours))
             made.append(Group(frames, neighbours, edges, flipped, are_alike))
-        return Elimination(
-            self.n, self.first, self.second, self.given, changed, tuple(made), np.flatnonzero(self.alive)
-        )
+        return replace(order, groups=tuple(made))
 
     def _chosen(self) -> np.ndarray:
         """Frames without couplings between them, each with fewer neighbours than its neighbours have."""

@@ -184,13 +184,11 @@ def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) 
 
 def rounding_of_fixed(part: Part) -> Array:
     """Bound on the rounding of a fixed frame's translation about the gauge, where alpha multiplies it, (E, 2, 3)."""
-    result = np.zeros((len(part.pairs), 2, 3))
-    if part.is_scaled and part.fixed:
-        for e, pair in enumerate(part.pairs):
-            for side, name in enumerate(pair):
-                if name in part.fixed:
-                    shift = np.abs(part.frame_shift(name))
-                    result[e, side] = 2.0 * gamma(1) * (np.abs(part.fixed[name][:3, 3]) + 2.0 * shift)
+    of_frames = np.zeros((len(part.free) + len(part.fixed), 3))
+    if part.is_scaled:
+        for i, (name, T) in enumerate(part.fixed.items(), start=len(part.free)):
+            of_frames[i] = 2.0 * gamma(1) * (np.abs(T[:3, 3]) + 2.0 * np.abs(part.frame_shift(name)))
+    result: Array = of_frames[part.ends]
     return result
 
 

@@ -87,21 +87,19 @@ class Identifiability:
         )
 
     def __str__(self) -> str:
-        alone = sum(pair.is_unique for pair in self.pairs.values())
         if not self.is_unique:
             number = len(self.free_directions)
             return f"The measurements leave {number} direction{'s' if number > 1 else ''} free; see free_directions."
-        if len(self.pairs) == 1:
+        alone, number = sum(pair.is_unique for pair in self.pairs.values()), len(self.pairs)
+        if number == 1:
             return "The pair's measurements determine both of its frames."
-        if alone:
-            number = len(self.pairs)
-            if alone == number:
-                which = f"Each of the {number} pairs determines its own frames"
-            else:
-                own = "determines its own frames" if alone == 1 else "determine their own frames"
-                which = f"{alone} of {number} pairs {own}, and the other pairs connect the rest to them"
-            return f"{which}, so every frame is determined (RWHEC paper, Theorem 3)."
-        return "No pair determines its frames on its own; together the pairs determine every frame."
+        if not alone:
+            return "No pair determines its frames on its own; together the pairs determine every frame."
+        which = f"Each of the {number} pairs determines its own frames"
+        if alone < number:
+            own = "determines its own frames" if alone == 1 else "determine their own frames"
+            which = f"{alone} of {number} pairs {own}, and the other pairs connect the rest to them"
+        return f"{which}, so every frame is determined (RWHEC paper, Theorem 3)."
 
 
 def typical_length(part: Part) -> float:
@@ -158,8 +156,8 @@ class PairsAlone:
 
     def reason(self, e: int) -> FreeReason:
         """Why a direction of a pair is free."""
-        of_pair = int(self.axes[e]), float(self.turned_rad[e]), float(self.residual_rad[e]), int(self.counts[e])
-        return reason_for(*of_pair)
+        of_noise = float(self.turned_rad[e]), float(self.residual_rad[e])
+        return reason_for(int(self.axes[e]), *of_noise, int(self.counts[e]))
 
     def reasons_of_frames(self) -> Mapping[str, FreeReason]:
         """A frame has the reason of its pair that turned about most axes; of several such pairs, of the last one."""

@@ -137,20 +137,8 @@ def pair_information(part: Part, poses: PairPoses) -> PairInformation:
     used[:, 7:13] = free[:, 1, None]
     used[:, SHARED] = part.scale == "shared"
     used[:, OWN_X], used[:, 13] = owns & ~motion, owns & motion
-    return PairInformation(
-        kappa=moments.kappa,
-        weight=moments.weight,
-        alpha=poses.alpha,
-        R_Y=poses.R_Y,
-        turned=turned,
-        arm=arm,
-        along=along,
-        lever=lever,
-        lever_squares=lever_squares,
-        used=used,
-        motion=motion,
-        owns=owns,
-    )
+    sums = turned, arm, along, lever, lever_squares
+    return PairInformation(moments.kappa, moments.weight, poses.alpha, poses.R_Y, *sums, used, motion, owns)
 
 
 def order_of(part: Part) -> Elimination:

@@ -34,22 +34,16 @@ FREE = 1e-9
 
 def own_curvature(whole: PartForm, multipliers: Array) -> Array:
     """The smallest mu (n,) with Z v = mu Q v for vectors v of one frame alone. Where mu < 0, Z is surely negative."""
-    own, inner = _own_blocks(whole)
+    own = whole.full.frames
+    inner = own[:, :4, :4].copy()  # of translation and scale, made invertible
+    diagonal = np.einsum("nii->ni", inner)
+    diagonal[...] = (1.0 + FREE) * diagonal + (diagonal == 0.0)
     M = own[:, 4:, 4:] - np.matmul(own[:, 4:, :4], np.linalg.solve(inner, own[:, :4, 4:]))
     Lambda = multiplier_blocks(multipliers)[0][:, :9, :9]
     values, vectors = np.linalg.eigh(0.5 * (M + M.transpose(0, 2, 1)))
     root = vectors / np.sqrt(np.maximum(values, 1e-9 * np.abs(values).max(axis=1, initial=1e-290)[:, None]))[:, None, :]
     smallest: Array = 1.0 - np.linalg.eigvalsh(root.transpose(0, 2, 1) @ Lambda @ root)[:, -1]
     return smallest
-
-
-def _own_blocks(whole: PartForm) -> tuple[Array, Array]:
-    """Each frame's own block of Q (n, 13, 13), and its part of translation and scale (n, 4, 4), made invertible."""
-    own = whole.full.frames
-    inner = own[:, :4, :4].copy()
-    diagonal = np.einsum("nii->ni", inner)
-    diagonal[...] = (1.0 + FREE) * diagonal + np.where(diagonal == 0.0, 1.0, 0.0)
-    return own, inner
 
 
 #: Fractions of Q's diagonal that are added to Q and to Z, because translations and scales may be free.

@@ -363,8 +363,8 @@ class MeasuredForm:
         for d in directions:
             at = slice(12 * d, 12 * d + 12)
             value = _by_pair(*(each[..., at] for each in sums.by_features), 1.0)
-            error = _by_pair(*(each[..., at] for each in sums.by_features_error), -1.0)
-            error += gamma(8) * _by_pair(*(np.abs(each[..., at]) for each in sums.by_features), -1.0)
+            bounds = zip(sums.by_features, sums.by_features_error, strict=True)
+            error = _by_pair(*(bound[..., at] + gamma(8) * np.abs(of[..., at]) for of, bound in bounds), -1.0)
             shares = 0.5 * self.slots.summed(value * factor, at_pairs)
             slack = 0.5 * self.slots.summed((error + gamma(E + 40) * np.abs(value)) * np.abs(factor), at_pairs)
             of_fixed = self._of_fixed[at_pairs]

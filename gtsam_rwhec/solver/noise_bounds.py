@@ -102,17 +102,15 @@ def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]
     In the worst case all unknowns were fitted to the translations, and all rotations to the rotations.
     """
     N, rotations = part.number_of_measurements, 3 * len(part.free)
-    worst = float(3 * N - part.number_of_unknowns), float(3 * N - rotations)
-    if worst[0] >= PLENTY:
-        return worst
+    worst = max(float(3 * N - part.number_of_unknowns), 0.0), max(float(3 * N - rotations), 0.0)
     used = told.used
-    if used.sum() > DENSE_PARAMETERS:
-        return max(worst[0], 0.0), max(worst[1], 0.0)
+    if worst[0] >= PLENTY or used.sum() > DENSE_PARAMETERS:
+        return worst
     I_R, I_t = (each.dense()[used][:, used] for each in (told.rotation, told.translation))
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(I_R) + np.diagonal(I_t), 1e-300))
     I_R, I_t = I_R * unit[:, None] * unit, I_t * unit[:, None] * unit
     if not np.isfinite(I_R + I_t).all():  # lengths or scales whose squares overflow
-        return max(worst[0], 0.0), max(worst[1], 0.0)
+        return worst
     values, vectors = np.linalg.eigh(I_R + I_t)
     known = values > ROUNDING * values.max(initial=0.0)
     root = vectors[:, known] / np.sqrt(values[known])

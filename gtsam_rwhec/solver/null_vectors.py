@@ -60,19 +60,13 @@ class NullVectors:
     @staticmethod
     def none(size: int) -> NullVectors:
         """No direction."""
-        nothing, columns = np.zeros(0), np.zeros((size, 0))
-        return NullVectors(
-            np.zeros(0, dtype=int), columns, columns, columns, nothing, nothing, np.zeros((0, 0)), np.zeros((0, 0))
-        )
+        held, nothing, columns, square = np.zeros(0, dtype=int), np.zeros(0), np.zeros((size, 0)), np.zeros((0, 0))
+        return NullVectors(held, columns, columns, columns, nothing, nothing, square, square)
 
     def without_errors(self) -> NullVectors:
         """The same, as if nothing had been rounded."""
-        return replace(
-            self,
-            ZV_error=np.zeros_like(self.ZV_error),
-            Vg_error=np.zeros_like(self.Vg_error),
-            VZV_error=np.zeros_like(self.VZV_error),
-        )
+        errors = {name: np.zeros_like(getattr(self, name)) for name in ("ZV_error", "Vg_error", "VZV_error")}
+        return replace(self, **errors)
 
 
 def point_as_null_vector(

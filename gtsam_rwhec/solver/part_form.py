@@ -60,11 +60,9 @@ def newton_step(curvature: Curvature, evaluation: Evaluation) -> Point | None:
     by_frame = step[:-1].reshape(n, 7)
     reach = max(float(np.abs(point.numbers[:, :3]).max(initial=0.0)), 1e-9)
     scales = np.append(point.numbers[:, 3], point.alpha)
-    change = np.abs(np.append(by_frame[:, 3], step[-1])) / np.maximum(np.abs(scales), 1e-290)
-    longest = max(
-        np.abs(by_frame[:, 4:]).max(initial=0.0), np.abs(by_frame[:, :3]).max(initial=0.0) / reach, change.max()
-    )
-    if not longest <= LONGEST:
+    of_scales = np.append(by_frame[:, 3], step[-1]) / np.maximum(np.abs(scales), 1e-290)
+    lengths = np.r_[by_frame[:, 4:].ravel(), by_frame[:, :3].ravel() / reach, of_scales]
+    if not np.abs(lengths).max() <= LONGEST:
         return None
     numbers = point.numbers.copy()
     numbers[:, :4] -= by_frame[:, :4]

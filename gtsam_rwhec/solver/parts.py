@@ -176,26 +176,15 @@ def parts_of(problem: Problem) -> list[Part]:
 
 def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
     """The frames of each connected part of the graph, in order of first appearance."""
-    place: dict[str, int] = {}
-    above: list[int] = []  # nearer to the first frame of the component
+    members: dict[str, list[str]] = {}
     for pair in pairs:
-        for name in pair:
-            if name not in place:
-                place[name] = len(above)
-                above.append(len(above))
-        # Rem's algorithm (Patwary, Blair, Manne 2010): climb from both frames at once, and join the trees on the way.
-        low, high = place[pair[0]], place[pair[1]]
-        while above[low] != above[high]:
-            if above[low] < above[high]:
-                low, high = high, low
-            next_up, above[low] = above[low], above[high]
-            if next_up == low:
-                break
-            low = next_up
+        few, many = sorted((members.setdefault(name, [name]) for name in pair), key=len)
+        if few is not many:
+            many += few
+            members |= dict.fromkeys(few, many)
     components: dict[int, list[str]] = {}
-    for name, i in place.items():
-        above[i] = above[above[i]]
-        components.setdefault(above[i], []).append(name)
+    for name, component in members.items():
+        components.setdefault(id(component), []).append(name)
     return list(components.values())
 
 

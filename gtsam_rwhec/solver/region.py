@@ -78,14 +78,10 @@ def extent_of(part: Part, point: Point) -> float:
 
     Where the measurements were not kept, it is an estimate for unequal weights.
     """
-    moments, scale = part.moments, np.ones(len(part.pairs))
+    moments, scale = part.moments, part.known_scales.copy()
     if part.scale == "shared":
         scale[:] = abs(point.alpha) if part.kind == "direct" else 1.0 / abs(point.alpha)
-    for e, (target, _) in enumerate(part.pairs):
-        if target in part.scale_owners:
-            scale[e] = 1.0 / abs(point.numbers[part.free.index(target), 3])
-        elif target in part.fixed_scales:
-            scale[e] = part.fixed_scales[target]
+    scale[part.owns_scale] = 1.0 / np.abs(point.numbers[part.ends[part.owns_scale, 0], 3])
     reach = np.linalg.norm(point.numbers[:, :3], axis=1).max(initial=0.0)
     largest = [reach / scale[0] if part.kind == "direct" else reach]
     if part.given is None:

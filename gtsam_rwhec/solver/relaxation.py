@@ -99,22 +99,11 @@ def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: P
             break  # double precision ends here
         if max(a_primal, a_dual) < 1e-6:
             break
-        point = _Point(
-            point.X + a_primal * step.X,
-            point.multipliers + a_dual * step.multipliers,
-            point.gamma + a_dual * step.gamma,
-            point.Z + a_dual * step.Z,
-        )
+        multipliers, gamma = point.multipliers + a_dual * step.multipliers, point.gamma + a_dual * step.gamma
+        point = _Point(point.X + a_primal * step.X, multipliers, gamma, point.Z + a_dual * step.Z)
     X = point.X / point.X[-1, -1]
-    return Relaxation(
-        X,
-        scale * point.multipliers,
-        0.0,
-        scale * float(np.vdot(C, X)),
-        scale * point.gamma,
-        iteration,
-        Start.INTERIOR_POINT,
-    )
+    primal, dual = scale * float(np.vdot(C, X)), scale * point.gamma
+    return Relaxation(X, scale * point.multipliers, 0.0, primal, dual, iteration, Start.INTERIOR_POINT)
 
 
 @dataclass(frozen=True)
@@ -202,9 +191,7 @@ def _step_length(S: Array, dS: Array, fraction: float) -> float:
     lower = np.linalg.cholesky(S + 1e-16 * np.trace(S) * np.eye(len(S)))
     half = scipy.linalg.solve_triangular(lower, dS, lower=True, check_finite=False)
     inner = scipy.linalg.solve_triangular(lower, half.T, lower=True, check_finite=False)
-    smallest = float(
-        scipy.linalg.eigvalsh(_symmetric(inner), subset_by_index=[0, 0], check_finite=False, driver="evr")[0]
-    )
+    smallest = scipy.linalg.eigvalsh(_symmetric(inner), subset_by_index=[0, 0], check_finite=False, driver="evr").item()
     return 1.0 if smallest >= -fraction else fraction / -smallest
 
 
@@ -243,15 +230,8 @@ def solve_with_scale(Q: Array, row: Array, spread: float, tolerance: float, max_
 
 def _relaxation(Q: Array, X: Array, y: Array, scale: float, nu: float, iterations: int) -> Relaxation:
     n = (len(Q) - 1) // 9
-    return Relaxation(
-        X,
-        scale * y[: 20 * n].reshape(n, 20),
-        nu,
-        float(np.vdot(Q, X)),
-        scale * float(y[20 * n]),
-        iterations,
-        Start.CLARABEL,
-    )
+    multipliers, primal, dual = scale * y[: 20 * n].reshape(n, 20), float(np.vdot(Q, X)), scale * float(y[20 * n])
+    return Relaxation(X, multipliers, nu, primal, dual, iterations, Start.CLARABEL)
 
 
 def _clarabel(C: Array, n: int, tolerance: float, max_iterations: int) -> tuple[Array, Array, int]:

@@ -140,15 +140,17 @@ def small_stacks(measured: Measured) -> Iterator[Stack]:
             count += 1
         taken, small = small[:count], small[count:]
         filled = np.arange(longest) < np.array([len(raw.A) for _, raw in taken])[:, None]
-        A: Array = np.zeros((count, longest, 12))
-        B: Array = np.zeros((count, longest, 12))
-        weight: Array = np.zeros((count, longest))
-        kappa: Array = np.zeros((count, longest))
-        A[filled] = _rows(np.concatenate([raw.A for _, raw in taken]))
-        B[filled] = _rows(np.concatenate([raw.B for _, raw in taken]))
-        weight[filled] = 1.0 / np.concatenate([raw.sigma for _, raw in taken]) ** 2
-        kappa[filled] = np.concatenate([raw.kappa for _, raw in taken])
-        yield Stack(np.array([pair for pair, _ in taken]), A, B, weight, kappa)
+
+        def padded(values: Array, filled: np.ndarray = filled) -> Array:
+            result = np.zeros((*filled.shape, *values.shape[1:]))
+            result[filled] = values
+            return result
+
+        A, B, sigma, kappa = (
+            np.concatenate([getattr(raw, name) for _, raw in taken]) for name in ("A", "B", "sigma", "kappa")
+        )
+        pairs = np.array([pair for pair, _ in taken])
+        yield Stack(pairs, padded(_rows(A)), padded(_rows(B)), padded(1.0 / sigma**2), padded(kappa))
 
 
 def _rows(T: Array) -> Array:
@@ -204,9 +206,10 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
             reach = _reach(poses)[:, :, None] * one_error
             of_errors.append(reach + rounding[:, :, None] * (of_ones * root).reshape(k, 1, outputs))
         values, bounds = (square, *of_poses, np.ones(m) @ flat), (error, *of_errors, one_error[:, 0])
-        for table, bound, size, value, of_value in zip(tables, errors, sizes, values, bounds, strict=True):
+        rows = places, *[stack.pairs] * 3
+        for at, table, bound, size, value, of_value in zip(rows, tables, errors, sizes, values, bounds, strict=True):
             for whole, of_stack in ((table, value), (bound, of_value), (size, np.abs(value))):
-                sum_into(whole, places if len(whole) == 1 else stack.pairs, of_stack)
+                sum_into(whole, at, of_stack)
     for bound, size in zip(errors, sizes, strict=True):
         bound += gamma(number + 2) * size
         bound *= 1.0 + 1e-9

@@ -167,14 +167,9 @@ class Search:
         return answer_of(self.part, self.form, R).has_positive_scales
 
     def _relax(self) -> Relaxation:
-        options = self.options
+        limits = self.options.relaxation_tolerance, self.options.max_relaxation_iterations
         with self.stages.of("semidefinite relaxation"):
-            return solve_relaxation(
-                self.whole.reduced.Q,
-                options.relaxation_tolerance,
-                options.max_relaxation_iterations,
-                self.stages.progress,
-            )
+            return solve_relaxation(self.whole.reduced.Q, *limits, self.stages.progress)
 
     @property
     def form(self) -> SearchForm:
@@ -198,15 +193,12 @@ class Search:
         zero = OF_MOMENTS if self.part.given is None else OF_MEASUREMENTS
         # At rest a motion's equation cancels in the form, and its terms are of the size of kappa.
         magnitude = max(self.form.magnitude, float(self.part.moments.kappa.sum()))
-        floor = zero * self.form.size * magnitude + OF_ORIGIN * self._of_origin + 1e-250
-        return max(self.options.relative_tolerance * cost, floor)
-
-    @property
-    def _of_origin(self) -> float:
-        """The term that the gauge removed, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded relative to its size."""
+        # The term that the gauge removed, sum (|a|^2 + |c|^2) / sigma^2: poses are rounded relative to its size.
         gauge = self.part.gauge
         squares = float((gauge.sensor_carrier**2).sum() + (gauge.target_carrier**2).sum())
-        return float(self.part.moments.weight.sum()) * squares
+        of_origin = float(self.part.moments.weight.sum()) * squares
+        floor = zero * self.form.size * magnitude + OF_ORIGIN * of_origin + 1e-250
+        return max(self.options.relative_tolerance * cost, floor)
 
     @property
     def rounding(self) -> float:
@@ -279,20 +271,20 @@ class Attempt:
         """Bound the optimum at the best point: KKT multipliers, then all constraints', then the relaxation's."""
         if self.certify_by_kkt():
             return True
-        evaluation = self.reached[1]
-        R, gradient = evaluation.point.rotations, _by_rotations(evaluation)
-        kkt = kkt_multipliers(R, gradient)
+        evaluation, kkt = self.reached[1], self._kkt()
         with self.stages.of("small dual"):
             if self.search.is_large:
                 self._local = improve_locally(self.search.whole, evaluation, kkt, self.search.options.max_dense_frames)
                 multipliers, is_better = self._local.multipliers, self._local.t > 0.0
             else:
-                (multipliers, _), is_better = improve(self.search.whole.reduced.Q, R, kkt), True
+                (multipliers, _), is_better = (
+                    improve(self.search.whole.reduced.Q, evaluation.point.rotations, kkt),
+                    True,
+                )
             if is_better:
                 self._add(Multipliers.ALL_CONSTRAINTS, multipliers)
-        if self.is_closed or relaxation is None:
-            return self.is_closed
-        self._add_of_relaxation(relaxation.multipliers)
+        if relaxation is not None and not self.is_closed:
+            self._add_of_relaxation(relaxation.multipliers)
         return self.is_closed
 
     def certify_by_kkt(self) -> bool:
@@ -300,7 +292,7 @@ class Attempt:
         if self.bound is not NOTHING_YET:
             return self.is_closed
         with self.stages.of("dual certificate"):
-            self._add_kkt()
+            self._add(Multipliers.KKT, self._kkt())
             for _ in range(STEPS_ALONG_FREE_DIRECTIONS):
                 if self.bound.step is None:
                     break
@@ -308,7 +300,7 @@ class Attempt:
                 if not (evaluation.cost < self.reached[1].cost and answer.has_positive_scales):
                     break
                 self._reached, self.bound = (answer, evaluation), NOTHING_YET
-                self._add_kkt()
+                self._add(Multipliers.KKT, self._kkt())
         return self.is_closed
 
     def run_locally(self) -> Found:
@@ -324,9 +316,8 @@ class Attempt:
             local, evaluation = self._local, self.reached[1]
             if local is None or local.form is None:
                 break
-            kkt = kkt_multipliers(evaluation.point.rotations, _by_rotations(evaluation))
             with self.stages.of("semidefinite relaxation"):
-                relaxation = relax_locally(evaluation, kkt, local.form, search.options, self.stages.progress)
+                relaxation = relax_locally(evaluation, self._kkt(), local.form, search.options, self.stages.progress)
             if self.descend(relaxation.starts, Start.LOCAL_RELAXATION):
                 continue
             if self.descend(search.random_starts(search.options.random_starts), Start.BETTER):
@@ -352,15 +343,14 @@ class Attempt:
     def _add_of_relaxation(self, multipliers: Array) -> None:
         """Add the bounds from a relaxation's multipliers (n, 20), and from the nearest ones with a zero gradient."""
         evaluation = self.reached[1]
-        R, gradient = evaluation.point.rotations, _by_rotations(evaluation)
+        stationary = stationary_multipliers(_by_rotations(evaluation), evaluation.point.rotations, multipliers)
         with self.stages.of("dual certificate"):
-            self._add(Multipliers.RELAXATION, stationary_multipliers(gradient, R, multipliers))
+            self._add(Multipliers.RELAXATION, stationary)
             self._add(Multipliers.RELAXATION, multipliers)
 
-    def _add_kkt(self) -> None:
-        """Add the bound from the multipliers of R'R = I, at the answer reached."""
-        evaluation = self.reached[1]
-        self._add(Multipliers.KKT, kkt_multipliers(evaluation.point.rotations, _by_rotations(evaluation)))
+    def _kkt(self) -> Array:
+        """The multipliers (n, 20) of R'R = I, at the answer reached."""
+        return kkt_multipliers(self.reached[1].point.rotations, _by_rotations(self.reached[1]))
 
     def look_elsewhere(self) -> bool:
         """Search for a lower critical point: along the negative curvature of Z, from eigenvectors of Q', at random.

@@ -177,8 +177,7 @@ def maximise(
         direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * P
         # The damped step is safe and short; a step four times as long mostly stays inside too. No step is longer than
         # Newton's: longer ones oscillate about the centre without end.
-        length = min(1.0, 4.0 / (1.0 + decrement))
-        length = _stay_inside(Z - t * P, direction, length)
+        length = _stay_inside(Z - t * P, direction, min(1.0, 4.0 / (1.0 + decrement)))
         y = y + length * step[:-1]
         t += length * step[-1]
         if decrement < 0.5:

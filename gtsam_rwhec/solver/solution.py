@@ -23,7 +23,7 @@ from gtsam_rwhec.solver.answers import (
     as_point,
     costs_of_pairs,
     given_answer,
-    given_translations,
+    given_poses,
     residuals_of_pairs,
     rotations_as_variables,
     scales_of,
@@ -77,14 +77,9 @@ class Solution:
     @property
     def counts(self) -> str:
         """The size of the problem: "16 targets, 8 sensors, 73 pairs, 3230 measurements"."""
-        measurements = sum(residual.number_of_measurements for residual in self.residuals.values())
-        counts = (
-            (len(self.X), "target"),
-            (len(self.Y), "sensor"),
-            (len(self.residuals), "pair"),
-            (measurements, "measurement"),
-        )
-        return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts)
+        of_pairs = [residual.number_of_measurements for residual in self.residuals.values()]
+        counts = {"target": len(self.X), "sensor": len(self.Y), "pair": len(of_pairs), "measurement": sum(of_pairs)}
+        return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for word, number in counts.items())
 
     def __str__(self) -> str:
         if isinstance(self.scale, dict):
@@ -107,18 +102,16 @@ def contradicted_by(cost: float, degrees_of_freedom: int) -> float | None:
 
     With true weights, twice the cost is a chi-square with ``degrees_of_freedom``, equations minus unknowns.
     """
-    if degrees_of_freedom <= 0:
-        return None
-    ratio = cost / (0.5 * degrees_of_freedom)
-    return ratio if ratio > UNLIKELY and chdtrc(degrees_of_freedom, 2.0 * cost) < CHANCE else None
+    ratio = 2.0 * cost / max(degrees_of_freedom, 1)
+    is_sure = degrees_of_freedom > 0 and chdtrc(degrees_of_freedom, 2.0 * cost) < CHANCE
+    return ratio if is_sure and ratio > UNLIKELY else None
 
 
 def overstated_by(cost: float, degrees_of_freedom: int) -> float | None:
     """The cost over its expectation, where it is surely far too small: the noise that was stated is too large."""
-    if degrees_of_freedom <= 0:
-        return None
-    ratio = cost / (0.5 * degrees_of_freedom)
-    return ratio if ratio < FAR_SMALLER and chdtr(degrees_of_freedom, 2.0 * cost) < CHANCE else None
+    ratio = 2.0 * cost / max(degrees_of_freedom, 1)
+    is_sure = degrees_of_freedom > 0 and chdtr(degrees_of_freedom, 2.0 * cost) < CHANCE
+    return ratio if is_sure and ratio < FAR_SMALLER else None
 
 
 TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)
@@ -239,7 +232,7 @@ def solve(
     if initial is not None:
         if not (isinstance(initial, tuple) and len(initial) == 3):
             raise OptionError(
-                "initial is (X, Y, scale): poses of targets and of sensors by name, and a scale (1.0 if known)"
+                "initial is (X, Y, scale): poses of targets and of sensors by name, and 1.0 if it is known"
             )
         check_against_knowledge(problem, *initial)
     with one_blas_thread(), np.errstate(all="ignore"):
@@ -254,27 +247,16 @@ def _solved(
     options: SolveOptions,
     progress: Progress | None,
 ) -> PartSolution:
-    """The solution of one part. The search ends, and leaves its forms, before the rest begins."""
-    return PartSolution.of(_searched(part, method, initial, options, progress))
-
-
-def _searched(
-    part: Part,
-    method: Method,
-    initial: tuple[Poses, Poses, Scale] | None,
-    options: SolveOptions,
-    progress: Progress | None,
-) -> Searched:
-    """What the search of one part finds."""
     search = Search.of(part, options, progress)
     if options.nonnegative_scale:
         found = run_with_nonnegative_scale(search)
     elif initial is not None:
-        given = given_answer(part, *initial)
-        found = search.run(method, rotations_as_variables(part, given.R))
+        found = search.run(method, rotations_as_variables(part, given_answer(part, *initial).R))
     else:
         found = search.with_positive_scale(search.run(method, None))
-    return search.ended(found)
+    searched = search.ended(found)
+    del search  # and its forms, which large parts need no more
+    return PartSolution.of(searched)
 
 
 @one_blas_thread()
@@ -322,7 +304,7 @@ def certify(
         given = given_answer(part, X, Y, scale)
         search = Search.of(part, options, progress, contains=given)
         found = search.run("auto", rotations_as_variables(part, given.R))
-        evaluation = search.whole.evaluated(given, given_translations(part, X, Y))
+        evaluation = search.whole.evaluated(given, given_poses(part, X, Y)[:, :3, 3])
         cost = evaluation.upper
         if not np.isfinite(cost):
             raise ScaleError("the cost of the answer overflows; are its translations in metres, and its scale right?")
@@ -366,11 +348,8 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
         components = tuple(tuple(component) for component in connected_components(problem.pairs))
     known = Identifiability.merged([result.identifiability for result in results], components)
     if not known.is_unique:
-        warnings.warn(
-            "the measurements do not determine the answer: " + "; ".join(map(str, known.free_directions)),
-            NotUniqueWarning,
-            stacklevel=3,
-        )
+        directions = "; ".join(map(str, known.free_directions))
+        warnings.warn(f"the measurements do not determine the answer: {directions}", NotUniqueWarning, stacklevel=3)
     if not certificate.is_optimal:
         warnings.warn(f"not proven optimal: {certificate.reason}", NotCertifiedWarning, stacklevel=3)
     scale: float | dict[str, float] = 1.0
@@ -401,20 +380,18 @@ def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
     cost = sum(result.residual_cost for result in results)
     degrees_of_freedom = sum(6 * r.part.number_of_measurements - r.part.number_of_unknowns for r in results)
     ratio = contradicted_by(cost, degrees_of_freedom)
-    if ratio is not None and _is_from_corners(problem):
+    if ratio is None:
+        return
+    # What add_corners made has a noise that nobody stated.
+    if all(pair.target in problem.boards and pair.sensor in problem.cameras for pair in problem.pairs):
         _warn_of_images(results)
-    elif ratio is not None:
-        warnings.warn(
-            f"the residuals cost {cost:.4g}, {ratio:.3g} times what sigma and kappa predict ({cost / ratio:.4g}): the "
-            "noise is larger than they say, some measurements are wrong, or A or B is inverted",
-            WeightsWarning,
-            stacklevel=4,
-        )
-
-
-def _is_from_corners(problem: Problem) -> bool:
-    """Whether ``add_corners`` made all measurements: nobody stated their noise."""
-    return all(pair.target in problem.boards and pair.sensor in problem.cameras for pair in problem.pairs)
+        return
+    warnings.warn(
+        f"the residuals cost {cost:.4g}, {ratio:.3g} times what sigma and kappa predict ({cost / ratio:.4g}): the "
+        "noise is larger than they say, some measurements are wrong, or A or B is inverted",
+        WeightsWarning,
+        stacklevel=4,
+    )
 
 
 def _warn_of_images(results: list[PartSolution]) -> None:

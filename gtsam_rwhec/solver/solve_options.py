@@ -45,15 +45,11 @@ class SolveOptions:
         if not isinstance(self.nonnegative_scale, bool):
             raise OptionError(f"SolveOptions.nonnegative_scale={brief(self.nonnegative_scale)}; it is True or False")
         for option in fields(self)[:-1]:
-            value = getattr(self, option.name)
-            if isinstance(option.default, float):
-                if not (is_real(value) and 0.0 < value <= sys.float_info.max):
-                    raise OptionError(f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite")
-            elif not is_whole(value, least := 0 if option.name in ("random_starts", "seed") else 1):
-                raise OptionError(
-                    f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite: a whole number from "
-                    f"{least} to {LARGEST_WHOLE}"
-                )
+            value, is_float = getattr(self, option.name), isinstance(option.default, float)
+            least = 0 if option.name in ("random_starts", "seed") else 1
+            if not (is_real(value) and 0.0 < value <= sys.float_info.max if is_float else is_whole(value, least)):
+                whole = "" if is_float else f": a whole number from {least} to {LARGEST_WHOLE}"
+                raise OptionError(f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite{whole}")
 
 
 def check_method(method: str) -> None:

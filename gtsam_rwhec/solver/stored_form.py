@@ -13,7 +13,6 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma
 from gtsam_rwhec.solver.answers import Action, Evaluation, Point
 from gtsam_rwhec.solver.block_matrix import BlockMatrix
-from gtsam_rwhec.solver.full_form import PAIRS_AT_ONCE
 
 #: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (looser bounds).
 Wide = np.longdouble
@@ -72,37 +71,11 @@ class StoredForm:
 
     def _times(self, x: Array) -> tuple[Array, Array]:
         """Q x for x (13 n + 2, D), and a bound on its rounding, in doubles."""
-        return _product(self.form, x, size=False), self._unit * self._sizes(x) * (1.0 + 1e-9)
+        return self.form.times(x), self._unit * self._sizes(x) * (1.0 + 1e-9)
 
     def _sizes(self, x: Array) -> Array:
         """|Q| |x|, in doubles."""
-        return _product(self.form, np.abs(x).astype(float), size=True)
-
-
-def _product(form: BlockMatrix, x: Array, *, size: bool) -> Array:
-    """The form, or the absolute values of its entries, times x (13 n + 2, D), in the precision of x."""
-    n, D = len(form.frames), x.shape[1]
-    ends = form.ends
-    of_frames, of_tail = x[:-2].reshape(n, 13, D), x[-2:]
-    result, last = np.zeros((n, 13, D), dtype=x.dtype), _as(form.tail, x, size=size) @ of_tail
-    for begin in range(0, n, PAIRS_AT_ONCE):
-        at = slice(begin, begin + PAIRS_AT_ONCE)
-        frames, tails = _as(form.frames[at], x, size=size), _as(form.tails[at], x, size=size)
-        result[at] = np.einsum("nij,njd->nid", frames, of_frames[at]) + np.einsum("nit,td->nid", tails, of_tail)
-        last += np.einsum("nit,nid->td", tails, of_frames[at])
-    for begin in range(0, len(form.couplings), PAIRS_AT_ONCE):
-        at = slice(begin, begin + PAIRS_AT_ONCE)
-        couplings, first, second = _as(form.couplings[at], x, size=size), ends[0][at], ends[1][at]
-        np.add.at(result, first, np.einsum("fij,fjd->fid", couplings, of_frames[second]))
-        np.add.at(result, second, np.einsum("fij,fid->fjd", couplings, of_frames[first]))
-    whole: Array = np.concatenate([result.reshape(13 * n, D), last])
-    return whole
-
-
-def _as(blocks: Array, x: Array, *, size: bool) -> Array:
-    """Blocks, or their absolute values, in the precision of x."""
-    result: Array = (np.abs(blocks) if size else blocks).astype(x.dtype, copy=False)
-    return result
+        return self.form.sizes(x.astype(float))
 
 
 def _rounded(values: Array) -> Array:

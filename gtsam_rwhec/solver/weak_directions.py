@@ -64,8 +64,7 @@ def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Arra
     tested; ``ends`` (n + 1,): how many ends of measurements each frame has, and how many measurements the shared scale.
     """
     unit = unit_of(noise, used)
-    matrix = information.scaled(unit)
-    if not all(np.isfinite(each).all() for each in (matrix.frames, matrix.couplings, matrix.tails, matrix.tail)):
+    if not np.isfinite(information.diagonal * unit**2).all():  # and so are the entries beside it: it is semidefinite
         raise UnderdeterminedError(
             "what the measurements tell of the poses overflows: the translations of A and of B, or a scale, are "
             "far beyond anything measured in metres; give lengths in metres"
@@ -73,11 +72,12 @@ def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Arra
     size = int(used.sum())
     if size == 0:
         return Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
-    if size <= DENSE_PARAMETERS:
-        values, vectors = _all_of(matrix, used)
-    else:
-        # Each direction has at least two squares, and the threshold is the highest for the fewest squares.
-        values, vectors = _weakest_of_many(matrix, used, float(free_threshold(2.0, 0.0, spare)))
+    # Each direction has at least two squares, and the threshold is the highest for the fewest squares.
+    values, vectors = (
+        _all_of(information, unit, used)
+        if size <= DENSE_PARAMETERS
+        else _weakest_of_many(information, unit, used, float(free_threshold(2.0, 0.0, spare)))
+    )
     # By Satterthwaite, the squares that a direction sums follow from its shares of the frames' measurements. A tilt of
     # the direction at a frame removes two of them.
     of_parameters = vectors**2
@@ -91,20 +91,20 @@ def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Arra
     return Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
 
 
-def _all_of(matrix: BlockMatrix, used: np.ndarray) -> tuple[Array, Array]:
-    """All eigenvalues of the used parameters, and their vectors over all parameters."""
-    values, reduced = np.linalg.eigh(matrix.dense()[used][:, used])
+def _all_of(information: BlockMatrix, unit: Array, used: np.ndarray) -> tuple[Array, Array]:
+    """All eigenvalues of the used parameters in their units, and their vectors over all parameters."""
+    values, reduced = np.linalg.eigh((information.dense() * unit[:, None] * unit)[used][:, used])
     values[values < ROUNDING * values[-1]] = 0.0
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
     return values, vectors
 
 
-def _weakest_of_many(matrix: BlockMatrix, used: np.ndarray, enough: float) -> tuple[Array, Array]:
+def _weakest_of_many(information: BlockMatrix, unit: Array, used: np.ndarray, enough: float) -> tuple[Array, Array]:
     """The smallest eigenpairs, up to one above ``enough``."""
     from scipy.sparse.linalg import LinearOperator, eigsh  # slow to import, and few problems need it
 
-    size, parameters = len(used), int(used.sum())
+    size, parameters, matrix = len(used), int(used.sum()), information.scaled(unit)
     unused = np.where(used, 0.0, _FAR)
     start = np.random.default_rng(0).standard_normal(size) * used
     # Nothing is free where the matrix less ``enough`` has a factor: then the weakest direction is only reported.
@@ -123,4 +123,4 @@ def _weakest_of_many(matrix: BlockMatrix, used: np.ndarray, enough: float) -> tu
             return values, vectors * used[:, None]
         count *= 4
     # Lanczos is not faster with so many free directions.
-    return _all_of(matrix, used)
+    return _all_of(information, unit, used)

@@ -262,16 +262,6 @@ def test_no_small_step_from_the_answer_costs_less(mode: str, knowledge: str, met
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_methods_agree(mode: str) -> None:
-    problem = simulated(mode).problem
-    auto, sdp = rw.solve(problem), rw.solve(problem, method="sdp")
-    assert sdp.certificate.path.start in (Start.CLARABEL, Start.INTERIOR_POINT)
-    assert sdp.cost == pytest.approx(auto.cost, rel=1e-9)
-    for name, T in {**auto.X, **auto.Y}.items():
-        np.testing.assert_allclose({**sdp.X, **sdp.Y}[name].matrix(), T.matrix(), atol=1e-7)
-
-
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("size", [1e-3, 0.2])
 def test_local_descends_from_the_users_start(mode: str, size: float) -> None:
     problem = simulated(mode).problem
@@ -405,6 +395,8 @@ def test_parts_are_certified_together() -> None:
     simulation = general(2, 2, seed=2, graph=[(0, 0), (1, 1)], noise=NOISE)
     problem = simulation.problem
     best = rw.solve(problem)
+    assert best.certificate.is_certified
+    assert len(best.parts) == 2
     certificate = rw.certify(problem, X=best.X, Y=best.Y)
     assert certificate.is_certified
     assert certificate.cost == pytest.approx(sum(part.certificate.cost for part in best.parts), rel=1e-9)
