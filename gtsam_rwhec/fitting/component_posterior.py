@@ -39,12 +39,6 @@ class Fitted:
     estimate: Estimate
 
 
-def value_and_gradient(model: NoiseModel, sizes: Sizes, logs: Array) -> tuple[float, Array]:
-    """-2 log of the posterior density of the logarithms, up to a constant, and its gradient."""
-    estimate, gradient = model.value_and_gradient(sizes.values(logs), sizes.active)
-    return estimate.minus_two_log + sizes.penalty(logs), gradient + sizes.penalty_gradient(logs)
-
-
 def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENOUGH) -> Fitted:
     """The maximum of the posterior density of the components, from a start: Newton's steps in a trusted region.
 
@@ -57,14 +51,14 @@ def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENO
         It ends where another step would lower ``objective`` by less than this.
     """
     low, high = np.array(sizes.bounds).T
-    here = _Point.at(model, sizes, np.clip(start, low, high))
+    here = Point.at(model, sizes, np.clip(start, low, high))
     H, radius = here.information, FARTHEST
     for number in range(1, MOST):
         held = ((here.logs <= low) & (here.gradient > 0.0)) | ((here.logs >= high) & (here.gradient < 0.0))
         step, gain = _trusted_step(H, np.where(held, 0.0, here.gradient), ~held, radius)
         if gain < enough:
             break
-        there = _Point.at(model, sizes, np.clip(here.logs + step, low, high))
+        there = Point.at(model, sizes, np.clip(here.logs + step, low, high))
         step = there.logs - here.logs
         expected = -float(here.gradient @ step + 0.5 * step @ H @ step)
         share = (here.value - there.value) / max(expected, 1e-300)
@@ -78,25 +72,26 @@ def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENO
             here = there
             if number < AVERAGED:
                 H = here.information
-    return Fitted(sizes, here.logs, here.value, here.estimate)
+    return Fitted(sizes, here.logs, here.value, here.eliminated.estimate)
 
 
 @dataclass(frozen=True)
-class _Point:
-    """-2 log of the posterior density at some components, its gradient, and what its curvature comes from."""
+class Point:
+    """-2 log of the posterior density of the logarithms, up to a constant, and its gradient."""
 
     sizes: Sizes
     logs: Array
     value: float
     gradient: Array
-    estimate: Estimate
     eliminated: Eliminated
 
     @staticmethod
-    def at(model: NoiseModel, sizes: Sizes, logs: Array) -> _Point:
-        estimate, eliminated = model.eliminated(sizes.values(logs))
+    def at(model: NoiseModel, sizes: Sizes, logs: Array) -> Point:
+        """At logarithms (k,) of the active components."""
+        eliminated = model.eliminated(sizes.values(logs))
+        value = eliminated.estimate.minus_two_log + sizes.penalty(logs)
         gradient = eliminated.gradient_by(sizes.active) + sizes.penalty_gradient(logs)
-        return _Point(sizes, logs, estimate.minus_two_log + sizes.penalty(logs), gradient, estimate, eliminated)
+        return Point(sizes, logs, value, gradient, eliminated)
 
     @property
     def information(self) -> Array:
@@ -259,7 +254,7 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
     """The mixture about the most probable components; the unknowns are those of the ``whole`` model."""
     k = len(fit.logs)
     low, high = np.array(fit.sizes.bounds).T
-    H = 0.5 * curvature(lambda logs: value_and_gradient(model, fit.sizes, logs)[1], fit.logs, low, high)
+    H = 0.5 * curvature(lambda logs: Point.at(model, fit.sizes, logs).gradient, fit.logs, low, high)
     values, vectors = np.linalg.eigh(H)
     spread = vectors / np.sqrt(np.maximum(values, 0.5 / PRIOR**2))
     drawn = normal_points(samples, k)
@@ -281,20 +276,12 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
 
 #: A component is at least and at most this many times the typical size of what residuals show of it.
 SMALLEST, LARGEST = 1e-3, 30.0
-
-
 #: The logarithm of a standard deviation is known before the data with this standard deviation.
 PRIOR = 2.0
-
-
 #: That of a component that the user states.
 STATED = 0.02
-
-
 #: A component is expected at this share of the residuals.
 EXPECTED = 0.3
-
-
 #: Errors that vary with the configuration are expected at this share: an arm in order shows less of them than noise.
 EXPECTED_SYSTEMATIC = 0.15
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from rwhec_factors import se3
 
@@ -19,7 +20,8 @@ from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.pose_fit import linearized
-from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
+from gtsam_rwhec.fitting.pose_graph import add_priors, normal_equations_of
+from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.fitting.variance_components import jacobian_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
@@ -355,30 +357,10 @@ def summed(values: Array, places: np.ndarray, shape: tuple[int, ...]) -> Array:
     return found.reshape(shape).astype(np.float64, copy=False)  # counts of none are integers
 
 
-def prior_terms(
-    problem: Problem, variables: Variables, state: State, layout: JointCovariance, basis: Array
-) -> tuple[Array, Array, float]:
+def prior_terms(problem: Problem, variables: Variables, state: State, basis: Array) -> tuple[Array, Array, float]:
     """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis."""
-    size, cost = len(layout.unit), 0.0
-    information, gradient = np.zeros((size, size)), np.zeros(size)
-    for name, priors in problem.priors.items():
-        unknown = Unknown(UnknownKind.FRAME, name)
-        if unknown not in layout.slots:
-            continue
-        place, pose = layout.slots[unknown], (state.X | state.Y)[name].matrix()
-        for prior in priors:
-            if prior.kappa is not None:
-                omega = se3.so3_logmap((prior.transform[:3, :3].T @ pose[:3, :3])[None])
-                # Log(R Expmap(d)) = omega + Jr^-1(omega) d, and Jr^-1(omega) = Jl^-1(-omega)
-                J = se3.so3_left_jacobian_inverse(-omega)[0]
-                rows = slice(place.start, place.start + 3)
-                information[rows, rows] += 2.0 * prior.kappa * J.T @ J
-                gradient[rows] += 2.0 * prior.kappa * J.T @ omega[0]
-                cost += prior.kappa * float(omega[0] @ omega[0])
-            if prior.sigma is not None:
-                R, away = pose[:3, :3], pose[:3, 3] - prior.transform[:3, 3]
-                rows = slice(place.start + 3, place.stop)
-                information[rows, rows] += np.eye(3) / prior.sigma**2
-                gradient[rows] += R.T @ away / prior.sigma**2
-                cost += 0.5 * float(away @ away) / prior.sigma**2
+    graph, values = gtsam.NonlinearFactorGraph(), variables.values(state)
+    add_priors(graph, variables, problem, "geodesic")
+    information, gradient = normal_equations_of(graph, values, variables)
+    cost = graph.error(values)
     return basis.T @ information @ basis, basis.T @ gradient, cost
