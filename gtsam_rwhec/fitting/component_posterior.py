@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, fdtri, ndtri
+from scipy.special import chdtri, fdtri, fdtridfd, ndtri
 
 from gtsam_rwhec.fitting.fit_options import SYSTEMATIC, Component
 from gtsam_rwhec.fitting.noise_likelihood import Eliminated, Estimate, NoiseModel, average_information
@@ -126,14 +125,15 @@ def _updated(H: Array, step: Array, change: Array) -> Array:
     return found
 
 
-def curvature(gradient: Callable[[Array], Array], at: Array, low: Array, high: Array) -> Array:
-    """The second derivative (k, k) of a function by central differences of its gradient, one-sided at the bounds."""
-    k = len(at)
-    H = np.empty((k, k))
-    for i in range(k):
-        after, before = at.copy(), at.copy()
-        after[i], before[i] = min(at[i] + STEP, high[i]), max(at[i] - STEP, low[i])
-        H[i] = (gradient(after) - gradient(before)) / (after[i] - before[i])
+def curvature(model: NoiseModel, sizes: Sizes, at: Array) -> Array:
+    """The second derivative (k, k) of `Point.value` by central differences of its gradient, one-sided at the bounds."""
+    low, high = np.array(sizes.bounds).T
+    rows = []
+    for step in STEP * np.eye(len(at)):
+        after, before = np.minimum(at + step, high), np.maximum(at - step, low)
+        change = Point.at(model, sizes, after).gradient - Point.at(model, sizes, before).gradient
+        rows.append(change / (after - before).sum())
+    H = np.array(rows)
     symmetric: Array = 0.5 * (H + H.T)
     return symmetric
 
@@ -200,12 +200,7 @@ class Mixture:
             return float(np.inf)
         if found >= m * fdtri(m, FEWEST, CONFIDENCE):
             return FEWEST
-        low, high = np.log(FEWEST), np.log(1e6)
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            is_large = m * fdtri(m, np.exp(middle), CONFIDENCE) > found
-            low, high = (middle, high) if is_large else (low, middle)
-        return float(np.exp(low))
+        return float(fdtridfd(m, CONFIDENCE, found / m))
 
     def share_of(self, rows: Array, added: Array, probability: float = 1.0) -> float:
         """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
@@ -254,7 +249,7 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
     """The mixture about the most probable components; the unknowns are those of the ``whole`` model."""
     k = len(fit.logs)
     low, high = np.array(fit.sizes.bounds).T
-    H = 0.5 * curvature(lambda logs: Point.at(model, fit.sizes, logs).gradient, fit.logs, low, high)
+    H = 0.5 * curvature(model, fit.sizes, fit.logs)
     values, vectors = np.linalg.eigh(H)
     spread = vectors / np.sqrt(np.maximum(values, 0.5 / PRIOR**2))
     drawn = normal_points(samples, k)

@@ -10,7 +10,8 @@ track; u_k are the arm's systematic errors, which vary smoothly with its configu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -210,7 +211,7 @@ class Rows:
                 block.append(part)
         stacked = [np.concatenate(block)[instants.order] for block in blocks]
         residual, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
-        by_unknowns = SparseColumns.of(jacobians, len(layout.unit)).of_rows(instants.order)
+        by_unknowns = SparseColumns.of(jacobians, len(layout.unit))[instants.order]
         A = np.concatenate([item.residuals.A for item in data])[instants.order]
         rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
         return Rows(
@@ -238,12 +239,7 @@ class Rows:
             instants.order[rows], np.flatnonzero(np.r_[True, np.diff(index) != 0]), index, instants.chain[rows],
             instants.chains, step, None if instants.seconds is None else instants.seconds[kept],
         )  # fmt: skip
-        return Rows(
-            fewer, self.residual[rows], self.by_unknowns.of_rows(rows), self.given[rows], self.axis[rows],
-            {side: twist[rows] for side, twist in self.twist.items()},
-            {side: moving[rows] for side, moving in self.configuration.items()},
-            self.rate[rows], self.predicted[rows], self.length[rows],
-        )  # fmt: skip
+        return Rows(fewer, *(_taken(getattr(self, part.name), rows) for part in fields(self)[1:]))
 
     def features(self, side: About) -> Array:
         """f (N, k): the centred principal components of the configurations."""
@@ -255,6 +251,11 @@ class Rows:
         kept = s**2 > SMALLEST_SPREAD * max(float((s**2).sum()), 1e-300)
         found: Array = centred @ directions[kept].T
         return found
+
+
+def _taken(part: Any, rows: np.ndarray) -> Any:
+    """Some rows of a part, or of each side of it."""
+    return {side: of[rows] for side, of in part.items()} if isinstance(part, dict) else part[rows]
 
 
 def _configuration(moving: Array) -> Array:
@@ -311,7 +312,7 @@ class SparseColumns:
             first += len(J)
         return SparseColumns(values, columns, count)
 
-    def of_rows(self, rows: np.ndarray) -> SparseColumns:
+    def __getitem__(self, rows: np.ndarray) -> SparseColumns:
         """Those of some rows."""
         return SparseColumns(self.values[rows], self.places[rows], self.count)
 

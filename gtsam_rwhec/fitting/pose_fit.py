@@ -365,11 +365,14 @@ def fit(
         if settled:
             break
     else:
-        (group, component), least = min(degrees_of_freedom.items(), key=lambda item: item[1])
+        where = [
+            f"{least:.2g} degrees of freedom for the {component} of {group_label(group)}"
+            for (group, component), least in sorted(degrees_of_freedom.items(), key=lambda item: item[1])[:1]
+        ]
         warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest degrees of freedom, {least:.2g}, "
-            f"has the {component} of {group_label(group)}. The noise given for A may already explain the residuals: "
-            "give less; or join groups (noise_groups='sensor' or 'all'), or give sigma and kappa (noise='given')",
+            f"the weights did not settle in {MAX_ROUNDS} rounds ({', '.join(where) or 'as time offsets change'}). If "
+            "the noise given for A already explains the residuals, give less; else join groups (noise_groups='all'), "
+            "give sigma and kappa (noise='given'), or estimate no time offsets",
             NotConvergedWarning,
             stacklevel=5,
         )

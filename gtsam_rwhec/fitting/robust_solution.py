@@ -23,7 +23,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from scipy.special import chdtr, chdtri
@@ -42,7 +42,6 @@ from gtsam_rwhec.solver.solution import Solution, solve
 NoiseScale = Literal["given", "estimate"]
 #: By pair, (N,) booleans: which measurements count.
 Inliers = dict[Pair, np.ndarray]
-Answer = TypeVar("Answer")
 
 #: Mu grows by this factor in an iteration (the paper's value).
 GRADUATION = 1.4
@@ -83,23 +82,6 @@ class RobustSolution:
     solution: Solution
     inliers: Inliers
     variance_factors: VarianceFactors
-
-
-def until_inliers_stay(
-    fit: Callable[[Inliers], Answer], judge: Callable[[Answer], Inliers], first: Inliers, most: int
-) -> tuple[Answer, Inliers]:
-    """Fit the inliers and judge all measurements by the fit, in turns, until the choice stays the same.
-
-    At most so many fits are made; the inliers that are returned are those of the last one.
-    """
-    inliers = first
-    for number in range(1, most + 1):
-        answer = fit(inliers)
-        again = judge(answer) if number < most else inliers
-        if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
-            break
-        inliers = again
-    return answer, inliers
 
 
 @one_blas_thread()

@@ -7,17 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from noisy_rows import problem_of, rows_of
+from settled_models import SIGMA
 
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns, unit_of
 from gtsam_rwhec.fitting.fit_options import About, Component, Walk
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel, average_information
 
 C = Component
-SIGMA = {
-    C.ROTATION: 0.01, C.TRANSLATION: 0.004, C.DEPTH: 0.007, C.CARRIER_ROTATION: 0.003, C.CARRIER_TRANSLATION: 0.002,
-    C.JITTER: 0.004, C.DRIFT_ROTATION: 0.001, C.DRIFT_TRANSLATION: 0.0007, C.DRIFT_SCALE: 0.002,
-    C.SYSTEMATIC_ROTATION: 0.02, C.SYSTEMATIC_TRANSLATION: 0.01,
-}  # fmt: skip
 
 
 def dense_drift(prior: DriftPrior, sigma: dict[Component, float]) -> np.ndarray:
