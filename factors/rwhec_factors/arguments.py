@@ -20,24 +20,19 @@ def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
 
 
 def number_of(values: gtsam.Values, key: int, what: str) -> float:
-    """The number in a key's 1-vector. Raises KeyError if the key is missing, and TypeError if it has another type."""
-    try:
-        vector = values.atVector(key)
-    except RuntimeError as error:
-        raise _explained(values, key, f"{what}, a 1-vector (numpy.array([...]), not a float)", error) from error
-    if vector.shape != (1,):
-        raise TypeError(f"{name_of(key)} should be {what}, a 1-vector; it is a vector of {len(vector)}")
-    return float(vector[0])
+    """The number in a key's 1-vector; errors as of ``vector_of``."""
+    return float(vector_of(values, key, 1, what)[0])
 
 
 def vector_of(values: gtsam.Values, key: int, dimension: int, what: str) -> Array:
     """The vector of a key. Raises KeyError or TypeError like ``pose_of``, and TypeError for another length."""
+    what = f"{what}, a {dimension}-vector"
     try:
         vector: Array = values.atVector(key)
     except RuntimeError as error:
-        raise _explained(values, key, f"{what}, a {dimension}-vector", error) from error
+        raise _explained(values, key, f"{what} (numpy.array([...]), not a float)", error) from error
     if vector.shape != (dimension,):
-        raise TypeError(f"{name_of(key)} should be {what}, a {dimension}-vector; it is a vector of {len(vector)}")
+        raise TypeError(f"{name_of(key)} should be {what}; it is a vector of {len(vector)}")
     return vector
 
 
@@ -88,12 +83,17 @@ def check_time_offset(time_offset_key: int | None, twists: ArrayLike | None) -> 
         raise ValueError("a time offset needs both its key (time_offset_key=) and the carriers' velocity (twist=)")
 
 
+def checked_numbers(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    """Finite numbers of the given shape."""
+    numbers = np.asarray(value, dtype=np.float64)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"{name} is {value!r}; give finite numbers of shape {shape}")
+    return numbers
+
+
 def checked_twists(twists: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Velocities of the carriers, finite and of the given shape."""
-    velocity = np.asarray(twists, dtype=np.float64)
-    if velocity.shape != shape or not np.isfinite(velocity).all():
-        raise ValueError(f"the twist is {velocity}; give finite numbers of shape {shape}, [omega (rad/s), v (m/s)]")
-    return velocity
+    return checked_numbers(twists, shape, "the twist [omega (rad/s), v (m/s)]")
 
 
 def checked_effect(effect: ArrayLike, key: int, count: int) -> Array:
@@ -109,17 +109,9 @@ def checked_effect(effect: ArrayLike, key: int, count: int) -> Array:
     return changes
 
 
-def checked_vector(value: ArrayLike, name: str) -> Array:
-    """Three finite numbers."""
-    vector = np.asarray(value, dtype=np.float64)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{name} is {value!r}; give three finite numbers")
-    return vector
-
-
 def unit_vector(value: ArrayLike, name: str) -> Array:
     """A direction (3,) as a vector of length 1."""
-    vector = checked_vector(value, name)
+    vector = checked_numbers(value, (3,), name)
     length = np.linalg.norm(vector)
     if length == 0.0:
         raise ValueError(f"{name} is {vector}, which has no direction; give a vector that is not zero")

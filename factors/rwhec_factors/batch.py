@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
@@ -126,33 +126,10 @@ def robot_world_hand_eye_batch_factor(
     TypeError, ValueError
         If the arrays' shapes do not agree, a weight is singular or not finite, or two keys are equal.
     """
-    whole: dict[int, Array] = {}
-    (factor,) = factors_of_parts(
-        target_key, sensor_key, A, B, sqrt_information, [(slice(None), whole)], scale_key=scale_key,
-        time_offset_key=time_offset_key, twists=twists,
+    return robot_world_hand_eye_effects_factor(
+        target_key, sensor_key, A, B, sqrt_information, {}, scale_key=scale_key, time_offset_key=time_offset_key,
+        twists=twists,
     )  # fmt: skip
-    return factor
-
-
-def factors_of_parts(
-    target_key: int,
-    sensor_key: int,
-    A: Array,
-    B: Array,
-    sqrt_information: Array,
-    parts: Sequence[Part],
-    *,
-    scale_key: int | None,
-    time_offset_key: int | None,
-    twists: Array | None,
-) -> list[gtsam.CustomFactor]:
-    """The factors of ``robot_world_hand_eye_effects_factors``; a part may have no effects."""
-    A, B = checked_pairs(A, B)
-    check_time_offset(time_offset_key, twists)
-    batch = BatchResiduals(A, B, None if twists is None else checked_twists(twists, (len(A), 6)))
-    whole = _Whitened(batch, _whitening(sqrt_information, len(A)), target_key, sensor_key, scale_key, time_offset_key)
-    check_keys(whole.keys)
-    return [_factor_of_part(whole, rows, effects) for rows, effects in parts]
 
 
 @dataclass
@@ -165,8 +142,9 @@ class _Whitened:
     sensor_key: int
     scale_key: int | None
     time_offset_key: int | None
-    _residual: tuple[bytes, Array] = (b"", np.zeros(0))
-    _linear: tuple[bytes, tuple[Array, ...]] = (b"", ())
+    _at: bytes = b""
+    _residual: Array = field(default_factory=lambda: np.zeros(0))
+    _jacobians: tuple[Array, ...] = ()
 
     @property
     def keys(self) -> list[int]:
@@ -182,22 +160,21 @@ class _Whitened:
         if self.time_offset_key is not None:
             offset = number_of(values, self.time_offset_key, "the time offset in seconds")
         here = np.concatenate([X.ravel(), Y.ravel(), [scale, offset]]).tobytes()
-        if linearized and self._linear[0] != here:
+        is_known = self._at == here
+        self._at = here
+        if linearized and not (is_known and self._jacobians):
             at = self.batch.linearize(X, Y, scale, offset)
             blocks = [at.target + at.sensor] if self.target_key == self.sensor_key else [at.target, at.sensor]
             if self.time_offset_key is not None:
                 blocks.append(at.offset[:, :, None])
             if self.scale_key is not None:
                 blocks.append(at.scale[:, :, None])
-            self._linear = here, tuple(_rows(self.whitening @ block) for block in blocks)
-            self._residual = here, self._whitened(at.residual)
-        elif self._residual[0] != here:
-            self._residual = here, self._whitened(self.batch.residuals(X, Y, scale, offset))
-        return self._residual[1], self._linear[1]
-
-    def _whitened(self, residual: Array) -> Array:
-        whitened: Array = np.einsum("nij,nj->ni", self.whitening, residual).ravel()
-        return whitened
+            self._jacobians = tuple(_rows(self.whitening @ block) for block in blocks)
+            self._residual = _rows(self.whitening @ at.residual[:, :, None])[:, 0]
+        elif not is_known:
+            self._jacobians = ()
+            self._residual = _rows(self.whitening @ self.batch.residuals(X, Y, scale, offset)[:, :, None])[:, 0]
+        return self._residual, self._jacobians
 
 
 def _factor_of_part(whole: _Whitened, rows: slice, effects: Mapping[int, ArrayLike]) -> gtsam.CustomFactor:
@@ -287,7 +264,7 @@ def robot_world_hand_eye_effects_factor(
         If the arrays' shapes do not agree, an effect is not finite, a weight is singular or not finite, or two keys are
         equal.
     """
-    (factor,) = factors_of_parts(
+    (factor,) = robot_world_hand_eye_effects_factors(
         target_key, sensor_key, A, B, sqrt_information, [(slice(None), effects)], scale_key=scale_key,
         time_offset_key=time_offset_key, twists=twists,
     )  # fmt: skip
@@ -323,7 +300,9 @@ def robot_world_hand_eye_effects_factors(
     list of gtsam.CustomFactor
         One for each part.
     """
-    return factors_of_parts(
-        target_key, sensor_key, A, B, sqrt_information, parts, scale_key=scale_key, time_offset_key=time_offset_key,
-        twists=twists,
-    )  # fmt: skip
+    A, B = checked_pairs(A, B)
+    check_time_offset(time_offset_key, twists)
+    batch = BatchResiduals(A, B, None if twists is None else checked_twists(twists, (len(A), 6)))
+    whole = _Whitened(batch, _whitening(sqrt_information, len(A)), target_key, sensor_key, scale_key, time_offset_key)
+    check_keys(whole.keys)
+    return [_factor_of_part(whole, rows, effects) for rows, effects in parts]

@@ -7,6 +7,9 @@ A depends on. P is compared with B, whose translation is scale times the true on
   makes A X = Y B hold, so the factor takes any 6 x 6 covariance of B, in GTSAM's order.
 - chordal: R_Y [vec(R_P - R_B), scale t_P - t_B]; (12,), columns of the rotation first. With isotropic noise its cost is
   the certified solution's (RWHEC paper, eq. 18).
+
+Every factor raises a TypeError or ValueError that names the argument if A or B is not a valid pose, the factor cannot
+hold the noise, two keys are equal, or a time offset has no twist.
 """
 
 from __future__ import annotations
@@ -64,11 +67,6 @@ def measurement_factor(
     scale_key : int or None
         Key of a 1-vector s: t_B = s * (true length).
     residual : "geodesic" or "chordal"
-
-    Raises
-    ------
-    TypeError, ValueError
-        If B is not a valid pose, the factor cannot hold the noise, two keys are equal, or the residual is unknown.
     """
     check_pose(B, "B")
     check_choice("residual", residual, Residual)
@@ -175,11 +173,6 @@ def robot_world_hand_eye_factor(
     twist : (6,), optional
         The carriers' velocity at the stamp, [omega (rad/s), v (m/s)], in the target carrier's frame like A's right
         perturbations: Log(A(t)^-1 A(t + h)) / h for small h.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If A or B is not a valid pose, the factor cannot hold the noise, two keys are equal, or an offset has no twist.
     """
     check_pose(A, "A")
     check_time_offset(time_offset_key, twist)
@@ -231,11 +224,6 @@ def pose_robot_world_hand_eye_factor(
         Key of a 1-vector s, the factor's last key: t_B = s * (true length).
     residual : "geodesic" or "chordal"
     pose : "sensorcarrier_in_targetcarrier" or "targetcarrier_in_sensorcarrier"
-
-    Raises
-    ------
-    TypeError, ValueError
-        If B is not a valid pose, the factor cannot hold the noise, or two keys are equal.
     """
     check_choice("pose", pose, Carrier)
     inverted = pose == "sensorcarrier_in_targetcarrier"
@@ -273,11 +261,6 @@ def two_pose_robot_world_hand_eye_factor(
     sensorcarrier_key, targetcarrier_key : int
         Keys of P_i and P_j, Pose3.
     target_key, sensor_key, B, noise, scale_key, residual
-        As in ``pose_robot_world_hand_eye_factor``.
-
-    Raises
-    ------
-    TypeError, ValueError
         As in ``pose_robot_world_hand_eye_factor``.
     """
     names = ("P_i = T_world_sensorcarrier", "P_j = T_world_targetcarrier")
@@ -326,11 +309,6 @@ def hand_eye_factor(
     scale_key : int, optional
         Key of a 1-vector s, the factor's last key: t_B = s * (true length), as in a monocular odometry.
     residual : "geodesic" or "chordal"
-
-    Raises
-    ------
-    TypeError, ValueError
-        If A or B is not a valid pose, the factor cannot hold the noise, or two keys are equal.
     """
     check_pose(A, "A")
     return measurement_factor(

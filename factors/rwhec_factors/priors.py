@@ -18,8 +18,8 @@ from rwhec_factors import noise_models
 from rwhec_factors.arguments import (
     check_choice,
     check_pose,
+    checked_numbers,
     checked_twists,
-    checked_vector,
     name_of,
     number_of,
     pose_of,
@@ -116,7 +116,7 @@ def position_prior_factor(key: int, t_m: ArrayLike, noise: gtsam.noiseModel.Base
     noise : gtsam.noiseModel.Base
         Dimension 3, metres, along the carrier's axes. For one or two coordinates take `position_along_prior_factor`.
     """
-    t_0 = checked_vector(t_m, "the prior's position t_m")
+    t_0 = checked_numbers(t_m, (3,), "the prior's position t_m")
     model = noise_models.checked(noise, 3, "the prior's position")
 
     def error(pose: gtsam.Pose3) -> tuple[Array, Array]:

@@ -79,24 +79,15 @@ def so3_logmap(R: Array) -> Array:
     return omega
 
 
-def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
-    """(1 - cos) / angle^2, (angle - sin) / angle^3, and the coefficient of hat^2 in the left Jacobian's inverse."""
-    small = angle < SMALL
-    t = np.where(small, 1.0, angle)
-    t2 = angle * angle
-    b = np.where(small, 0.5 - t2 / 24.0 + t2 * t2 / 720.0, (1.0 - np.cos(t)) / t**2)
-    c = np.where(small, 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0, (t - np.sin(t)) / t**3)
-    cot = (1.0 - 0.5 * t * np.cos(0.5 * t) / np.sin(0.5 * t)) / t**2
-    d = np.where(small, 1.0 / 12.0 + t2 / 720.0 + t2 * t2 / 30240.0, cot)
-    return b, c, d
-
-
 def so3_left_jacobian_inverse(omega: Array) -> Array:
     """The inverse (N, 3, 3) of the SO(3) left Jacobian: I - hat/2 + d hat^2."""
     angle = np.linalg.norm(omega, axis=1)
-    _, _, d = _coefficients(angle)
+    t2, small = angle * angle, angle < SMALL
+    t = np.where(small, 1.0, angle)
+    cot = (1.0 - 0.5 * t * np.cos(0.5 * t) / np.sin(0.5 * t)) / t**2
+    d = np.where(small, 1.0 / 12.0 + t2 / 720.0 + t2 * t2 / 30240.0, cot)
     result: Array = (d[:, None] * omega)[:, :, None] * omega[:, None, :] - 0.5 * hat(omega)
-    result[:, np.arange(3), np.arange(3)] += (1.0 - d * angle**2)[:, None]  # W^2 = omega omega' - angle^2 I
+    result[:, np.arange(3), np.arange(3)] += (1.0 - d * t2)[:, None]  # W^2 = omega omega' - angle^2 I
     return result
 
 
@@ -106,10 +97,13 @@ def expmap(xi: Array) -> Array:
     W = hat(omega)
     W2 = W @ W
     angle = np.linalg.norm(omega, axis=1)
-    b, c, _ = _coefficients(angle)
+    t2, small = angle * angle, angle < SMALL
+    t = np.where(small, 1.0, angle)
     a = np.sinc(angle / np.pi)
-    R = np.eye(3) + a[:, None, None] * W + b[:, None, None] * W2
-    left_jacobian = np.eye(3) + b[:, None, None] * W + c[:, None, None] * W2
+    b = np.where(small, 0.5 - t2 / 24.0 + t2 * t2 / 720.0, (1.0 - np.cos(t)) / t**2)[:, None, None]
+    c = np.where(small, 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0, (t - np.sin(t)) / t**3)[:, None, None]
+    R = np.eye(3) + a[:, None, None] * W + b * W2
+    left_jacobian = np.eye(3) + b * W + c * W2
     return pose(R, np.einsum("nij,nj->ni", left_jacobian, xi[:, 3:]))
 
 

@@ -22,7 +22,6 @@ from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 
 #: All good measurements are kept with at least this probability, if their noise is Gaussian.
@@ -55,22 +54,6 @@ def inlier_threshold(confidence: float, count: int) -> float:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """The test of every measurement."""
-
-    #: (N,): e' (V -+ J C J')^-1 e; infinite where a frame has no pose.
-    square: Array
-    #: The quantile that it is compared with.
-    threshold: float
-
-    @property
-    def agrees(self) -> np.ndarray:
-        """(N,): which measurements belong to the answer."""
-        agreeing: np.ndarray = self.square <= self.threshold
-        return agreeing
-
-
-@dataclass(frozen=True)
 class _PairRows:
     """A pair's residuals e (n, 6) in units of the noise as stated, and their Jacobian J (n, 6, w) by unknowns (w,)."""
 
@@ -90,8 +73,8 @@ def judged(
     *,
     noise_of: np.ndarray | None = None,
     robust: bool = False,
-) -> Judged:
-    """Judge every measurement at a fit to the kept ones (N,).
+) -> np.ndarray:
+    """Which measurements (N,) belong to the answer, by a fit to the kept ones (N,).
 
     ``noise_of`` (N,) are the measurements that show the noise, all kept ones by default. ``robust`` takes the variances
     from medians: for a fit to all measurements, of which some may be outliers.
@@ -110,7 +93,7 @@ def judged(
     if size > MOST_UNKNOWNS:
         for pair, variance in zip(pairs, variances, strict=True):
             square[pair.rows] = np.sum(pair.e**2 / variance, axis=1)
-        return Judged(square, threshold)
+        return square <= threshold
     for _ in range(2):  # the step moves residuals a little, and these the variances
         residuals, _ = _as_if_fitted(pairs, keep, variances, size)
         variances = _variances(pairs, residuals, noise_of, size, robust=robust)
@@ -124,14 +107,17 @@ def judged(
         values, vectors = np.linalg.eigh(share)
         whitened = np.einsum("nij,ni->nj", vectors, e / deviation)
         square[pair.rows] = np.where(values > 1e-6, whitened**2 / np.maximum(values, 1e-6), 0.0).sum(axis=1)
-    return Judged(square, threshold)
+    return square <= threshold
 
 
 def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple[list[_PairRows], int]:
     """Residuals and Jacobians at a fit, of the pairs whose frames have poses; and the number of all unknowns."""
     free = [name for name in problem.targets + problem.sensors if name not in problem.fixed and name in fit.poses]
     first = {name: DOF * i for i, name in enumerate(free)}
-    scales = _scale_columns(problem.scale, problem, DOF * len(free))
+    owners = [] if problem.scale == "known" else dict.fromkeys(pair.target for pair in problem.pairs)
+    owners = [name for name in owners if name not in problem.fixed_scales]
+    shared = problem.scale == "shared"
+    scales = {name: DOF * len(free) + (0 if shared else i) for i, name in enumerate(owners)}
     pairs = []
     for pair, rows in zip(measured.pairs, measured.rows, strict=True):
         alpha = fit.alpha.get(pair.target, np.nan)
@@ -140,9 +126,10 @@ def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple
         at = BatchResiduals(measured.A[rows], measured.B[rows]).linearize(
             fit.poses[pair.target], fit.poses[pair.sensor], alpha
         )
-        blocks = {first[name]: J for name, J in ((pair.target, at.target), (pair.sensor, at.sensor)) if name in first}
-        if pair.target == pair.sensor and pair.target in first:  # a motion: one frame is both
-            blocks = {first[pair.target]: at.target + at.sensor}
+        blocks: dict[int, Array] = {}
+        for name, J in ((pair.target, at.target), (pair.sensor, at.sensor)):  # of a motion one frame is both
+            if name in first:
+                blocks[first[name]] = blocks.get(first[name], 0.0) + J
         if pair.target in scales:
             blocks[scales[pair.target]] = at.scale[:, :, None]
         unknowns = [np.arange(start, start + J.shape[2]) for start, J in blocks.items()]
@@ -151,16 +138,6 @@ def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple
         e = np.einsum("nij,nj->ni", W, at.residual)
         pairs.append(_PairRows(rows, pair.sensor, e, W @ J, np.concatenate([np.zeros(0, dtype=np.int64), *unknowns])))
     return pairs, DOF * len(free) + len(set(scales.values()))
-
-
-def _scale_columns(mode: ScaleMode, problem: Problem, first: int) -> dict[str, int]:
-    """The column of each target's unknown scale."""
-    owners = dict.fromkeys(pair.target for pair in problem.pairs)
-    if mode == "known":
-        return {}
-    if mode == "shared":
-        return dict.fromkeys(owners, first)
-    return {name: first + i for i, name in enumerate(name for name in owners if name not in problem.fixed_scales)}
 
 
 def _whitening(measured: Measured, rows: slice) -> Array:

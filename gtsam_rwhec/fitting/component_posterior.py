@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, fdtri, ndtri
+from scipy.special import chdtri, fdtri, fdtridfd, ndtri
 
 from gtsam_rwhec.fitting.fit_options import SYSTEMATIC, Component
 from gtsam_rwhec.fitting.noise_likelihood import Eliminated, Estimate, NoiseModel, average_information
@@ -39,12 +38,6 @@ class Fitted:
     estimate: Estimate
 
 
-def value_and_gradient(model: NoiseModel, sizes: Sizes, logs: Array) -> tuple[float, Array]:
-    """-2 log of the posterior density of the logarithms, up to a constant, and its gradient."""
-    estimate, gradient = model.value_and_gradient(sizes.values(logs), sizes.active)
-    return estimate.minus_two_log + sizes.penalty(logs), gradient + sizes.penalty_gradient(logs)
-
-
 def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENOUGH) -> Fitted:
     """The maximum of the posterior density of the components, from a start: Newton's steps in a trusted region.
 
@@ -57,14 +50,14 @@ def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENO
         It ends where another step would lower ``objective`` by less than this.
     """
     low, high = np.array(sizes.bounds).T
-    here = _Point.at(model, sizes, np.clip(start, low, high))
+    here = Point.at(model, sizes, np.clip(start, low, high))
     H, radius = here.information, FARTHEST
     for number in range(1, MOST):
         held = ((here.logs <= low) & (here.gradient > 0.0)) | ((here.logs >= high) & (here.gradient < 0.0))
         step, gain = _trusted_step(H, np.where(held, 0.0, here.gradient), ~held, radius)
         if gain < enough:
             break
-        there = _Point.at(model, sizes, np.clip(here.logs + step, low, high))
+        there = Point.at(model, sizes, np.clip(here.logs + step, low, high))
         step = there.logs - here.logs
         expected = -float(here.gradient @ step + 0.5 * step @ H @ step)
         share = (here.value - there.value) / max(expected, 1e-300)
@@ -78,25 +71,26 @@ def fitted(model: NoiseModel, sizes: Sizes, start: Array, *, enough: float = ENO
             here = there
             if number < AVERAGED:
                 H = here.information
-    return Fitted(sizes, here.logs, here.value, here.estimate)
+    return Fitted(sizes, here.logs, here.value, here.eliminated.estimate)
 
 
 @dataclass(frozen=True)
-class _Point:
-    """-2 log of the posterior density at some components, its gradient, and what its curvature comes from."""
+class Point:
+    """-2 log of the posterior density of the logarithms, up to a constant, and its gradient."""
 
     sizes: Sizes
     logs: Array
     value: float
     gradient: Array
-    estimate: Estimate
     eliminated: Eliminated
 
     @staticmethod
-    def at(model: NoiseModel, sizes: Sizes, logs: Array) -> _Point:
-        estimate, eliminated = model.eliminated(sizes.values(logs))
+    def at(model: NoiseModel, sizes: Sizes, logs: Array) -> Point:
+        """At logarithms (k,) of the active components."""
+        eliminated = model.eliminated(sizes.values(logs))
+        value = eliminated.estimate.minus_two_log + sizes.penalty(logs)
         gradient = eliminated.gradient_by(sizes.active) + sizes.penalty_gradient(logs)
-        return _Point(sizes, logs, estimate.minus_two_log + sizes.penalty(logs), gradient, estimate, eliminated)
+        return Point(sizes, logs, value, gradient, eliminated)
 
     @property
     def information(self) -> Array:
@@ -131,14 +125,15 @@ def _updated(H: Array, step: Array, change: Array) -> Array:
     return found
 
 
-def curvature(gradient: Callable[[Array], Array], at: Array, low: Array, high: Array) -> Array:
-    """The second derivative (k, k) of a function by central differences of its gradient, one-sided at the bounds."""
-    k = len(at)
-    H = np.empty((k, k))
-    for i in range(k):
-        after, before = at.copy(), at.copy()
-        after[i], before[i] = min(at[i] + STEP, high[i]), max(at[i] - STEP, low[i])
-        H[i] = (gradient(after) - gradient(before)) / (after[i] - before[i])
+def curvature(model: NoiseModel, sizes: Sizes, at: Array) -> Array:
+    """The second derivative (k, k) of `Point.value` by central differences of its gradient, one-sided at the bounds."""
+    low, high = np.array(sizes.bounds).T
+    rows = []
+    for step in STEP * np.eye(len(at)):
+        after, before = np.minimum(at + step, high), np.maximum(at - step, low)
+        change = Point.at(model, sizes, after).gradient - Point.at(model, sizes, before).gradient
+        rows.append(change / (after - before).sum())
+    H = np.array(rows)
     symmetric: Array = 0.5 * (H + H.T)
     return symmetric
 
@@ -205,12 +200,7 @@ class Mixture:
             return float(np.inf)
         if found >= m * fdtri(m, FEWEST, CONFIDENCE):
             return FEWEST
-        low, high = np.log(FEWEST), np.log(1e6)
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            is_large = m * fdtri(m, np.exp(middle), CONFIDENCE) > found
-            low, high = (middle, high) if is_large else (low, middle)
-        return float(np.exp(low))
+        return float(fdtridfd(m, CONFIDENCE, found / m))
 
     def share_of(self, rows: Array, added: Array, probability: float = 1.0) -> float:
         """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
@@ -259,7 +249,7 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
     """The mixture about the most probable components; the unknowns are those of the ``whole`` model."""
     k = len(fit.logs)
     low, high = np.array(fit.sizes.bounds).T
-    H = 0.5 * curvature(lambda logs: value_and_gradient(model, fit.sizes, logs)[1], fit.logs, low, high)
+    H = 0.5 * curvature(model, fit.sizes, fit.logs)
     values, vectors = np.linalg.eigh(H)
     spread = vectors / np.sqrt(np.maximum(values, 0.5 / PRIOR**2))
     drawn = normal_points(samples, k)
@@ -281,20 +271,12 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
 
 #: A component is at least and at most this many times the typical size of what residuals show of it.
 SMALLEST, LARGEST = 1e-3, 30.0
-
-
 #: The logarithm of a standard deviation is known before the data with this standard deviation.
 PRIOR = 2.0
-
-
 #: That of a component that the user states.
 STATED = 0.02
-
-
 #: A component is expected at this share of the residuals.
 EXPECTED = 0.3
-
-
 #: Errors that vary with the configuration are expected at this share: an arm in order shows less of them than noise.
 EXPECTED_SYSTEMATIC = 0.15
 

@@ -131,22 +131,14 @@ def unit_of(sigma: dict[C, float]) -> Array:
 
 def drift_columns(rows: Rows, sigma: dict[C, float], prior: DriftPrior) -> Array:
     """G (N, 6, s): the residual's change by the unit states of its instant."""
-    found: Array = drift_directions(rows, prior) * np.tile(unit_of(sigma), rows.instants.chains)
-    return found
-
-
-def drift_directions(rows: Rows, prior: DriftPrior) -> Array:
-    """The same by states in rad, m and logarithms of the scale."""
-    own, N = own_directions(rows, prior), len(rows.residual)
-    if rows.instants.chains == 1:
-        return own
-    result = np.zeros((N, 6, rows.instants.chains, TRACK))
-    result[np.arange(N), :, rows.instants.chain] = own
-    return result.reshape(N, 6, -1)
+    own = own_directions(rows, prior) * unit_of(sigma)
+    result = np.zeros((len(own), 6, rows.instants.chains, TRACK))
+    result[np.arange(len(own)), :, rows.instants.chain] = own
+    return result.reshape(len(own), 6, -1)
 
 
 def own_directions(rows: Rows, prior: DriftPrior) -> Array:
-    """The same (N, 6, 7) by the states of each measurement's own track."""
+    """The residual's change (N, 6, 7) by its own track's state in rad, m and the logarithm of the scale."""
     N = len(rows.residual)
     own = np.zeros((N, 6, TRACK))
     back = se3.inverse(rows.predicted)

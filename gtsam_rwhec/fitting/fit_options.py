@@ -269,11 +269,11 @@ class CornerOptions:
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
-        every = self.stated.values() if isinstance(self.stated, Mapping) else (self.stated,)
-        for value, words, choices in (*((each, "stated", Stated) for each in every), (self.about, "about", About)):
-            if not is_one_of(value, get_args(choices)):
+        check_choices(self, {"about": About})
+        for value in self.stated.values() if isinstance(self.stated, Mapping) else (self.stated,):
+            if not is_one_of(value, get_args(Stated)):
                 raise OptionError(
-                    f"CornerOptions.{words}={brief(value)} is not one of {', '.join(map(repr, get_args(choices)))}"
+                    f"CornerOptions.stated={brief(value)} is not one of {', '.join(map(repr, get_args(Stated)))}"
                 )
         shares = self.size_share.values() if isinstance(self.size_share, Mapping) else (self.size_share,)
         others = (("warp_m", self.warp_m), ("corners_m", self.corners_m))

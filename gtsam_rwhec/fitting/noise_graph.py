@@ -29,8 +29,8 @@ from gtsam_rwhec.fitting.noise_likelihood import Estimate, NoiseModel
 from gtsam_rwhec.fitting.noise_rows import prior_terms
 from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
 from gtsam_rwhec.fitting.pair_data import PairData, square_root_information
-from gtsam_rwhec.fitting.pose_fit import linearized
-from gtsam_rwhec.fitting.pose_graph import add_fixed, add_priors, optimise
+from gtsam_rwhec.fitting.pose_fit import residuals
+from gtsam_rwhec.fitting.pose_graph import add_knowledge, optimise
 from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements, scale_of
 from gtsam_rwhec.fitting.unknowns import State, Variables
@@ -80,7 +80,7 @@ class _Effects:
     def of(model: NoiseModel, sigma: dict[C, float]) -> _Effects:
         rows = model.rows
         N, index = len(rows.residual), rows.instants.index
-        E = rows.twist[model.side] * np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
+        E = model.carrier(sigma)
         shared = (np.bincount(index, minlength=rows.instants.count) > 1) & bool(E.any())
         alone = ~shared[index]
         covariance = model.white(sigma)
@@ -138,8 +138,7 @@ def graph_of(
         keys[name] = key
         values.insert(key, np.zeros(size))
         graph.add(gtsam.PriorFactorVector(key, np.zeros(size), gtsam.noiseModel.Unit.Create(size)))
-    add_priors(graph, variables, problem, "geodesic")
-    add_fixed(graph, variables, problem)
+    add_knowledge(graph, variables, problem, "geodesic")
     return FactorGraph(graph, values, keys)
 
 
@@ -291,10 +290,9 @@ def _optimum(
 
 def _cost_without_effects(task: Task, model: NoiseModel, sigma: dict[C, float], state: State) -> float:
     """The graph's cost at an estimate, with all effects at zero."""
-    at = linearized(task.data, task.variables, state)
-    residual = np.concatenate([at[item.pair].residual for item in task.data])[model.rows.instants.order]
+    residual = np.concatenate(residuals(task.data, task.variables, state))[model.rows.instants.order]
     whitened = np.einsum("nij,nj->ni", _Effects.of(model, sigma).root, residual)
-    priors = prior_terms(task.problem, task.variables, state, task.layout, model.basis)[2]
+    priors = prior_terms(task.problem, task.variables, state, model.basis)[2]
     return 0.5 * float((whitened**2).sum()) + priors
 
 

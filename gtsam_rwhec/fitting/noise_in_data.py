@@ -334,8 +334,7 @@ def widening(task: Task, found: Settled) -> Array:
     if count < 2 * BLOCKS:
         return wider
     sigma = found.fit.sizes.values(found.fit.logs)
-    carrier = np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
-    E = rows.twist[found.model.side] * carrier
+    E = found.model.carrier(sigma)
     root = np.linalg.cholesky(found.model.white(sigma) + E @ E.transpose(0, 2, 1))
     J = np.linalg.solve(root, rows.by_unknowns.by(basis).whole)
     r = np.linalg.solve(root, rows.residual[:, :, None])[:, :, 0]

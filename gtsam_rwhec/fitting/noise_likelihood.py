@@ -18,7 +18,7 @@ import numpy as np
 
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, EliminatedDrift, own_directions
 from gtsam_rwhec.fitting.fit_options import About, C
-from gtsam_rwhec.fitting.instant_products import Measurements, Reduced, white_terms
+from gtsam_rwhec.fitting.instant_products import Measurements, Reduced, carrier_of, white_terms
 from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.fitting.noise_rows import Rows
 from gtsam_rwhec.geometry.poses import Array
@@ -62,12 +62,7 @@ class NoiseModel:
 
     def evaluate(self, sigma: dict[C, float]) -> Estimate:
         """The restricted likelihood at standard deviations, with the estimate and its covariance."""
-        return self.eliminated(sigma)[0]
-
-    def value_and_gradient(self, sigma: dict[C, float], active: tuple[C, ...]) -> tuple[Estimate, Array]:
-        """The same, and d(-2 l) / d log sigma (k,) of the active components."""
-        estimate, eliminated = self.eliminated(sigma)
-        return estimate, eliminated.gradient_by(active)
+        return self.eliminated(sigma).estimate
 
     def white(self, sigma: dict[C, float]) -> Array:
         """D (N, 6, 6): the noise of single measurements, of B and of stamps."""
@@ -77,31 +72,30 @@ class NoiseModel:
         )
         return found
 
+    def carrier(self, sigma: dict[C, float]) -> Array:
+        """E (N, 6, 6): the residual's change by the unit twists of A."""
+        found: Array = self.rows.twist[self.side] * carrier_of(sigma)
+        return found
+
     @cached_property
     def _measurements(self) -> Measurements:
         directions = None if self.drift is None else own_directions(self.rows, self.drift)
         return Measurements.of(self.rows, self.side, self.basis, directions)
 
     @cached_property
-    def _features(self) -> tuple[Array, Array]:
-        """f (T, k) of the instants, and f f' (T, k k)."""
-        f = self.features[self.rows.instants.first]
-        return f, (f[:, :, None] * f[:, None, :]).reshape(len(f), -1)
-
-    @cached_property
     def _orders(self) -> dict[int, EliminationOrder]:
         """The order of elimination of the systematic errors and the unknowns, by their number."""
         return {}
 
-    def eliminated(self, sigma: dict[C, float]) -> tuple[Estimate, Eliminated]:
+    def eliminated(self, sigma: dict[C, float]) -> Eliminated:
         """The same, and what is left of the elimination for derivatives."""
         measured = self._measurements.reduced(sigma)
         systematic = np.repeat([sigma[C.SYSTEMATIC_ROTATION], sigma[C.SYSTEMATIC_TRANSLATION]], 3)
-        f, ff = self._features
+        f = self.features[self.rows.instants.first]
         if not systematic.any():
-            f, ff = f[:, :0], ff[:, :0]
+            f = f[:, :0]
         q, log_det, drift = 6 * f.shape[1], measured.log_det, None
-        gram = _products(measured, systematic, f, ff)
+        gram = _products(measured, systematic, f)
         if self.drift is not None:
             drift = EliminatedDrift.of(self.drift, sigma, measured.cross[:, 6:], systematic, f)
             log_det += drift.log_det
@@ -123,10 +117,10 @@ class NoiseModel:
             np.ascontiguousarray(covariance[q:, q:]),
             0.5 * squares + self.prior_cost,
         )
-        return estimate, Eliminated(measured, drift, covariance, mean, systematic, f, ff)
+        return Eliminated(estimate, measured, drift, covariance, mean, systematic, f)
 
 
-def _products(measured: Reduced, systematic: Array, f: Array, ff: Array) -> Array:
+def _products(measured: Reduced, systematic: Array, f: Array) -> Array:
     """Those (q + m, q + m) of the columns [u | d | r]: a systematic error's are E f_k, its products those of E."""
     (T, k), cross, m = f.shape, measured.cross, measured.of.m
     q = 6 * k
@@ -136,8 +130,11 @@ def _products(measured: Reduced, systematic: Array, f: Array, ff: Array) -> Arra
         mixed = (f.T @ cross[:, :6, :m].reshape(T, -1)).reshape(k, 6, m) * systematic[:, None]
         gram[:q, q:] = mixed.transpose(1, 0, 2).reshape(q, m)
         gram[q:, :q] = gram[:q, q:].T
-        own = cross[:, :6, m : m + 6] * (systematic[:, None] * systematic)
-        gram[:q, :q] = (ff.T @ own.reshape(T, 36)).reshape(k, k, 6, 6).transpose(2, 0, 3, 1).reshape(q, q)
+        own = (cross[:, :6, m : m + 6] * (systematic[:, None] * systematic)).reshape(T, 36)
+        both = np.empty((k, k, 36))
+        for i in range(k):  # symmetric
+            both[i, i:] = both[i:, i] = (f[:, i:] * f[:, i, None]).T @ own
+        gram[:q, :q] = both.reshape(k, k, 6, 6).transpose(2, 0, 3, 1).reshape(q, q)
     return gram
 
 
@@ -145,6 +142,7 @@ def _products(measured: Reduced, systematic: Array, f: Array, ff: Array) -> Arra
 class Eliminated:
     """What one evaluation of the likelihood leaves for its gradient."""
 
+    estimate: Estimate
     #: The single measurements.
     measured: Reduced
     drift: EliminatedDrift | None
@@ -154,9 +152,8 @@ class Eliminated:
     mean: Array
     #: (6,): Standard deviations of the systematic errors.
     systematic: Array
-    #: (T, k) and (T, k k): f of each instant, and f f'; k = 0 without systematic errors.
+    #: (T, k): f of each instant; k = 0 without systematic errors.
     features: Array
-    products: Array
 
     @cached_property
     def states(self) -> Array:
@@ -208,9 +205,10 @@ class Eliminated:
         if q:
             mixed = self.features @ G[:q, q:].reshape(6, k, m).transpose(1, 0, 2).reshape(k, 6 * m)
             by_cross[:, :6, :m] = 2.0 * self.systematic[:, None] * mixed.reshape(T, 6, m)
-            own = G[:q, :q].reshape(6, k, 6, k).transpose(1, 3, 0, 2).reshape(k * k, 36)
+            own = G[:q, :q].reshape(6, k, 6, k).transpose(1, 3, 0, 2).reshape(k, k * 36)
+            of_twists = self.features[:, None] @ (self.features @ own).reshape(T, k, 36)
             both = self.systematic[:, None] * self.systematic
-            by_cross[:, :6, m : m + 6] = both * (self.products @ own).reshape(T, 6, 6)
+            by_cross[:, :6, m : m + 6] = both * of_twists.reshape(T, 6, 6)
         if self.drift is not None:
             by_cross[:, 6:], by_drift = self.drift.gradient(G)
             result |= by_drift

@@ -176,12 +176,12 @@ def agreeing(
             if step.farthest < SETTLED:
                 break
             state = moved(state, variables, task.layout, there.basis @ step.step)
-    _, eliminated = there.eliminated(sigma)
+    eliminated = there.eliminated(sigma)
     rows = there.rows
     left = eliminated.left(eliminated.measured.of.columns)
     keep = np.concatenate([inliers[item.pair] for item in data])[rows.instants.order]
     honest = replace(there, rows=replace(rows, given=rows.given * np.where(keep, 1.0, WEIGHTLESS)[:, None, None]))
-    E = rows.twist[found.model.side] * np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
+    E = there.carrier(sigma)
     estimate = found.model.evaluate(sigma)
     J = rows.by_unknowns
     covariance = honest.white(sigma) + E @ E.transpose(0, 2, 1)

@@ -10,8 +10,10 @@ track; u_k are the arm's systematic errors, which vary smoothly with its configu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
+import gtsam
 import numpy as np
 from rwhec_factors import se3
 
@@ -19,7 +21,8 @@ from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.pose_fit import linearized
-from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
+from gtsam_rwhec.fitting.pose_graph import add_priors, normal_equations_of
+from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.fitting.variance_components import jacobian_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
@@ -208,7 +211,7 @@ class Rows:
                 block.append(part)
         stacked = [np.concatenate(block)[instants.order] for block in blocks]
         residual, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
-        by_unknowns = SparseColumns.of(jacobians, len(layout.unit)).of_rows(instants.order)
+        by_unknowns = SparseColumns.of(jacobians, len(layout.unit))[instants.order]
         A = np.concatenate([item.residuals.A for item in data])[instants.order]
         rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
         return Rows(
@@ -236,12 +239,7 @@ class Rows:
             instants.order[rows], np.flatnonzero(np.r_[True, np.diff(index) != 0]), index, instants.chain[rows],
             instants.chains, step, None if instants.seconds is None else instants.seconds[kept],
         )  # fmt: skip
-        return Rows(
-            fewer, self.residual[rows], self.by_unknowns.of_rows(rows), self.given[rows], self.axis[rows],
-            {side: twist[rows] for side, twist in self.twist.items()},
-            {side: moving[rows] for side, moving in self.configuration.items()},
-            self.rate[rows], self.predicted[rows], self.length[rows],
-        )  # fmt: skip
+        return Rows(fewer, *(_taken(getattr(self, part.name), rows) for part in fields(self)[1:]))
 
     def features(self, side: About) -> Array:
         """f (N, k): the centred principal components of the configurations."""
@@ -253,6 +251,11 @@ class Rows:
         kept = s**2 > SMALLEST_SPREAD * max(float((s**2).sum()), 1e-300)
         found: Array = centred @ directions[kept].T
         return found
+
+
+def _taken(part: Any, rows: np.ndarray) -> Any:
+    """Some rows of a part, or of each side of it."""
+    return {side: of[rows] for side, of in part.items()} if isinstance(part, dict) else part[rows]
 
 
 def _configuration(moving: Array) -> Array:
@@ -309,7 +312,7 @@ class SparseColumns:
             first += len(J)
         return SparseColumns(values, columns, count)
 
-    def of_rows(self, rows: np.ndarray) -> SparseColumns:
+    def __getitem__(self, rows: np.ndarray) -> SparseColumns:
         """Those of some rows."""
         return SparseColumns(self.values[rows], self.places[rows], self.count)
 
@@ -355,30 +358,10 @@ def summed(values: Array, places: np.ndarray, shape: tuple[int, ...]) -> Array:
     return found.reshape(shape).astype(np.float64, copy=False)  # counts of none are integers
 
 
-def prior_terms(
-    problem: Problem, variables: Variables, state: State, layout: JointCovariance, basis: Array
-) -> tuple[Array, Array, float]:
+def prior_terms(problem: Problem, variables: Variables, state: State, basis: Array) -> tuple[Array, Array, float]:
     """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis."""
-    size, cost = len(layout.unit), 0.0
-    information, gradient = np.zeros((size, size)), np.zeros(size)
-    for name, priors in problem.priors.items():
-        unknown = Unknown(UnknownKind.FRAME, name)
-        if unknown not in layout.slots:
-            continue
-        place, pose = layout.slots[unknown], (state.X | state.Y)[name].matrix()
-        for prior in priors:
-            if prior.kappa is not None:
-                omega = se3.so3_logmap((prior.transform[:3, :3].T @ pose[:3, :3])[None])
-                # Log(R Expmap(d)) = omega + Jr^-1(omega) d, and Jr^-1(omega) = Jl^-1(-omega)
-                J = se3.so3_left_jacobian_inverse(-omega)[0]
-                rows = slice(place.start, place.start + 3)
-                information[rows, rows] += 2.0 * prior.kappa * J.T @ J
-                gradient[rows] += 2.0 * prior.kappa * J.T @ omega[0]
-                cost += prior.kappa * float(omega[0] @ omega[0])
-            if prior.sigma is not None:
-                R, away = pose[:3, :3], pose[:3, 3] - prior.transform[:3, 3]
-                rows = slice(place.start + 3, place.stop)
-                information[rows, rows] += np.eye(3) / prior.sigma**2
-                gradient[rows] += R.T @ away / prior.sigma**2
-                cost += 0.5 * float(away @ away) / prior.sigma**2
+    graph, values = gtsam.NonlinearFactorGraph(), variables.values(state)
+    add_priors(graph, variables, problem, "geodesic")
+    information, gradient = normal_equations_of(graph, values, variables)
+    cost = graph.error(values)
     return basis.T @ information @ basis, basis.T @ gradient, cost

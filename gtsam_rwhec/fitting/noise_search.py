@@ -89,7 +89,7 @@ class Task:
         rows = self._rows(state)
         drift = None if walk is None else DriftPrior.of(rows, walk)
         features = rows.features(side) if systematic else np.zeros((len(rows.residual), 0))
-        information, gradient, cost = prior_terms(self.problem, self.variables, state, self.layout, self.basis)
+        information, gradient, cost = prior_terms(self.problem, self.variables, state, self.basis)
         return NoiseModel(rows, side, self.basis, information, gradient, drift, features, cost)
 
     def model_like(self, model: NoiseModel, state: State) -> NoiseModel:

@@ -53,17 +53,13 @@ class PairData:
         """
         raw = problem.measurements(*pair)
         scale = problem.fixed_scales.get(pair.target, 1.0)
-        B = raw.B
-        covariance = raw.covariance_of_B()
-        if scale != 1.0:
-            unit = np.r_[1.0, 1.0, 1.0, np.full(3, 1.0 / scale)]
-            B = B.copy()
-            B[:, :3, 3] /= scale
-            covariance = covariance * unit[:, None] * unit
+        unit = np.r_[1.0, 1.0, 1.0, np.full(3, 1.0 / scale)]
+        B = raw.B.copy()
+        B[:, :3, 3] /= scale
         return PairData(
             pair,
             BatchResiduals(raw.A, B, twists=None if paths is None else paths.twists()),
-            covariance,
+            raw.covariance_of_B() * unit[:, None] * unit,
             None if options.carrier_noise is None else carrier_covariances(options.carrier_noise, pair, raw.A),
             raw.stamps_ns,
             paths,

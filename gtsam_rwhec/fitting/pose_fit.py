@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from rwhec_factors.batch import Linearization
+from rwhec_factors.batch import BatchResiduals, Linearization
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import NoiseError, NotConvergedWarning, WeightsWarning
@@ -25,10 +26,11 @@ from gtsam_rwhec.fitting.pair_data import (
     group_label,
     group_of,
     largest_change,
+    measurement_covariance,
     residual_covariance,
     square_root_information,
 )
-from gtsam_rwhec.fitting.pose_graph import Optimum, add_summary, information_of, optimise, summary_of
+from gtsam_rwhec.fitting.pose_graph import Optimum, add_summary, information_of, optimise
 from gtsam_rwhec.fitting.unknowns import State, Variables, carrier_key
 from gtsam_rwhec.fitting.variance_components import SMALLEST, VarianceComponents, from_measurements, from_moments
 from gtsam_rwhec.geometry.poses import Array, to_pose3
@@ -79,6 +81,11 @@ class GeodesicModel:
         return self.options.robust in graphs.LOSSES
 
     @property
+    def first_loss(self) -> Robust | None:
+        """The loss that is minimised first, because it has no local minima; the loss of the options follows."""
+        return "huber" if self.is_m_estimate and self.options.robust != "huber" else None
+
+    @property
     def reweighs(self) -> bool:
         """Whether the weights depend on the estimate: they do if A's noise is propagated into the residual."""
         return self.options.carrier_noise is not None and self.carriers is None
@@ -101,31 +108,25 @@ class GeodesicModel:
             result[item.pair] = (rotation, translation)
         return result
 
-    def covariances(self, at: dict[Pair, Linearization], factors: FactorsByPair) -> dict[Pair, Array]:
-        """The covariances (N, 6, 6) of every pair's residuals."""
+    def covariances(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
+        """The covariances (N, 6, 6) of every pair's residuals at an estimate."""
+        if self.options.carrier_noise is None:
+            return {item.pair: measurement_covariance(item, factors[item.pair]) for item in self.data}
+        at = linearized(self.data, self.variables, state)
         return {item.pair: residual_covariance(item, at[item.pair], factors[item.pair]) for item in self.data}
 
     def graph(self, state: State, factors: FactorsByPair, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
         """The measurements' factors, weighted at an estimate; ``robust`` replaces the loss of the options."""
-        loss = self.options.robust if robust is None else robust
+        loss = robust or self.options.robust
         graph = gtsam.NonlinearFactorGraph()
         rest = [replace(item, residuals=item.at(state.offsets_s.get(item.pair.sensor, 0.0))) for item in self.data]
         if self.carriers is not None:
             graphs.add_with_carriers(graph, self.variables, rest, self.carriers, factors, loss)
             rest = [item for item in rest if item.pair not in self.carriers.index]
         if rest:
-            covariances = self.covariances(linearized(self.data, self.variables, state), factors)
-            if loss in graphs.LOSSES:
-                graphs.add_single(graph, self.variables, rest, covariances, loss)
-            else:
-                roots = {item.pair: square_root_information(covariances[item.pair]) for item in rest}
-                graphs.add_batches(graph, self.variables, rest, roots)
+            add = graphs.add_single if loss in graphs.LOSSES else graphs.add_batches
+            add(graph, self.variables, rest, self.covariances(state, factors), loss)
         return graph
-
-    @property
-    def first_loss(self) -> Robust | None:
-        """The loss that is minimised first, because it has no local minima; the loss of the options follows."""
-        return "huber" if self.is_m_estimate and self.options.robust != "huber" else None
 
     def values(self, state: State) -> gtsam.Values:
         """An estimate as GTSAM's values, with the measured carrier poses where they are variables."""
@@ -134,10 +135,6 @@ class GeodesicModel:
             for i, A in enumerate(self.carriers.A):
                 values.insert(carrier_key(i), to_pose3(A[:3, :3], A[:3, 3]))
         return values
-
-    def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
-        """The measurements' factors without a loss: the unknowns' information, up to ``inefficiency``."""
-        return self.graph(state, factors, "none")
 
     def inefficiency(self, state: State, factors: FactorsByPair) -> float:
         """The factor by which a loss widens least squares' covariance: Huber's E psi^2 / (E psi')^2, 6 dimensions.
@@ -150,24 +147,23 @@ class GeodesicModel:
         at = linearized(self.data, self.variables, state)
         whitened = [
             np.einsum("nij,nj->ni", square_root_information(covariance), at[pair].residual)
-            for pair, covariance in self.covariances(at, factors).items()
+            for pair, covariance in self.covariances(state, factors).items()
         ]
         lengths = np.linalg.norm(np.concatenate(whitened), axis=1)
         weight = np.array([loss.weight(d) for d in lengths])
         step = 1e-5
-        slope = np.array([(loss.weight(d + step) - loss.weight(max(d - step, 0.0))) for d in lengths]) / (
-            step + np.minimum(lengths, step)
-        )
+        before = np.maximum(lengths - step, 0.0)
+        change = [loss.weight(d + step) - loss.weight(b) for d, b in zip(lengths, before, strict=True)]
+        slope = np.array(change) / (lengths + step - before)
         unknowns = sum(unknown.dimension for unknown in self.variables.unknowns)
         degrees_of_freedom = max(6 * len(lengths) - unknowns, 1)
         square = float(np.sum((weight * lengths) ** 2)) / degrees_of_freedom
         gain = float(np.mean(weight + slope * lengths / 6.0))
         if not gain > 0.05:
             raise NoiseError(
-                f"robust={self.options.robust!r} gives the measurements a mean weight of only {weight.mean():.2g}: "
-                f"half of the residuals are beyond {np.median(lengths):.3g} standard deviations. Either the noise is "
-                "larger than given (take noise='estimate'), or outliers have pulled the certified solution away (take "
-                "robust='gnc', which needs no good start)"
+                f"robust={self.options.robust!r}: half of the residuals are beyond {np.median(lengths):.3g} standard "
+                "deviations. Either the noise is larger than given (take noise='estimate'), or outliers have pulled "
+                "the certified solution away (take robust='gnc', which needs no good start)"
             )
         return square / gain**2
 
@@ -180,41 +176,59 @@ class GeodesicModel:
             self.data, at, self.variables, joint, factors, groups, consistency=self.inlier_share
         )
         if self.is_m_estimate:
-            components = replace(components, factors=self._median_factors(at, factors, groups, components))
+            factors = self._median_factors(at, state, factors, groups, components.degrees_of_freedom)
+            components = replace(components, factors=factors)
         return components
 
     def _median_factors(
-        self, at: dict[Pair, Linearization], factors: FactorsByPair, groups: NoiseGroups, components: VarianceComponents
+        self,
+        at: dict[Pair, Linearization],
+        state: State,
+        factors: FactorsByPair,
+        groups: NoiseGroups,
+        degrees_of_freedom: dict[tuple[Group, str], float],
     ) -> FactorsByPair:
         """Variance factors that withstand outliers: medians of squared residuals over a chi-square's, 3 dimensions."""
-        squares: dict[tuple[Group, int], list[Array]] = {}
-        for pair, covariance in self.covariances(at, factors).items():
-            for i, block in enumerate((slice(0, 3), slice(3, 6))):
+        squares: dict[tuple[Group, str], list[Array]] = {}
+        for pair, covariance in self.covariances(state, factors).items():
+            for component, block in zip(COMPONENTS, (slice(0, 3), slice(3, 6)), strict=True):
                 r = at[pair].residual[:, block]
                 square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance[:, block, block]), r)
-                squares.setdefault((group_of(pair, groups), i), []).append(square)
+                squares.setdefault((group_of(pair, groups), component), []).append(square)
         ratios = {}
-        for (group, i), values in squares.items():
-            all_squares = np.concatenate(values)
-            degrees_of_freedom = components.degrees_of_freedom[group, COMPONENTS[i]] / (3.0 * len(all_squares))
-            ratios[group, i] = max(float(np.median(all_squares)) / float(chdtri(3, 0.5)) / degrees_of_freedom, SMALLEST)
+        for group, values in squares.items():
+            every = np.concatenate(values)
+            spare = degrees_of_freedom[group] / (3.0 * len(every))
+            ratios[group] = max(float(np.median(every)) / float(chdtri(3, 0.5)) / spare, SMALLEST)
         return {
-            pair: VarianceFactors(*(factor * ratios[group_of(pair, groups), i] for i, factor in enumerate(old)))
+            pair: VarianceFactors(
+                old.rotation * ratios[group_of(pair, groups), "rotation"],
+                old.translation * ratios[group_of(pair, groups), "translation"],
+            )
             for pair, old in factors.items()
         }
 
 
 def linearized(data: list[PairData], variables: Variables, state: State) -> dict[Pair, Linearization]:
     """Residuals and Jacobians of pairs at an estimate."""
+    return {item.pair: here.linearize(*at) for item, here, at in _placed(data, variables, state)}
+
+
+def residuals(data: list[PairData], variables: Variables, state: State) -> list[Array]:
+    """Residuals (N, 6) of pairs alone."""
+    return [here.residuals(*at) for _, here, at in _placed(data, variables, state)]
+
+
+def _placed(
+    data: list[PairData], variables: Variables, state: State
+) -> Iterator[tuple[PairData, BatchResiduals, tuple[Array, Array, float, float]]]:
+    """Each pair with its residuals about an estimate, and X, Y, the scale and the offset there."""
     frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
-    result = {}
     for item in data:
-        target, sensor = item.pair
         scale = variables.scale_of_pair.get(item.pair)
+        offset_s = state.offsets_s.get(item.pair.sensor, 0.0)
         alpha = 1.0 if scale is None else state.scales[scale]
-        offset_s = state.offsets_s.get(sensor, 0.0)
-        result[item.pair] = item.at(offset_s).linearize(frames[target], frames[sensor], alpha, offset_s)
-    return result
+        yield item, item.at(offset_s), (frames[item.pair.target], frames[item.pair.sensor], alpha, offset_s)
 
 
 @dataclass(frozen=True)
@@ -224,9 +238,10 @@ class ChordalModel:
     parts: list[Part]
     variables: Variables
 
-    #: The weights do not depend on the estimate.
+    #: The weights do not depend on the estimate, and there is no loss.
     reweighs = False
     has_constant_weights = True
+    first_loss = None
 
     @property
     def given_noise(self) -> dict[Pair, tuple[float, float]]:
@@ -240,21 +255,17 @@ class ChordalModel:
             for e, pair in enumerate(part.pairs)
         }
 
-    def graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
+    def graph(self, state: State, factors: FactorsByPair, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
         """The measurements' factors."""
         graph = gtsam.NonlinearFactorGraph()
         for part in self.parts:
             for e, pair in enumerate(part.pairs):
-                add_summary(graph, self.variables, pair, summary_of(part, e, factors[pair]))
+                add_summary(graph, self.variables, part, e, factors[pair])
         return graph
 
     def values(self, state: State) -> gtsam.Values:
         """An estimate as GTSAM's values."""
         return self.variables.values(state)
-
-    def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
-        """The graph itself, which has no loss."""
-        return self.graph(state, factors)
 
     def inefficiency(self, state: State, factors: FactorsByPair) -> float:
         """1: least squares has no loss."""
@@ -272,7 +283,7 @@ class ChordalModel:
                 cost, used = [], []
                 for i, component in enumerate(COMPONENTS):
                     alone = gtsam.NonlinearFactorGraph()
-                    add_summary(alone, self.variables, pair, summary_of(part, e, AS_STATED, component))
+                    add_summary(alone, self.variables, part, e, AS_STATED, component)
                     cost.append(alone.error(values))
                     information = information_of(alone, values, self.variables)
                     used.append(float(np.sum(joint.finite * information)) / factors[pair][i])
@@ -317,7 +328,7 @@ def fit(
     degrees_of_freedom: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
-    if isinstance(model, GeodesicModel) and model.first_loss is not None:
+    if model.first_loss is not None:
         graph = model.graph(state, factors, model.first_loss)
         graphs.add_knowledge(graph, variables, problem, options.residual)
         optimum = optimise(graph, values, options.max_iterations)
@@ -334,7 +345,7 @@ def fit(
         iterations += optimum.iterations
         before, state, values = state, variables.state(optimum.values), optimum.values
         if not model.has_constant_weights:
-            without_loss = model.information_graph(state, factors)
+            without_loss = model.graph(state, factors, "none")
             graphs.add_priors(without_loss, variables, problem, options.residual)
         information = information_of(without_loss, values, variables) / model.inefficiency(state, factors)
         settled = not model.reweighs or round_number > 0
@@ -354,19 +365,14 @@ def fit(
         if settled:
             break
     else:
-        few = sorted(degrees_of_freedom, key=lambda key: degrees_of_freedom[key])[:3]
-        where = ", ".join(
-            f"the {component} of {group_label(group)}: {degrees_of_freedom[group, component]:.2g}"
-            for group, component in few
-        )
+        where = [
+            f"{least:.2g} degrees of freedom for the {component} of {group_label(group)}"
+            for (group, component), least in sorted(degrees_of_freedom.items(), key=lambda item: item[1])[:1]
+        ]
         warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; these have the fewest degrees of "
-            f"freedom: {where}. "
-            + (
-                "The noise given for A may already explain the residuals: give less, or give B's noise (noise='given')"
-                if options.carrier_noise is not None
-                else "Join groups (noise_groups='sensor' or 'all'), or give sigma and kappa (noise='given')"
-            ),
+            f"the weights did not settle in {MAX_ROUNDS} rounds ({', '.join(where) or 'as time offsets change'}). If "
+            "the noise given for A already explains the residuals, give less; else join groups (noise_groups='all'), "
+            "give sigma and kappa (noise='given'), or estimate no time offsets",
             NotConvergedWarning,
             stacklevel=5,
         )

@@ -15,7 +15,13 @@ from rwhec_factors.priors import position_prior_factor, rotation_prior_factor, s
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.fitting.fit_options import ResidualKind, Robust
-from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, PoseComponent, measurement_covariance
+from gtsam_rwhec.fitting.pair_data import (
+    FactorsByPair,
+    PairData,
+    PoseComponent,
+    measurement_covariance,
+    square_root_information,
+)
 from gtsam_rwhec.fitting.unknowns import Variables, carrier_key, rows_of, slots_of
 from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.measurements import Pair
@@ -33,6 +39,7 @@ LOSSES: dict[str, tuple[Any, float]] = {
     "geman_mcclure": (gtsam.noiseModel.mEstimator.GemanMcClure, 4.846),
 }
 
+Isotropic = gtsam.noiseModel.Isotropic
 
 #: A step that lowers the cost by less than this is the last: what is left is far below a thousandth of a deviation.
 LAST_STEP = 1e-9
@@ -93,11 +100,19 @@ class CarrierVariables:
         return CarrierVariables(index, first, np.array(A), np.array(covariance))
 
 
-def summary_of(
-    part: Part, pair_index: int, factors: VarianceFactors, component: PoseComponent | None = None
-) -> EdgeSummary:
-    """A pair's moments as one summary, with variances multiplied by the factors; or the summary of one component."""
-    moments = part.moments
+def add_summary(
+    graph: gtsam.NonlinearFactorGraph,
+    variables: Variables,
+    part: Part,
+    pair_index: int,
+    factors: VarianceFactors,
+    component: PoseComponent | None = None,
+) -> None:
+    """One chordal factor for all measurements of a pair, or for one component of them, from moments (design fact 2).
+
+    Variances are multiplied by the factors.
+    """
+    moments, pair = part.moments, part.pairs[pair_index]
     one = slice(pair_index, pair_index + 1)
     translation, rotation = edge_forms(moments.translations(one), moments.rotations(one), moments.kappa[one])
     form = np.zeros((25, 25))
@@ -105,21 +120,14 @@ def summary_of(
         form += rotation[0] / factors.rotation
     if component != "rotation":
         form += translation[0] / factors.translation
-    target, sensor = part.pairs[pair_index]
-    scale = part.fixed_scales.get(target, 1.0)
-    if scale != 1.0:  # the form has measured lengths, the factor true lengths
-        unit = np.r_[np.full(7, scale), np.ones(18)]
-        form = form * unit[:, None] * unit
-    return EdgeSummary(
-        form=form,
+    # The form has measured lengths, the factor true lengths.
+    unit = np.r_[np.full(7, part.fixed_scales.get(pair.target, 1.0)), np.ones(18)]
+    summary = EdgeSummary(
+        form=form * unit[:, None] * unit,
         count=int(moments.count[pair_index]),
-        target_origin=part.frame_shift(target),
-        sensor_origin=part.frame_shift(sensor),
+        target_origin=part.frame_shift(pair.target),
+        sensor_origin=part.frame_shift(pair.sensor),
     )
-
-
-def add_summary(graph: gtsam.NonlinearFactorGraph, variables: Variables, pair: Pair, summary: EdgeSummary) -> None:
-    """One chordal factor for all measurements of a pair, from moments (design fact 2)."""
     target, sensor = variables.ends(pair)
     scale_key = variables.scale_key(pair)
     if pair.is_motion:
@@ -129,18 +137,20 @@ def add_summary(graph: gtsam.NonlinearFactorGraph, variables: Variables, pair: P
 
 
 def add_batches(
-    graph: gtsam.NonlinearFactorGraph, variables: Variables, data: list[PairData], roots: dict[Pair, Array]
+    graph: gtsam.NonlinearFactorGraph,
+    variables: Variables,
+    data: list[PairData],
+    covariances: dict[Pair, Array],
+    robust: Robust = "none",
 ) -> None:
-    """One geodesic factor for each pair, in which every measurement has its own weight."""
+    """One geodesic factor for each pair, in which every measurement has its own weight; there is no loss."""
     for item in data:
-        target, sensor = variables.ends(item.pair)
         graph.add(
             robot_world_hand_eye_batch_factor(
-                target,
-                sensor,
+                *variables.ends(item.pair),
                 item.residuals.A,
                 item.residuals.B,
-                roots[item.pair],
+                square_root_information(covariances[item.pair]),
                 scale_key=variables.scale_key(item.pair),
                 time_offset_key=variables.offset_key(item.pair),
                 twists=item.residuals.twists,
@@ -169,13 +179,11 @@ def add_single(
 ) -> None:
     """One geodesic factor for each measurement, so that GTSAM's losses weigh each measurement."""
     for item in data:
-        target, sensor = variables.ends(item.pair)
         twists = item.residuals.twists
         for i, (A, B) in enumerate(zip(item.residuals.A, item.residuals.B, strict=True)):
             graph.add(
                 robot_world_hand_eye_factor(
-                    target,
-                    sensor,
+                    *variables.ends(item.pair),
                     to_pose3(A[:3, :3], A[:3, 3]),
                     to_pose3(B[:3, :3], B[:3, 3]),
                     robust_noise(covariances[item.pair][i], robust),
@@ -210,14 +218,12 @@ def add_with_carriers(
     for item in data:
         if item.pair not in carriers.index:
             continue
-        target, sensor = variables.ends(item.pair)
         covariance = measurement_covariance(item, factors[item.pair])
         for i, B in enumerate(item.residuals.B):
             graph.add(
                 pose_robot_world_hand_eye_factor(
                     carrier_key(int(carriers.index[item.pair][i])),
-                    target,
-                    sensor,
+                    *variables.ends(item.pair),
                     to_pose3(B[:3, :3], B[:3, 3]),
                     robust_noise(covariance[i], robust),
                     scale_key=variables.scale_key(item.pair),
@@ -251,15 +257,10 @@ def add_priors(
             pose = to_pose3(prior.transform[:3, :3], prior.transform[:3, 3])
             key = variables.frames[name]
             if prior.kappa is not None:
-                noise = isotropic(np.sqrt(0.5 / prior.kappa))
+                noise = Isotropic.Sigma(3, np.sqrt(0.5 / prior.kappa))
                 graph.add(rotation_prior_factor(key, pose.rotation(), noise, residual=residual))
             if prior.sigma is not None:
-                graph.add(position_prior_factor(key, pose.translation(), isotropic(prior.sigma)))
-
-
-def isotropic(sigma: float) -> gtsam.noiseModel.Isotropic:
-    """Three equal standard deviations."""
-    return gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+                graph.add(position_prior_factor(key, pose.translation(), Isotropic.Sigma(3, prior.sigma)))
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ def optimise(
     for iteration in range(1, max_iterations + 1):
         linear = graph.linearize(values)
         for key, size in (held or {}).items():
-            noise = gtsam.noiseModel.Isotropic.Sigma(size, HELD)
+            noise = Isotropic.Sigma(size, HELD)
             linear.add(gtsam.JacobianFactor(key, np.eye(size), np.zeros(size), noise))
         try:
             step = linear.optimize()
@@ -312,6 +313,13 @@ def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, vari
 
     ``graph`` has no constraints of fixed frames: their rows are left out here.
     """
+    return normal_equations_of(graph, values, variables)[0]
+
+
+def normal_equations_of(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, variables: Variables
+) -> tuple[Array, Array]:
+    """The information as of ``information_of``, and the cost's gradient (d,) by the same unknowns."""
     linear = graph.linearize(values)
     keys = variables.keys
     present = set(linear.keyVector())
@@ -325,15 +333,15 @@ def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, vari
                 "it is given about, moves frames far away by very much. Give the noise about the other carrier "
                 "(CarrierNoise.about), or take a world origin near the measurements"
             ) from error
-    seen = slots_of(unknown for unknown, key in keys.items() if key in present)
-    ordering = gtsam.Ordering()
-    for unknown in seen:
-        ordering.push_back(keys[unknown])
-    dense = linear.hessian(ordering)[0] if seen else np.zeros((0, 0))
     slots = slots_of(variables.unknowns)
+    seen = [unknown for unknown in slots if keys[unknown] in present]
     size = sum(unknown.dimension for unknown in slots)
-    information = np.zeros((size, size))
-    both = [unknown for unknown in slots if unknown in seen]
-    rows, columns = rows_of(slots, both), rows_of(seen, both)
-    information[np.ix_(rows, rows)] = dense[np.ix_(columns, columns)]
-    return information
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    if seen:
+        ordering = gtsam.Ordering()
+        for unknown in [*seen, *(u for u, key in keys.items() if key in present and u not in slots)]:
+            ordering.push_back(keys[unknown])
+        rows = rows_of(slots, seen)
+        whole, right = linear.hessian(ordering)
+        information[np.ix_(rows, rows)], gradient[rows] = whole[: len(rows), : len(rows)], -right[: len(rows)]
+    return information, gradient

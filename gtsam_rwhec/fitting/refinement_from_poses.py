@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import count
 
 import gtsam
 import numpy as np
@@ -28,7 +27,7 @@ from gtsam_rwhec.fitting.joint_covariance import FreeSpace, JointCovariance, fre
 from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, group_of, local_paths, residual_covariance
 from gtsam_rwhec.fitting.pose_fit import ChordalModel, GeodesicModel, Model, SettledFit, fit, linearized
 from gtsam_rwhec.fitting.refined import FactorGraph, Movement, PairNoise, Refined
-from gtsam_rwhec.fitting.robust_solution import Inliers, robust_solution, until_inliers_stay
+from gtsam_rwhec.fitting.robust_solution import Inliers, robust_solution
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
@@ -158,26 +157,22 @@ def _chosen_under_full_noise(
     single = replace(options, carrier_model="propagated")
     threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
     factors: FactorsByPair = {}
-    steps = count(1)
-
-    def fitted(chosen: Inliers) -> tuple[Solution, SettledFit, Variables]:
-        nonlocal factors
-        tell(f"choosing the inliers under the full noise, step {next(steps)} of at most {MAX_CHOICES}")
-        problem = selected(whole, chosen)
-        solution = start if chosen is inliers else solve(problem)
-        variables = _variables(whole, problem, options)
-        model = GeodesicModel.of(_kept(problem, data, chosen), variables, single)
-        settled = fit(problem, model, variables, variables.start(solution), single, estimates, tell, factors)
-        factors = settled.factors
-        return solution, settled, variables
-
-    def judged(answer: tuple[Solution, SettledFit, Variables]) -> Inliers:
-        _, settled, variables = answer
-        return inliers_of(data, variables, variables.state(settled.optimum.values), settled.factors, threshold)
-
+    solution, chosen = start, inliers
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)  # the last fit has its own
-        (solution, _, _), chosen = until_inliers_stay(fitted, judged, inliers, MAX_CHOICES)
+        for step in range(1, MAX_CHOICES + 1):
+            tell(f"choosing the inliers under the full noise, step {step} of at most {MAX_CHOICES}")
+            problem = selected(whole, chosen)
+            solution = start if step == 1 else solve(problem)
+            variables = _variables(whole, problem, options)
+            model = GeodesicModel.of(_kept(problem, data, chosen), variables, single)
+            settled = fit(problem, model, variables, variables.start(solution), single, estimates, tell, factors)
+            factors = settled.factors
+            state = variables.state(settled.optimum.values)
+            again = inliers_of(data, variables, state, factors, threshold)
+            if step == MAX_CHOICES or all(np.array_equal(again[pair], mask) for pair, mask in chosen.items()):
+                break
+            chosen = again
     return solution, chosen, factors
 
 

@@ -19,12 +19,11 @@ Every stage has a bound on its number of fits, so that no measurements make it r
 
 from __future__ import annotations
 
-import contextlib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from scipy.special import chdtr, chdtri
@@ -43,7 +42,6 @@ from gtsam_rwhec.solver.solution import Solution, solve
 NoiseScale = Literal["given", "estimate"]
 #: By pair, (N,) booleans: which measurements count.
 Inliers = dict[Pair, np.ndarray]
-Answer = TypeVar("Answer")
 
 #: Mu grows by this factor in an iteration (the paper's value).
 GRADUATION = 1.4
@@ -84,23 +82,6 @@ class RobustSolution:
     solution: Solution
     inliers: Inliers
     variance_factors: VarianceFactors
-
-
-def until_inliers_stay(
-    fit: Callable[[Inliers], Answer], judge: Callable[[Answer], Inliers], first: Inliers, most: int
-) -> tuple[Answer, Inliers]:
-    """Fit the inliers and judge all measurements by the fit, in turns, until the choice stays the same.
-
-    At most so many fits are made; the inliers that are returned are those of the last one.
-    """
-    inliers = first
-    for number in range(1, most + 1):
-        answer = fit(inliers)
-        again = judge(answer) if number < most else inliers
-        if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
-            break
-        inliers = again
-    return answer, inliers
 
 
 @one_blas_thread()
@@ -169,25 +150,21 @@ def _doubts(work: TruncatedLeastSquares, inliers: Inliers, noise_scale: NoiseSca
             f"{problem.number_of_measurements} measurements are too few to tell outliers from noise that is not known: "
             "all of them count. Measure more, or give sigma and kappa (noise='given')"
         )
-    counts = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
-    suspect = {name: (good, total) for name, (good, total) in counts.items() if good < SUSPECT * total}
-    named = [
-        f"{name} ({good} of {total}{'' if good else ': left out'})"
-        for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
-    ]
-    named += [
-        f"{pair} ({mask.sum()} of {len(mask)})"
+    frames = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
+    suspect = {name: (good, total) for name, (good, total) in frames.items() if good < SUSPECT * total}
+    doubted = dict(sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1]))
+    doubted |= {
+        str(pair): (int(mask.sum()), len(mask))
         for pair, mask in inliers.items()
-        if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
-    ]
+        if mask.sum() < SUSPECT * len(mask) and not suspect.keys() & set(pair)
+    }
+    named = [f"{name} ({good} of {total}{'' if good else ': left out'})" for name, (good, total) in doubted.items()]
     kept, total = sum(int(mask.sum()) for mask in inliers.values()), sum(map(len, inliers.values()))
     if kept < SUSPECT * total:
-        check = "check the frame convention, the stamps, and the names of targets"
-        if noise_scale == "given":
-            check = "if sigma and kappa may be too small, take noise='estimate'; else check the names of frames"
         said.append(
             f"only {kept} of {total} measurements agree to within {np.sqrt(work.threshold):.3g} standard deviations; "
-            f"{check}"
+            "check the frame convention, the stamps and the names of frames, and take noise='estimate' if sigma and "
+            "kappa may be too small"
         )
     elif named:
         more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
@@ -235,12 +212,11 @@ class TruncatedLeastSquares:
         if not everything.has_positive_scales and self.problem.scale == "per_target":
             everything = with_scales_of_targets_alone(self.problem, self.confidence, noise_scale, self.tell)
         if noise_scale == "given":
-            fit, _ = self.best([lambda: self.graduate(everything)])
+            fit, _ = self.best([partial(self.graduate, everything)])
             self.threshold = inlier_threshold(self.confidence, len(everyone))
             return self.settle(fit)
-        halves = self.trim(everything)
-        fit, _ = self.settle(halves, estimates=True)
-        fit, _ = self.best([lambda: self.graduate(everything), lambda: fit])
+        fit, _ = self.settle(self.trim(everything), estimates=True)
+        fit, _ = self.best([partial(self.graduate, everything), lambda: fit])
         return self.admit(*self.settle(fit, estimates=True))
 
     @property
@@ -267,7 +243,7 @@ class TruncatedLeastSquares:
         unknowns = DOF * (count - 1) - self.spare_equations
         if unknowns > PULLED * DOF * count:
             return False
-        if not judged(self.problem, self.measured, everything, everyone, self.confidence, robust=True).agrees.all():
+        if not judged(self.problem, self.measured, everything, everyone, self.confidence, robust=True).all():
             return False
         self.factors = self._from_inliers(self.measured.squares(everything), everyone)
         self.threshold = inlier_threshold(self.confidence, count)
@@ -282,7 +258,7 @@ class TruncatedLeastSquares:
         first = keep
         self.threshold = inlier_threshold(self.confidence, len(keep))
         for step in range(1, MAX_ADMISSIONS + 1):
-            agrees = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first).agrees
+            agrees = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first)
             if (agrees == keep).all():
                 break
             try:
@@ -296,19 +272,14 @@ class TruncatedLeastSquares:
 
     def best(self, starts: list[Callable[[], WeightedFit]]) -> tuple[WeightedFit, np.ndarray]:
         """The best fit of all starts, each settled to weights of 0 and 1; a start with too few inliers is left out."""
-        ends: list[tuple[float, WeightedFit, np.ndarray]] = []
-        failure: UnderdeterminedError | CountError | None = None
-        for start in starts:
+        ends: list[tuple[WeightedFit, np.ndarray]] = []
+        for number, start in enumerate(starts, 1):
             try:
-                fit, keep = self.settle(start())
-                ends.append((self.truncated(self.distances(fit)), fit, keep))
-            except (UnderdeterminedError, CountError) as error:
-                failure = error
-        if not ends:
-            assert failure is not None
-            raise failure
-        _, fit, keep = min(ends, key=lambda end: end[0])
-        return self.vote(fit, keep)
+                ends.append(self.settle(start()))
+            except (UnderdeterminedError, CountError):
+                if number == len(starts) and not ends:
+                    raise
+        return self.vote(*min(ends, key=lambda end: self.truncated(self.distances(end[0]))))
 
     def vote(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
         """Move frames with outliers to where more of their measurements agree, where this lowers the cost."""
@@ -321,23 +292,24 @@ class TruncatedLeastSquares:
                 if good >= VOTED * total:
                     continue
                 self.tell(f"rejecting outliers: the measurements of {name} vote, {good} of {total} agree")
-                moved, less = by_vote(name, self.measured, moved, self.factors, self.threshold)
+                moved, less = by_vote(name, self.problem, moved, self.factors, self.threshold)
                 saved += less
             if saved <= 0.0:
                 break
-            with contextlib.suppress(UnderdeterminedError, CountError):
+            try:
                 candidate, kept = self.settle(moved)
-                if self.truncated(self.distances(candidate)) < least * (1.0 - PAYS):
-                    fit, keep = candidate, kept
-                    continue
-            break
+            except (UnderdeterminedError, CountError):
+                break
+            if self.truncated(self.distances(candidate)) >= least * (1.0 - PAYS):
+                break
+            fit, keep = candidate, kept
         return fit, keep
 
     def complete(self, fit: WeightedFit) -> WeightedFit:
         """The fit with poses by vote for frames that lost all their measurements, so that they may come back."""
         for name in self.free_frames:
             if name not in fit.poses:
-                fit, _ = by_vote(name, self.measured, fit, self.factors, self.threshold)
+                fit, _ = by_vote(name, self.problem, fit, self.factors, self.threshold)
         return fit
 
     def fit(self, weights: np.ndarray, previous: WeightedFit | None) -> WeightedFit:
@@ -469,11 +441,8 @@ def with_scales_of_targets_alone(
 
 def truncated_weights(d2: Array, mu: float, c2: float) -> Array:
     """Weights of the graduated truncated squares, eq. 14: 1 at first, then c / d sqrt(mu (mu + 1)) - mu, then 0."""
-    w = np.zeros_like(d2)
-    w[d2 <= mu / (mu + 1.0) * c2] = 1.0
-    between = (d2 > mu / (mu + 1.0) * c2) & (d2 < (mu + 1.0) / mu * c2)
-    w[between] = np.sqrt(c2 * mu * (mu + 1.0) / d2[between]) - mu
-    return np.clip(w, 0.0, 1.0)
+    with np.errstate(divide="ignore"):
+        return np.clip(np.sqrt(c2 * mu * (mu + 1.0) / d2) - mu, 0.0, 1.0)
 
 
 def inlier_count(name: str, inliers: Inliers) -> tuple[int, int]:

@@ -90,8 +90,8 @@ def at_physical_optimum(problem: Problem, parts: list[Part], fit: WeightedFit) -
     variables = Variables.of(problem, ())
     graph = gtsam.NonlinearFactorGraph()
     for part in inverse:
-        for e, pair in enumerate(part.pairs):
-            graphs.add_summary(graph, variables, pair, graphs.summary_of(part, e, AS_STATED))
+        for e in range(len(part.pairs)):
+            graphs.add_summary(graph, variables, part, e, AS_STATED)
     graphs.add_knowledge(graph, variables, problem, "chordal")
     poses = {name: to_pose3(T[:3, :3], T[:3, 3]) for name, T in fit.poses.items()}
     start = State(
@@ -161,38 +161,25 @@ class Measured:
     whitening_of_translation: Array | None
 
     @staticmethod
-    def of(problem: Problem) -> Measured:
-        """The measurements of a problem that kept them."""
-        raw = [problem.measurements(*pair) for pair in problem.pairs]
+    def of(problem: Problem, pairs: tuple[Pair, ...] | None = None) -> Measured:
+        """The measurements of a problem that kept them: of some pairs, in their order, or of all."""
+        pairs = problem.pairs if pairs is None else pairs
+        raw = [problem.measurements(*pair) for pair in pairs]
         whitening = whitening_of_translation = None
         if problem.has_covariances:
-            covariances = np.concatenate([one.covariance_of_B() for one in raw])
+            covariances = np.concatenate([np.empty((0, 6, 6)), *(one.covariance_of_B() for one in raw)])
             whitening = np.linalg.inv(np.linalg.cholesky(covariances))
             whitening_of_translation = np.linalg.inv(np.linalg.cholesky(covariances[:, 3:, 3:]))
+        bounds = np.cumsum([0, *(len(one.A) for one in raw)]).tolist()
         return Measured(
-            problem.pairs,
-            _rows_of([len(one.A) for one in raw]),
-            np.concatenate([one.A for one in raw]),
-            np.concatenate([one.B for one in raw]),
-            np.concatenate([one.sigma for one in raw]),
-            np.concatenate([one.kappa for one in raw]),
+            pairs,
+            tuple(slice(first, end) for first, end in pairwise(bounds)),
+            np.concatenate([np.empty((0, 4, 4)), *(one.A for one in raw)]),
+            np.concatenate([np.empty((0, 4, 4)), *(one.B for one in raw)]),
+            np.concatenate([np.empty(0), *(one.sigma for one in raw)]),
+            np.concatenate([np.empty(0), *(one.kappa for one in raw)]),
             whitening,
             whitening_of_translation,
-        )
-
-    def of_pairs(self, pairs: list[Pair]) -> Measured:
-        """The measurements of some pairs alone, in their order."""
-        rows = [self.rows[self.pairs.index(pair)] for pair in pairs]
-        index = np.concatenate([np.arange(one.start, one.stop) for one in rows]) if rows else np.zeros(0, dtype=int)
-        return Measured(
-            tuple(pairs),
-            _rows_of([one.stop - one.start for one in rows]),
-            self.A[index],
-            self.B[index],
-            self.sigma[index],
-            self.kappa[index],
-            None if self.whitening is None else self.whitening[index],
-            None if self.whitening_of_translation is None else self.whitening_of_translation[index],
         )
 
     def pair_of(self, index: int) -> Pair:
@@ -245,11 +232,6 @@ class Measured:
         return result
 
 
-def _rows_of(counts: list[int]) -> tuple[slice, ...]:
-    """The rows of each pair, one pair after another."""
-    return tuple(slice(int(first), int(end)) for first, end in pairwise(np.cumsum([0, *counts])))
-
-
 def _norms(whitening: Array, error: Array) -> Array:
     white = np.einsum("nij,nj->ni", whitening, error)
     square: Array = np.einsum("ni,ni->n", white, white)
@@ -261,13 +243,13 @@ PROPOSALS = 50
 
 
 def by_vote(
-    name: str, measured: Measured, fit: WeightedFit, factors: VarianceFactors, threshold: float
+    name: str, problem: Problem, fit: WeightedFit, factors: VarianceFactors, threshold: float
 ) -> tuple[WeightedFit, float]:
     """The fit with one frame moved to where most of its measurements agree, and the decrease of sum min(d^2, c^2).
 
     The frame may lack a pose before. The fit stays as given where no proposal is better. ``threshold`` is c^2.
     """
-    own = measured.of_pairs([pair for pair in measured.pairs if name in pair and not pair.is_motion])
+    own = Measured.of(problem, tuple(pair for pair in problem.pairs if name in pair and not pair.is_motion))
 
     def cost_of(candidate: WeightedFit) -> tuple[float, Array]:
         d = own.together(own.squares(candidate), factors)
@@ -276,7 +258,7 @@ def by_vote(
     before, d = cost_of(fit)
     best, least = fit, before
     order = np.argsort(np.minimum(d, np.finfo(float).max), kind="stable")
-    for index in order[np.unique(np.linspace(0, len(order) - 1, PROPOSALS).astype(int))] if len(order) else []:
+    for index in order[np.unique(np.linspace(0, len(order) - 1, PROPOSALS).astype(int))] if len(order) else ():
         T = _proposed(name, int(index), own, fit)
         if T is None:
             continue

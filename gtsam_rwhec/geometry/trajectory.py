@@ -56,26 +56,25 @@ class Trajectory:
         of a pose the gap is 0. Outside the trajectory the gap is infinite, and the pose is the nearest one.
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
-        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 0, len(self.T) - 1)
-        met = self.stamps_ns[after] == stamps_ns
-        before = np.where(met, after, np.maximum(after - 1, 0))
-        outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
-        gap_ns = self.stamps_ns[after] - self.stamps_ns[before]
-        inside = ~met & ~outside
+        before, after, gap_s = self._around(stamps_ns)
         poses = self.T[after].copy()
+        inside = (gap_s > 0.0) & np.isfinite(gap_s)
         first = self.T[before[inside]]
-        share = (stamps_ns[inside] - self.stamps_ns[before[inside]]) / gap_ns[inside]
+        share = (stamps_ns[inside] - self.stamps_ns[before[inside]]) * 1e-9 / gap_s[inside]
         step = se3.logmap(se3.inverse(first) @ self.T[after[inside]])
         poses[inside] = first @ se3.expmap(share[:, None] * step)
-        gap_s = np.where(outside, np.inf, np.where(met, 0.0, gap_ns * 1e-9))
         return poses, gap_s
 
     def gaps(self, stamps_ns: np.ndarray) -> Array:
         """The gaps (M,) of ``at``, seconds, without the poses."""
+        return self._around(stamps_ns)[2]
+
+    def _around(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray, Array]:
+        """The poses before and after each stamp, which are one where a stamp is met, and the gaps of ``at``."""
         after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 0, len(self.T) - 1)
         before = np.where(self.stamps_ns[after] == stamps_ns, after, np.maximum(after - 1, 0))
         outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
-        return np.where(outside, np.inf, (self.stamps_ns[after] - self.stamps_ns[before]) * 1e-9)
+        return before, after, np.where(outside, np.inf, (self.stamps_ns[after] - self.stamps_ns[before]) * 1e-9)
 
     def speeds(self) -> tuple[Array, Array]:
         """Angular (rad/s) and linear (m/s) speed at each pose, (N,): the faster of the steps before and after it."""

@@ -14,6 +14,14 @@ def values_of(variables: dict[int, gtsam.Pose3 | float]) -> gtsam.Values:
     return values
 
 
+def graph_of(*factors: gtsam.CustomFactor) -> gtsam.NonlinearFactorGraph:
+    """A graph of some factors."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
 def moved(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
     """The values with one variable moved along its tangent."""
     delta = gtsam.VectorValues()

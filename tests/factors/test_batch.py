@@ -6,14 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import D, E, S, U, W, X, Y
-from numeric_jacobians import check_jacobians
-from rwhec_factors import (
-    BatchResiduals,
-    robot_world_hand_eye_batch_factor,
-    robot_world_hand_eye_effects_factor,
-    robot_world_hand_eye_effects_factors,
-    se3,
-)
+from numeric_jacobians import check_jacobians, graph_of
+from rwhec_factors import BatchResiduals, robot_world_hand_eye_effects_factor, robot_world_hand_eye_effects_factors, se3
 
 N = 5
 
@@ -35,13 +29,6 @@ def point(seed: int = 1) -> gtsam.Values:
     for key, size in ((S(0), 1), (D(0), 1), (U(0), 4), (W(3), 7)):
         values.insert(key, chance.uniform(0.3, 1.0, size=size))
     return values
-
-
-def graph_of(*factors: gtsam.CustomFactor) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
 
 
 def test_residuals_are_less_the_effects() -> None:
@@ -88,17 +75,6 @@ def test_parts_are_the_whole() -> None:
         (H, g), (H_parts, g_parts) = (graph.linearize(values).hessian(ordering) for graph in both)
         np.testing.assert_allclose(H_parts, H, rtol=1e-10, atol=1e-9)
         np.testing.assert_allclose(g_parts, g, rtol=1e-10, atol=1e-9)
-
-
-def test_without_effects_it_is_the_batch() -> None:
-    A, B, _, root, _ = problem()
-    factors = [
-        robot_world_hand_eye_effects_factor(X(0), Y(0), A, B, root, {}),
-        robot_world_hand_eye_batch_factor(X(0), Y(0), A, B, root),
-    ]
-    of_effects, of_batch = (factor.unwhitenedError(point()) for factor in factors)
-    np.testing.assert_array_equal(of_effects, of_batch)
-    assert list(factors[0].keys()) == list(factors[1].keys())
 
 
 @pytest.mark.parametrize(

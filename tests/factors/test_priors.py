@@ -167,21 +167,6 @@ def test_dual_quaternion_prior_is_the_papers(seed: int, angle: float) -> None:
     assert ours == pytest.approx(imaginary, rel=1e-9, abs=1e-12)
 
 
-def test_dual_quaternion_prior_in_the_matrices_of_eq_28() -> None:
-    T_0, T = pose(8), pose(9)
-    conjugate = np.array([-1.0, -1.0, -1.0, 1.0])
-
-    def left(p: np.ndarray) -> np.ndarray:
-        return np.column_stack([quaternion_product(p, e) for e in np.eye(4)])
-
-    (q_0, dual_0), (q, dual) = dual_quaternion(T_0), dual_quaternion(T)
-    L, L_dual, G = left(conjugate * q_0), left(conjugate * dual_0), np.diag([1.0, 1.0, 1.0, 0.0])
-    rotation = q @ L.T @ G @ L @ q
-    rest = dual_0 @ dual_0 * (q @ q) + 2.0 * q @ (L_dual.T @ L) @ dual + dual @ dual
-    ours = PRIORS["dual quaternion, imaginary"][0](T_0).error(values_of({X(0): T}))
-    assert ours == pytest.approx(A_WEIGHT * rotation + B_WEIGHT * rest, rel=1e-12)
-
-
 def test_dual_quaternion_weights_are_sigmas_near_the_prior() -> None:
     """a and b are sigmas of sqrt(2 / a) rad and sqrt(2 / b) m."""
     T_0 = pose(10)
@@ -317,8 +302,8 @@ def test_arguments_that_are_not_valid_are_refused() -> None:
         (lambda: rotation_prior_factor(X(0), T.rotation(), unit6), ValueError, "dimension 6"),
         (lambda: rotation_prior_factor(X(0), T, unit3), TypeError, "Rot3"),
         (lambda: rotation_prior_factor(X(0), T.rotation(), anisotropic, residual="chordal"), ValueError, "anisotropic"),
-        (lambda: position_prior_factor(X(0), [1.0, 2.0], unit3), ValueError, "three finite numbers"),
-        (lambda: position_prior_factor(X(0), [1.0, 2.0, np.nan], unit3), ValueError, "three finite numbers"),
+        (lambda: position_prior_factor(X(0), [1.0, 2.0], unit3), ValueError, "t_m is .*finite numbers of shape"),
+        (lambda: position_prior_factor(X(0), [1.0, 2.0, np.nan], unit3), ValueError, "t_m is .*finite numbers"),
         (lambda: position_along_prior_factor(X(0), [0.0, 0.0, 0.0], 1.0, 1.0), ValueError, "no direction"),
         (lambda: position_along_prior_factor(X(0), [0.0, 0.0, 1.0], np.inf, 1.0), ValueError, "value_m is inf"),
         (lambda: position_along_prior_factor(X(0), [0.0, 0.0, 1.0], 1.0, 0.0), ValueError, "sigma_m is 0"),

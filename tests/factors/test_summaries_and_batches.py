@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import D, S, X, Y
-from numeric_jacobians import check_jacobians, values_of
+from numeric_jacobians import check_jacobians, graph_of, values_of
 from rwhec_factors import (
     EdgeSummary,
     edge_summary_factor,
@@ -33,13 +33,6 @@ def point(seed: int, size: float = 1.0, scale: float = 0.7) -> gtsam.Values:
     generator = np.random.default_rng(seed)
     x, y = (gtsam.Pose3.Expmap(size * generator.standard_normal(6)) for _ in range(2))
     return values_of({X(0): x, Y(0): y, S(0): scale, D(0): 0.05})
-
-
-def graph_of(*factors: gtsam.CustomFactor) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
 
 
 def assert_same(one: gtsam.NonlinearFactorGraph, other: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
@@ -127,15 +120,6 @@ def test_batch_is_all_its_measurements(scaled: bool) -> None:
     key = S(0) if scaled else None
     factor = robot_world_hand_eye_batch_factor(X(0), Y(0), A, B, np.diag(1.0 / SIGMAS), scale_key=key)
     assert_same(graph_of(factor), singles(A, B, scaled), point(7, 0.6))
-
-
-@pytest.mark.parametrize("size", [1.0, 1e-6])
-def test_batch_jacobians_are_the_numeric_ones(size: float) -> None:
-    A, B, twists = measurements(3, size)
-    factor = robot_world_hand_eye_batch_factor(
-        X(0), Y(0), A, B, np.eye(6), scale_key=S(0), time_offset_key=D(0), twists=twists
-    )
-    check_jacobians(factor, point(8, size), np.ones(factor.dim()), atol=1e-6)
 
 
 def test_batch_of_one_frame_is_ax_xb() -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from noisy_rows import random_poses
 from rwhec_factors import se3
-from settled_models import C, task_of
+from settled_models import task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.noise_in_data import BLOCKS, widening
-from gtsam_rwhec.fitting.noise_search import MOST_TRACKS
+from gtsam_rwhec.fitting.noise_search import MOST_TRACKS, Settled, Task
 
 TAGS, FRAMES = MOST_TRACKS + 1, 100
 
@@ -30,16 +30,14 @@ def problem_of(correlation: float, frames: int = FRAMES) -> rw.Problem:
     return problem
 
 
-def widened(problem: rw.Problem) -> np.ndarray:
+def settled(problem: rw.Problem) -> tuple[Task, Settled]:
     solution = rw.solve(problem)
     task = task_of(problem, solution)
-    found = task.settle(task.variables.start(solution), "targetcarrier", None, systematic=False)
-    assert C.ROTATION in found.fit.sizes.active
-    return widening(task, found)
+    return task, task.settle(task.variables.start(solution), "targetcarrier", None, systematic=False)
 
 
 def test_blocks_of_time_widen_what_is_correlated_and_nothing_else() -> None:
-    white, slow = widened(problem_of(0.0)), widened(problem_of(0.9))
+    white, slow = (widening(*settled(problem_of(correlation))) for correlation in (0.0, 0.9))
     assert (white >= 1.0).all()
     assert np.median(white) < 1.3
     assert np.median(slow) > 2.0
@@ -47,10 +45,7 @@ def test_blocks_of_time_widen_what_is_correlated_and_nothing_else() -> None:
 
 def test_the_widening_is_the_root_of_the_ratio_of_variances() -> None:
     """With errors twice as large as the model has them, in blocks that are independent, it is two."""
-    problem = problem_of(0.0)
-    solution = rw.solve(problem)
-    task = task_of(problem, solution)
-    found = task.settle(task.variables.start(solution), "targetcarrier", None, systematic=False)
+    task, found = settled(problem_of(0.0))
     once = widening(task, found)
     found.model.rows.residual[:] *= 2.0
     twice = widening(task, found)
@@ -59,7 +54,7 @@ def test_the_widening_is_the_root_of_the_ratio_of_variances() -> None:
 
 
 def test_too_few_instants_for_blocks_widen_nothing() -> None:
-    np.testing.assert_array_equal(widened(problem_of(0.9, 2 * BLOCKS - 1)), 1.0)
+    np.testing.assert_array_equal(widening(*settled(problem_of(0.9, 2 * BLOCKS - 1))), 1.0)
 
 
 def test_the_verdict_says_that_no_model_holds_the_drift(monkeypatch: pytest.MonkeyPatch) -> None:

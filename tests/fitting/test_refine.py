@@ -172,13 +172,6 @@ def test_planar_motion_has_infinite_variance_along_what_is_free(residual: str) -
     assert r.contains("target0", simulation.X["target0"], 0.999)
 
 
-def test_no_rotation_at_all() -> None:
-    simulation = rig(1, 1, seed=3, motion="none", number_of_measurements=40)
-    r = refined(simulation.problem)
-    assert np.isinf(np.diag(r.covariance("sensor0"))).all() or r.free_directions
-    assert np.isinf(np.diag(r.covariance("sensor0"))[3:]).all()
-
-
 def test_a_prior_makes_the_free_direction_finite() -> None:
     simulation = rig(1, 1, seed=2, motion="planar", number_of_measurements=40)
     simulation.problem.add_prior("target0", simulation.X["target0"], sigma=0.01)

@@ -83,7 +83,7 @@ def test_parts_of_the_measurements_keep_their_pairs() -> None:
     simulation = general(2, 2, seed=5, noise=NOISE, number_of_measurements=4)
     measured = Measured.of(simulation.problem)
     fit = truth(simulation)
-    own = measured.of_pairs([("target1", "sensor0"), ("target0", "sensor0")])
+    own = Measured.of(simulation.problem, (rw.Pair("target1", "sensor0"), rw.Pair("target0", "sensor0")))
     assert [own.pair_of(i) for i in (0, 3, 4, 7)] == [("target1", "sensor0")] * 2 + [("target0", "sensor0")] * 2
     whole = measured.by_pair(measured.together(measured.squares(fit), ONE))
     part = own.by_pair(own.together(own.squares(fit), ONE))

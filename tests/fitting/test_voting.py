@@ -34,19 +34,19 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
     wrong = {**truth.poses, name: np.eye(4)}
     if missing:
         del wrong[name]
-    fit, saved = by_vote(name, measured, replace(truth, poses=wrong), ONE, THRESHOLD)
+    fit, saved = by_vote(name, problem, replace(truth, poses=wrong), ONE, THRESHOLD)
     assert saved > 0.0
     assert np.abs(fit.poses[name] - truth.poses[name]).max() < 0.15
     inliers = measured.together(measured.squares(fit), ONE) <= 3.0 * THRESHOLD
     assert inliers.mean() > 0.5
-    stays, nothing = by_vote(name, measured, fit, ONE, THRESHOLD)
+    stays, nothing = by_vote(name, problem, fit, ONE, THRESHOLD)
     assert nothing >= 0.0
     assert np.abs(stays.poses[name] - fit.poses[name]).max() < 0.15
 
 
 def test_without_a_pose_of_the_other_frame_no_pose_is_proposed() -> None:
     simulation = general(1, 1, seed=2, number_of_measurements=5, noise=NOISE)
-    fit, saved = by_vote("target0", Measured.of(simulation.problem), WeightedFit({}, {}), ONE, THRESHOLD)
+    fit, saved = by_vote("target0", simulation.problem, WeightedFit({}, {}), ONE, THRESHOLD)
     assert saved == 0.0
     assert not fit.poses
 

@@ -14,7 +14,7 @@ import pytest
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import NotUniqueWarning, RwhecError, WeightsWarning
+from gtsam_rwhec.errors import NotUniqueWarning, WeightsWarning
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.methods import opencv
 from gtsam_rwhec.simulate import Noise, general
@@ -111,12 +111,6 @@ def test_one_thread_in_methods_without_progress(monkeypatch: pytest.MonkeyPatch)
         call()
         assert found
         assert all(count == {1} for count in found)
-
-
-def test_restored_after_an_exception() -> None:
-    with pytest.raises(RwhecError):
-        rw.solve(rw.Problem())
-    assert threads() == {THREADS}
 
 
 def test_restored_after_an_exception_in_a_block() -> None:
