@@ -67,11 +67,7 @@ def as_refined(
     freedom = min((value for (letter, _), value in corners.freedom.items() if letter in "xy"), default=np.inf)
     cost = float(corners.graph.graph.error(corners.graph.values(corners.point)))
     graph = corners.graph
-    keys = {name: key for keys in (graph.x, graph.y) for name, key in keys.items()}
-    keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
-    keys |= {f"shape:{name}": key for name, key in graph.b.items()}
-    keys |= {f"time_offset:{name}": key for name, key in graph.t.items()}
-    keys |= {f"corners:{name}": key for name, key in graph.p.items()}
+    keys = {name: graph.keys[at] for name, at in corners.names.items()}
     refined = replace(
         base,
         X=corners.X,

@@ -251,16 +251,9 @@ def spread_over_claims(refined: CornersRefined, parts: Sequence[CornersRefined])
 def _off(refined: CornersRefined, part: CornersRefined, slot: tuple[str, str]) -> Array:
     """How far a part's unknown is from that of all images."""
     letter, name = slot
-    point, other = refined.point, part.point
     if letter in "xy":
         first, second = (each.X if letter == "x" else each.Y for each in (refined, part))
         moved: Array = gtsam.Pose3.Logmap(first[name].between(second[name]))
         return moved
-    if letter == "k":
-        return other.cameras[name] - point.cameras[name]
-    if letter == "b":
-        changed: Array = (other.shapes[name] - point.shapes[name])[refined.graph.model.free_shape(name)]
-        return changed
-    if letter == "t":
-        return np.array([other.offsets_s.get(name, 0.0) - point.offsets_s.get(name, 0.0)])
-    return (other.corners[name] - point.corners[name]).ravel()
+    vectors = refined.graph.model.vectors
+    return vectors(part.point)[slot] - vectors(refined.point)[slot]
