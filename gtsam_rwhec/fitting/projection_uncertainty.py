@@ -74,7 +74,7 @@ def projection_deviations(
 def lens_deviations_over(
     camera: Camera, covariance: Array, seen: Array, distance_m: float, *, steps: int = 20
 ) -> tuple[Array, Array]:
-    """As `projection_deviations`, of the lens alone: its pose hides errors of the intrinsics best where corners were seen.
+    """As `projection_deviations`, of the lens alone: with the pose that hides its errors best where corners were seen.
 
     Parameters
     ----------
