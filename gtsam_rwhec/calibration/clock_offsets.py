@@ -96,48 +96,44 @@ def offsets_worth_estimating(
 def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: Trajectory | None) -> Clock:
     pairs = sorted(
         (pair for pair in problem.pairs if pair.sensor == sensor), key=lambda pair: -problem.moments(*pair).count
-    )
-    pairs = pairs[:MOST_TARGETS]
+    )[:MOST_TARGETS]
+
+    def right(why: str, *found: float) -> Clock:
+        return Clock(sensor, False, why, *found)
+
     if not problem.has_measurements:
-        return Clock(sensor, False, "the raw measurements were not kept")
+        return right("the raw measurements were not kept")
     if any(pair.is_motion for pair in pairs):
-        return Clock(sensor, False, "its measurements are motions between two stamps, for which no offset is modelled")
-    raws = [problem.measurements(*pair).stamps_ns for pair in pairs]
-    own = [raw for raw in raws if raw is not None]
-    if len(own) < len(raws):
-        return Clock(sensor, False, NO_STAMPS)
+        return right("its measurements are motions between two stamps, for which no offset is modelled")
+    own = [raw for pair in pairs if (raw := problem.measurements(*pair).stamps_ns) is not None]
+    if len(own) < len(pairs):
+        return right(NO_STAMPS)
     stamps = np.unique(np.concatenate(own))
     if len(stamps) < FEWEST_STAMPS:
-        return Clock(sensor, False, f"{len(stamps)} stamps are too few for an offset")
+        return right(f"{len(stamps)} stamps are too few for an offset")
     if not all(name in solution.X for name, _ in pairs) or sensor not in solution.Y:
-        return Clock(sensor, False, "it is not in the certified solution")
+        return right("it is not in the certified solution")
     apart_s = float(np.median(np.diff(stamps))) * 1e-9
     try:
         paths = local_paths(problem, (sensor,), carrier_path)
     except CountError as error:
-        return Clock(
-            sensor, False, f"the carriers' path about its stamps is not known ({apart_s:.2g} s apart): {error}"
-        )
-    options = RefineOptions(time_offsets=(sensor,), carrier_path=carrier_path)
-    data = [PairData.of(problem, pair, options, paths[pair]) for pair in pairs]
+        return right(f"the carriers' path about its stamps is not known ({apart_s:.2g} s apart): {error}")
     unknown = _unknown_share(paths)
     if unknown > LARGEST_UNKNOWN_SHARE:
         help_ = "" if carrier_path is not None else " (a path that was logged faster would tell: carrier_path)"
-        return Clock(
-            sensor,
-            False,
-            f"the carriers stood still, or how they moved between stamps {apart_s:.2g} s apart is not known{help_}",
+        return right(
+            f"the carriers stood still, or how they moved between stamps {apart_s:.2g} s apart is not known{help_}"
         )
-    offset_s, sigma_s = _one_step(_OffsetRows.of(data, solution, frozenset(problem.fixed_scales)))
+    options = RefineOptions(time_offsets=(sensor,), carrier_path=carrier_path)
+    data = [PairData.of(problem, pair, options, paths[pair]) for pair in pairs]
+    offset_s, sigma_s = _one_step(data, *_rows_of(data, solution, frozenset(problem.fixed_scales)))
     # An error of the velocities scales the offset.
     sigma_s = float(np.hypot(sigma_s, unknown * offset_s))
     about = f"motion tells it to +-{1e3 * sigma_s:.2g} ms"
     if not sigma_s <= LARGEST_SIGMA_S:
-        return Clock(sensor, False, f"{about} only", offset_s, sigma_s)
+        return right(f"{about} only", offset_s, sigma_s)
     if abs(offset_s) > WINDOW_S:
-        return Clock(
-            sensor,
-            False,
+        return right(
             f"the offset would be {offset_s:+.2g} s, and beyond {WINDOW_S:g} s the path is not linear enough; find it "
             "with cleaning.estimate_time_offset, and pair A and B again",
             offset_s,
@@ -155,27 +151,27 @@ def _unknown_share(paths: dict[Pair, LocalPaths]) -> float:
     return float(np.min(error / np.maximum(squares, 1e-18)))
 
 
-def _one_step(rows: _OffsetRows) -> tuple[float, float]:
+def _one_step(data: list[PairData], r_0: Array, all_J: Array) -> tuple[float, float]:
     """One step of Gauss-Newton from the certified solution: the offset, and its standard deviation, s."""
-    good, weight = np.ones(len(rows.r), dtype=bool), np.ones(2)
-    r = rows.r
+    good, r = np.ones(len(r_0), dtype=bool), r_0
     for _ in range(3):
         squares = (r**2).reshape(-1, 2, 3).sum(axis=2)
         variance = np.maximum(np.median(squares[good], axis=0) / chdtri(3, 0.5), 1e-24)
         good = (squares / variance).max(axis=1) < 3.0 * GROSS_SIGMAS**2
         weight = np.repeat(1.0 / variance, 3)
-        J = rows.J[good]
+        J = all_J[good]
         H = np.einsum("nip,i,niq->pq", J, weight, J)
         unit = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
         inverse = np.linalg.pinv(H / unit[:, None] / unit, rcond=1e-10, hermitian=True) / unit[:, None] / unit
-        step = -inverse @ np.einsum("nip,i,ni->p", J, weight, rows.r[good])
-        r = rows.r + rows.J @ step
+        step = -inverse @ np.einsum("nip,i,ni->p", J, weight, r_0[good])
+        r = r_0 + all_J @ step
     if not inverse[0, 0] > 0.0:
         return float(step[0]), np.inf
-    g = rows.J @ (inverse[:, 0] / inverse[0, 0])  # the offset, with all else following
+    g = all_J @ (inverse[:, 0] / inverse[0, 0])  # the offset, with all else following
     information = np.where(good, np.einsum("ni,i,ni->n", g, weight, g), 0.0)
     scores = np.where(good, np.einsum("ni,i,ni->n", g, weight, r), 0.0)
-    order = np.argsort(rows.stamps_ns, kind="stable")
+    stamps_ns = np.concatenate([item.stamps_ns for item in data if item.stamps_ns is not None])
+    order = np.argsort(stamps_ns, kind="stable")
     share = np.cumsum(information[order]) / max(float(information.sum()), 1e-300)
     block = np.minimum((share * BLOCKS_OF_TIME).astype(int), BLOCKS_OF_TIME - 1)
     filled = max(len(np.unique(block)), 2)
@@ -185,40 +181,29 @@ def _one_step(rows: _OffsetRows) -> tuple[float, float]:
     return float(step[0]), max(np.sqrt(total), scatter) / max(total, 1e-300)
 
 
-@dataclass(frozen=True)
-class _OffsetRows:
+def _rows_of(data: list[PairData], solution: Solution, fixed_scales: frozenset[str]) -> tuple[Array, Array]:
     """Residuals (N, 6) of a sensor and their derivatives (N, 6, p): by the offset, Y, each X, each scale."""
-
-    r: Array
-    J: Array
-    stamps_ns: np.ndarray
-
-    @staticmethod
-    def of(data: list[PairData], solution: Solution, fixed_scales: frozenset[str]) -> _OffsetRows:
-        targets = list(dict.fromkeys(item.pair.target for item in data))
-        owners = [] if solution.scale_mode == "known" else [name for name in targets if name not in fixed_scales]
-        scale_at = {name: 7 + 6 * len(targets) + (i if solution.scale_mode == "per_target" else 0)
-                    for i, name in enumerate(owners)}  # fmt: skip
-        columns = max(scale_at.values(), default=6 + 6 * len(targets)) + 1
-        r, J, stamps = [], [], []
-        for item in data:
-            target, sensor = item.pair
-            scale = 1.0
-            if target in scale_at:
-                scale = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
-            at = item.residuals.linearize(solution.X[target].matrix(), solution.Y[sensor].matrix(), scale)
-            own = np.zeros((item.count, 6, columns))
-            own[:, :, 0] = at.offset
-            own[:, :, 1:7] = at.sensor
-            k = 7 + 6 * targets.index(target)
-            own[:, :, k : k + 6] = at.target
-            if target in scale_at:
-                own[:, :, scale_at[target]] = at.scale
-            r.append(at.residual)
-            J.append(own)
-            assert item.stamps_ns is not None
-            stamps.append(item.stamps_ns)
-        return _OffsetRows(np.concatenate(r), np.concatenate(J), np.concatenate(stamps))
+    targets = list(dict.fromkeys(item.pair.target for item in data))
+    owners = [] if solution.scale_mode == "known" else [name for name in targets if name not in fixed_scales]
+    first, step = 7 + 6 * len(targets), int(solution.scale_mode == "per_target")
+    scale_at = {name: first + i * step for i, name in enumerate(owners)}
+    r, J = [], []
+    for item in data:
+        target, sensor = item.pair
+        scale = 1.0
+        if target in scale_at:
+            scale = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
+        at = item.residuals.linearize(solution.X[target].matrix(), solution.Y[sensor].matrix(), scale)
+        own = np.zeros((item.count, 6, max(scale_at.values(), default=first - 1) + 1))
+        own[:, :, 0] = at.offset
+        own[:, :, 1:7] = at.sensor
+        k = 7 + 6 * targets.index(target)
+        own[:, :, k : k + 6] = at.target
+        if target in scale_at:
+            own[:, :, scale_at[target]] = at.scale
+        r.append(at.residual)
+        J.append(own)
+    return np.concatenate(r), np.concatenate(J)
 
 
 #: A time offset of at least so many standard deviations explains rows that look shifted.
@@ -285,7 +270,7 @@ def _by_option(run: Run, first: Solution | None) -> Answer:
     chosen = f"estimated for {', '.join(found.time_offsets_s)}" if asked and found.time_offsets_s else "not estimated"
     run.record.choose(TIME_OFFSETS, chosen, run.says_so)
     if found.refined is not None:
-        _doubt_stated_clocks(run, _stated_clocks(run, found))
+        _doubt_stated_clocks(run, found)
     return found
 
 
@@ -339,34 +324,25 @@ def _evidence(clocks: tuple[Clock, ...]) -> str:
     for clock in clocks:
         sensors.setdefault(clock.evidence, []).append(clock.sensor)
     if set(sensors) == {NO_STAMPS}:
-        return "the measurements have no stamps"
+        return NO_STAMPS.replace("its", "the")
     return "; ".join(f"{', '.join(names)}: {evidence}" for evidence, names in sensors.items())
 
 
-def _stated_clocks(run: Run, found: Answer) -> tuple[Clock, ...]:
-    """What the measurements that agree say of the clocks that were taken as right.
+def _doubt_stated_clocks(run: Run, found: Answer) -> None:
+    """Record a finding for each clock that was taken as right, although the measurements that agree contradict it.
 
     A late clock makes outliers while carriers move. So where many measurements of a sensor are outliers, all of its
     measurements are used.
     """
     stated = [name for name in run.problem.sensors if name not in found.time_offsets_s]
     if not stated:
-        return ()
+        return
     clocks = {clock.sensor: clock for clock in _clocks(run, found.solution, found.inliers)}
-    of_sensor = {
-        name: np.concatenate([mask for pair, mask in found.inliers.items() if pair.sensor == name])
-        for name in stated
-        if found.inliers
-    }
-    many = [name for name, kept in of_sensor.items() if np.mean(~kept) > MANY_LEFT_OUT]
+    kept = {name: [mask for pair, mask in found.inliers.items() if pair.sensor == name] for name in stated}
+    many = [name for name, of in kept.items() if of and np.mean(~np.concatenate(of)) > MANY_LEFT_OUT]
     if many:
         clocks |= {clock.sensor: clock for clock in _clocks(run, found.solution, {}) if clock.sensor in many}
-    return tuple(clocks[name] for name in stated if name in clocks)
-
-
-def _doubt_stated_clocks(run: Run, clocks: tuple[Clock, ...]) -> None:
-    """Record a finding for each clock that was taken as right although the motion contradicts it."""
-    for clock in clocks:
+    for clock in (clocks[name] for name in stated if name in clocks):
         if clock.is_clearly_off and clock.offset_s is not None:
             ground = Ground.LATE_CLOCK if abs(clock.offset_s) > LATE_S else Ground.COVARIANCE_DOUBTED
             run.record.find(ground, f"the clock of {clock.sensor} was taken as right, but {clock.evidence}")

@@ -8,9 +8,9 @@ measurements: B = Y^-1 A X.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -33,47 +33,32 @@ from gtsam_rwhec.solver.solve_options import SolveOptions
 Split = Literal["time", "pair", "sensor"]
 
 
-class Fold(NamedTuple):
-    """Measurements held out together, as (N,) booleans for each pair that has some, and a name for messages."""
-
-    name: str
-    held_out: dict[Pair, np.ndarray]
+#: Measurements that are held out together, as (N,) booleans for each pair that has some.
+HeldOut = dict[Pair, np.ndarray]
 
 
-def folds_of(raw: Mapping[Pair, Measurements], by: Split, number: int) -> Iterator[Fold]:
-    """The folds of a split; with ``by="time"`` there are ``number`` folds."""
+def folds_of(raw: Mapping[Pair, Measurements], by: Split, number: int) -> dict[str, HeldOut]:
+    """The folds of a split, by a name for messages; with ``by="time"`` there are ``number`` folds."""
+    if by == "pair":
+        return {pair.label: {pair: np.ones(len(one.A), dtype=bool)} for pair, one in raw.items()}
+    rank = {pair: _in_time(one) for pair, one in raw.items()}
     if by == "time":
-        return _blocks(raw, number)
-    return _pairs(raw) if by == "pair" else _halves(raw)
+        # The middle of each measurement's share of the pair: few measurements are spread over all folds.
+        block = {pair: ((of + 0.5) * number / len(of)).astype(np.int64) for pair, of in rank.items()}
+        return {
+            f"block {fold + 1} of {number}": {pair: of == fold for pair, of in block.items()} for fold in range(number)
+        }
+    folds: dict[str, HeldOut] = {}
+    for sensor in dict.fromkeys(sensor for _, sensor in raw):
+        own = {pair: 2 * of < len(of) for pair, of in rank.items() if pair.sensor == sensor}
+        folds[f"{sensor}, first half"] = own
+        folds[f"{sensor}, second half"] = {pair: ~mask for pair, mask in own.items()}
+    return folds
 
 
 def _in_time(one: Measurements) -> np.ndarray:
     """The rank (N,) of each measurement in time."""
-    count = len(one.A)
-    if one.stamps_ns is None:
-        return np.arange(count)
-    rank = np.empty(count, dtype=np.int64)
-    rank[np.argsort(one.stamps_ns, kind="stable")] = np.arange(count)
-    return rank
-
-
-def _blocks(raw: Mapping[Pair, Measurements], folds: int) -> Iterator[Fold]:
-    # The middle of each measurement's share of the pair: few measurements are spread over all folds.
-    block = {pair: ((_in_time(one) + 0.5) * folds / len(one.A)).astype(np.int64) for pair, one in raw.items()}
-    for fold in range(folds):
-        yield Fold(f"block {fold + 1} of {folds}", {pair: number == fold for pair, number in block.items()})
-
-
-def _pairs(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
-    for pair, one in raw.items():
-        yield Fold(pair.label, {pair: np.ones(len(one.A), dtype=bool)})
-
-
-def _halves(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
-    for sensor in dict.fromkeys(sensor for _, sensor in raw):
-        own = {pair: 2 * _in_time(one) < len(one.A) for pair, one in raw.items() if pair.sensor == sensor}
-        yield Fold(f"{sensor}, first half", own)
-        yield Fold(f"{sensor}, second half", {pair: ~mask for pair, mask in own.items()})
+    return np.arange(len(one.A)) if one.stamps_ns is None else np.argsort(np.argsort(one.stamps_ns, kind="stable"))
 
 
 @dataclass(frozen=True)
@@ -204,17 +189,45 @@ def cross_validate(
     _check(problem, folds, by)
     check_progress(progress)
     raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
-    calibrate = _Calibrator(options, solve_options)
     notes: dict[str, None] = {}
-    everything = calibrate(problem, "with everything", notes)
+
+    def calibrated(some: Problem, name: str) -> Solution | Refined:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            solution = solve(some, options=solve_options)
+            answer = solution if options is None else refine(some, solution, options)
+        for warning in caught:
+            if isinstance(warning.message, RwhecWarning):
+                notes.setdefault(f"{name}: {warning.message}")
+            else:
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+        return answer
+
+    everything = calibrated(problem, "with everything")
     training = {pair: prediction_errors(problem, everything, pair, one) for pair, one in raw.items()}
     errors = {pair: np.full((2, len(one.A)), np.nan) for pair, one in raw.items()}
-    tell = progress or silent
-    number = 0
-    for fold in folds_of(raw, by, folds):
-        number += 1
-        tell(f"held out: {fold.name}")
-        _predict(problem, raw, fold, calibrate, errors, notes)
+    split = folds_of(raw, by, folds)
+    for name, held_out in split.items():
+        (progress or silent)(f"held out: {name}")
+        if all(pair in held_out and held_out[pair].all() for pair in raw):
+            notes.setdefault(f"{name}: no measurement is left to predict it from")
+            continue
+        try:
+            rest = selected(problem, {pair: ~mask for pair, mask in held_out.items()})
+            answer = calibrated(rest, f"without {name}")
+        except (UnderdeterminedError, ScaleError, OutlierError) as error:
+            notes.setdefault(f"{name} is not predicted: the rest gives no answer ({error})")
+            continue
+        for pair, mask in held_out.items():
+            if not mask.any():
+                continue
+            predicted = prediction_errors(problem, answer, pair, raw[pair])
+            errors[pair][:, mask] = predicted[:, mask]
+            if np.isnan(predicted).all():
+                known = set(answer.X) | set(answer.Y) | set(problem.fixed)
+                unknown = [frame for frame in pair.frames if frame not in known]
+                lacking = " and ".join(unknown) or f"the size of {pair.target}"
+                notes.setdefault(f"{pair} ({name}) is not predicted: no other measurement determines {lacking}")
     if not any(np.isfinite(values).any() for values in errors.values()):
         raise UnderdeterminedError(
             f"no measurement can be predicted with by={by!r}: {'; '.join(notes)}. Measure more, or choose another split"
@@ -231,7 +244,7 @@ def cross_validate(
 
     return CrossValidation(
         by=by,
-        number_of_folds=number,
+        number_of_folds=len(split),
         ordered_by="stamps" if all(one.stamps_ns is not None for one in raw.values()) else "order",
         overall=compare(list(raw)),
         sensors={name: compare([pair for pair in raw if pair.sensor == name]) for name in problem.sensors},
@@ -258,54 +271,3 @@ def _check(problem: Problem, folds: int, by: str) -> None:
             f"folds={folds}, but no pair has more than {largest} measurements to cut into blocks; give at most "
             f"{largest}"
         )
-
-
-@dataclass(frozen=True)
-class _Calibrator:
-    """Calibrates each fold's problem in the same way."""
-
-    options: RefineOptions | None
-    solve_options: SolveOptions | None
-
-    def __call__(self, problem: Problem, name: str, notes: dict[str, None]) -> Solution | Refined:
-        """The certified solution, refined if there are options; warnings become notes."""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            solution = solve(problem, options=self.solve_options)
-            answer = solution if self.options is None else refine(problem, solution, self.options)
-        for warning in caught:
-            if isinstance(warning.message, RwhecWarning):
-                notes.setdefault(f"{name}: {warning.message}")
-            else:
-                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-        return answer
-
-
-def _predict(
-    problem: Problem,
-    raw: Mapping[Pair, Measurements],
-    fold: Fold,
-    calibrate: _Calibrator,
-    errors: dict[Pair, Array],
-    notes: dict[str, None],
-) -> None:
-    """Calibrate without the fold, and write its prediction errors into ``errors``."""
-    name, held_out = fold
-    if all(pair in held_out and held_out[pair].all() for pair in raw):
-        notes.setdefault(f"{name}: no measurement is left to predict it from")
-        return
-    try:
-        answer = calibrate(selected(problem, {pair: ~m for pair, m in held_out.items()}), f"without {name}", notes)
-    except (UnderdeterminedError, ScaleError, OutlierError) as error:
-        notes.setdefault(f"{name} is not predicted: the rest gives no answer ({error})")
-        return
-    for pair, mask in held_out.items():
-        if not mask.any():
-            continue
-        predicted = prediction_errors(problem, answer, pair, raw[pair])
-        errors[pair][:, mask] = predicted[:, mask]
-        if np.isnan(predicted).all():
-            known = set(answer.X) | set(answer.Y) | set(problem.fixed)
-            unknown = [frame for frame in pair.frames if frame not in known]
-            lacking = " and ".join(unknown) if unknown else f"the size of {pair.target}"
-            notes.setdefault(f"{pair} ({name}) is not predicted: no other measurement determines {lacking}")

@@ -65,12 +65,6 @@ class Score:
     mm: float
     expected_px: float
 
-    @property
-    def in_words(self) -> str:
-        """The error on the target, with the model."""
-        size = f"{self.mm:.3g} mm" if np.isfinite(self.mm) else "a target behind its camera"
-        return f"{size} with {self.words}"
-
 
 @dataclass(frozen=True, eq=False)
 class Tried:
@@ -81,6 +75,12 @@ class Tried:
     evidence: str
     scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
     left_out: LeftOut  #: Of the chosen one; empty where images are too few
+
+    @property
+    def unexplained(self) -> float:
+        """The ratio of held-out errors to those that the covariances predict; 1 if it may be chance."""
+        times = self.scores[0].px / self.scores[0].expected_px if self.scores else 1.0
+        return times if times > UNEXPLAINED else 1.0
 
 
 def chosen_model(
@@ -96,19 +96,29 @@ def chosen_model(
     Raises as ``refine_corners`` does.
     """
     some = thinned(observations)
+
+    def scored(of: CornerOptions, refined: CornersRefined | None = None) -> tuple[CornerOptions, Score, LeftOut]:
+        refined = refined or refine_corners(some, X, Y, of, tell)
+        folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
+        found = left_out(some, refined, of, folds=folds, progress=tell)
+        errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.errors.values()])
+        weights = np.array([one.corners for one in found.errors.values()], dtype=float)
+        return of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found
+
     try:
-        first = _scored(some, X, Y, options, tell, thin)
+        every = [scored(options, thin)]
     except CountError as error:
         return Tried(options, in_words(options), f"no other was tried: {error}", (), LeftOut({}, {}))
-    every = [first]
     if options.carrier_noise != "exact":
-        every.append(_scored(some, X, Y, replace(options, carrier_noise="exact"), tell))
-    chosen, score, found = every[-1] if every[-1][1].mm < BETTER_SHARE * first[1].mm else first
-    rest = tuple(one for _, one, _ in every if one is not score)
+        every.append(scored(replace(options, carrier_noise="exact")))
+        if every[1][1].mm < BETTER_SHARE * every[0][1].mm:
+            every.reverse()
+    chosen, score, found = every[0]
     evidence = f"it predicts images that were left out to {score.px:.3g} px, and {score.mm:.3g} mm on the target"
-    if rest:
-        evidence += f" ({', '.join(one.in_words for one in rest)})"
-    return Tried(chosen, score.words, evidence, (score, *rest), found)
+    for _, other, _ in every[1:]:
+        size = f"{other.mm:.3g} mm" if np.isfinite(other.mm) else "a target behind its camera"
+        evidence += f" ({size} with {other.words})"
+    return Tried(chosen, score.words, evidence, tuple(one for _, one, _ in every), found)
 
 
 def thinned(observations: Observations) -> Observations:
@@ -123,29 +133,6 @@ def thinned(observations: Observations) -> Observations:
     return replace(observations, views={pair: some(view) for pair, view in observations.views.items()})
 
 
-def _scored(
-    observations: Observations,
-    X: Mapping[str, PoseLike],
-    Y: Mapping[str, PoseLike],
-    options: CornerOptions,
-    tell: Progress,
-    thin: CornersRefined | None = None,
-) -> tuple[CornerOptions, Score, LeftOut]:
-    refined = thin or refine_corners(observations, X, Y, options, tell)
-    folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
-    found = left_out(observations, refined, options, folds=folds, progress=tell)
-    errors = found.errors
-    weights = np.array([one.corners for one in errors.values()], dtype=float)
-
-    def mean(values: list[float]) -> float:
-        return float(np.sqrt(weights @ np.square(values) / weights.sum()))
-
-    px, mm, expected = (
-        mean([getattr(one, name) for one in errors.values()]) for name in ("rms_px", "rms_mm", "expected_px")
-    )
-    return options, Score(in_words(options), px, mm, expected), found
-
-
 def in_words(options: CornerOptions) -> str:
     """What the options assume about A and about sizes."""
     noise = options.carrier_noise
@@ -153,13 +140,11 @@ def in_words(options: CornerOptions) -> str:
         of_A = f"A's noise as stated ({np.degrees(noise.rotation_rad):.2g}° and {1e3 * noise.translation_m:.2g} mm)"
     else:
         of_A = "A as exact" if noise == "exact" else "A's noise estimated"
-    shares = options.size_share.values() if isinstance(options.size_share, Mapping) else (options.size_share,)
-    if not any(shares):
-        return f"{of_A} and sizes as stated"
     if not isinstance(options.size_share, Mapping):
-        return f"{of_A} and sizes estimated"
+        return f"{of_A} and sizes {'estimated' if options.size_share else 'as stated'}"
     free = [name for name, share in options.size_share.items() if share]
-    return f"{of_A} and {f'the size of {free[0]}' if len(free) == 1 else 'some sizes'} estimated"
+    sizes = f"the size of {free[0]} estimated" if len(free) == 1 else "some sizes estimated"
+    return f"{of_A} and {sizes if free else 'sizes as stated'}"
 
 
 #: The name of this choice: whether the answer is from corners or from poses.
@@ -186,6 +171,8 @@ class CornersFound:
     #: The factor on each unknown's standard deviations, where held-out images have larger errors than the covariances
     #: predict; else empty
     wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    start: Refined | None = None  #: The answer from poses that was its start
+    without: dict[Pair, int] = field(default_factory=dict)  #: How many measurements have no corners, by pair
 
     @staticmethod
     def none(why: str, *findings: Finding) -> CornersFound:
@@ -246,36 +233,31 @@ def corners_found(
     except RwhecError as error:
         return CornersFound.none(f"the corners give none: {error}")
     if is_doubtful(corners):
-        return CornersFound.none(
-            f"the corners do not fit together: {' '.join(corners.findings)}", *_against_poses(corners)
+        px, words = corners.noise.corner_px, " ".join(corners.findings)
+        # The poses are of the same corners; noise of A alone is no finding, since the poses' noise model contains it.
+        against = (
+            f"the corners of the images do not fit together: they are off by {px:.2g} pixels, more than a detector's "
+            "noise, and the poses are of the same corners"
         )
+        findings = [Finding(Ground.CORNERS_DOUBTED, against)] if px > DETECTOR_PX else []
+        return CornersFound.none(f"the corners do not fit together: {words}", *findings)
     intrinsics = intrinsics_of(corners, {name: options.stated_of(options.camera_of(name)) for name in corners.Y})
     faults = [f"{name}: {one.fault}" for name, one in intrinsics.items() if one.fault]
     if faults:
         why = f"the corners lead to intrinsics that no camera has ({'; '.join(faults)})"
         return CornersFound.none(why, Finding(Ground.CORNERS_DOUBTED, why))
+    scores = tried.scores  # without models that put a target behind its camera
+    models = tuple(TriedModel(one.words, one.px, one.mm, one is scores[0]) for one in scores if np.isfinite(one.px))
+    times = tried.unexplained
     return CornersFound(
         corners,
         intrinsics,
-        numbers_of(observations, corners, tried.options, tried.left_out.errors, _tried_models(tried)),
+        numbers_of(observations, corners, tried.options, tried.left_out.errors, models),
         tuple(_corner_choices(observations, corners, tried, intrinsics, far_off)),
         (*_corner_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
-        _wider(tried),
+        # unexplained errors: their ratio, or the disagreement between folds, whichever is larger
+        {slot: max(times, spread) for slot, spread in tried.left_out.spread.items()} if times > 1.0 else {},
     )
-
-
-def _against_poses(corners: CornersRefined) -> Iterator[Finding]:
-    """Findings where the corners do not fit together: the poses of single images are from the same corners.
-
-    Noise of A alone is no finding: the noise model of the poses contains it.
-    """
-    px = corners.noise.corner_px
-    if px > DETECTOR_PX:
-        words = (
-            f"the corners of the images do not fit together: they are off by {px:.2g} pixels, more than a detector's "
-            "noise, and the poses are of the same corners"
-        )
-        yield Finding(Ground.CORNERS_DOUBTED, words)
 
 
 def _against_exact(observations: Observations, corners: CornersRefined, options: CornerOptions) -> Iterator[Finding]:
@@ -298,12 +280,6 @@ def _against_exact(observations: Observations, corners: CornersRefined, options:
                 f"({innovation.deviations:.2g} deviations of a calibration off)"
             )
             yield Finding(Ground.INTRINSICS_DOUBTED if is_sure else Ground.INTRINSICS_UNCERTAIN, words)
-
-
-def _tried_models(tried: Tried) -> tuple[TriedModel, ...]:
-    """The errors of each model that was tried, except models that put a target behind its camera."""
-    best = tried.scores[:1]
-    return tuple(TriedModel(one.words, one.px, one.mm, one in best) for one in tried.scores if np.isfinite(one.px))
 
 
 def _corner_choices(
@@ -380,7 +356,7 @@ def _corner_findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[
         if lens and one.stated_as == "calibration":
             words = f"the intrinsics of {name} are stated without distortion, and its corners show one: {lens}"
             yield Finding(Ground.INTRINSICS_ESTIMATED, words)
-    times = _unexplained(tried)
+    times = tried.unexplained
     if times > 1.0:
         words = (
             f"images that were left out are predicted to {tried.scores[0].mm:.2g} mm on the target, {times:.2g} times "
@@ -388,18 +364,6 @@ def _corner_findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[
             "errors, and the standard deviations are widened by as much, or as blocks of images disagree"
         )
         yield Finding(Ground.SYSTEMATIC, words)
-
-
-def _wider(tried: Tried) -> dict[tuple[str, str], float]:
-    """Factors for unexplained errors: their ratio, or the disagreement between folds, whichever is larger."""
-    times = _unexplained(tried)
-    return {slot: max(times, spread) for slot, spread in tried.left_out.spread.items()} if times > 1.0 else {}
-
-
-def _unexplained(tried: Tried) -> float:
-    """The ratio of held-out errors to those that the covariances predict; 1 if it may be chance."""
-    times = tried.scores[0].px / tried.scores[0].expected_px if tried.scores else 1.0
-    return times if times > UNEXPLAINED else 1.0
 
 
 #: Target poses are computed again at most so many times.
@@ -428,8 +392,8 @@ def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefin
     if base is None or base.free_directions or not run.problem.boards or run.times > MOST_TIMES or run.recording:
         return None, None
     X, Y, cameras, corners = base.X, base.Y, dict(run.cameras), None
-    if run.options.observations != "poses" and not _why_not(run, base):
-        observations, options, _ = _observed(run, found)
+    if not _why_not(run, base):
+        observations, options, _ = _observed(run, base, found.noise.model)
         try:
             corners = refine_corners(thinned(observations), X, Y, options, run.tell)
         except RwhecError:  # then the answer is from the poses, and says why
@@ -448,45 +412,41 @@ def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefin
     return run.again(better, cameras) if is_new or changed else None, corners
 
 
-@dataclass(frozen=True, eq=False)
-class ByCorners:
-    """The result from corners, the answer from poses that was its start, and how many measurements lack corners."""
+def _from_corners(
+    run: Run, base: Refined, noise: NoiseInData | None = None, thin: CornersRefined | None = None
+) -> CornersFound:
+    """What the corners of the images give that agree with an answer from their poses, with the noise of these."""
+    if why := _why_not(run, base):
+        return replace(CornersFound.none(why), start=base)
+    observations, options, without = _observed(run, base, noise)
+    far_off = () if run.recording is None else run.recording.far_off
+    found = corners_found(base.X, base.Y, observations, options, run.tell, thin, far_off)
+    return replace(found, start=base, without=without)
 
-    found: CornersFound
-    start: Refined
-    without: dict[Pair, int] = field(default_factory=dict)
 
-
-def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tuple[Run, ByCorners]:
-    """The result from a log's corners, and the run with target poses by the intrinsics that the corners give.
+def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tuple[Run, CornersFound]:
+    """The run with target poses by the intrinsics that a log's corners give, and the result from these corners.
 
     ``base`` is an answer from the poses of the inliers. If the corners contradict the stated intrinsics, the run starts
     again.
     """
-    kept = replace(run, problem=agreeing(run.problem, inliers))
-    why = "an option says so" if run.options.observations == "poses" else _why_not(kept, base)
-    if why:
-        return run, ByCorners(CornersFound.none(why), base)
-    observations, options, without = _observed(kept, Answer(base.solution, refined=base))
-    far_off = () if run.recording is None else run.recording.far_off
-    found = corners_found(base.X, base.Y, observations, options, run.tell, far_off=far_off)
-    by = ByCorners(found, base, without)
-    corners = by.found.corners
+    found = _from_corners(replace(run, problem=agreeing(run.problem, inliers)), base)
+    corners = found.corners
     if corners is None:
-        return run, by
+        return run, found
     run.tell("computing the poses of targets again, with the estimated intrinsics")
     try:
         cameras = {name: one.camera for name, one in corners.intrinsics.items()}
         better, _ = nearer_poses(run.problem, corners.X, corners.Y, cameras)
     except (CameraError, TargetError):  # a lens without a ray for a corner, or a target that is not flat
-        return run, by
-    if by.found.contradicted and run.times <= MOST_TIMES:
-        return run.again(better, cameras), by
-    return replace(run, problem=better, cameras=cameras), by
+        return run, found
+    if found.contradicted and run.times <= MOST_TIMES:
+        return run.again(better, cameras), found
+    return replace(run, problem=better, cameras=cameras), found
 
 
 def answered_by_corners(
-    run: Run, found: Answer, thin: CornersRefined | None = None, by: ByCorners | None = None
+    run: Run, found: Answer, thin: CornersRefined | None = None, by: CornersFound | None = None
 ) -> Answer:
     """The answer from the corners, if the problem has them and they give a better one; the choice is recorded.
 
@@ -495,27 +455,25 @@ def answered_by_corners(
     base = found.refined
     if base is None or run.options.observations == "poses" or not (run.problem.boards or run.recording):
         return found
-    if by is None and (why := _why_not(run, base)):
-        by = ByCorners(CornersFound.none(why), base)
-    elif by is None:
-        observations, options, without = _observed(run, found)
-        by = ByCorners(corners_found(base.X, base.Y, observations, options, run.tell, thin), base, without)
-    elif base.free_directions and by.found.corners is not None:
-        by = ByCorners(CornersFound.none("the motion leaves poses free"), base)
-    of_corners, without = by.found, by.without
-    run.record.choices += of_corners.choices
-    run.record.findings += of_corners.findings
-    if of_corners.corners is None:
+    if by is None:
+        by = _from_corners(run, base, found.noise.model, thin)
+    elif base.free_directions and by.corners is not None:
+        by = CornersFound.none("the motion leaves poses free")
+    run.record.choices += by.choices
+    run.record.findings += by.findings
+    if by.corners is None or by.start is None:
         return found
-    if without:
-        counts = ", ".join(f"{number} of {pair}" for pair, number in without.items())
+    if by.without:
+        counts = ", ".join(f"{number} of {pair}" for pair, number in by.without.items())
         run.record.choose("measurements without corners", f"{counts} do not count in the poses", "the others have some")
-    return replace(found, refined=as_stated(of_corners.refined(base, found.noise.model), by.start, of_corners.corners))
+    return replace(found, refined=as_stated(by.refined(base, found.noise.model), by.start, by.corners))
 
 
 def _why_not(run: Run, base: Refined) -> str:
     """Why the problem's corners cannot be used; empty if they can."""
     problem = run.problem
+    if run.options.observations == "poses":
+        return "an option says so"
     if not problem.boards:
         return "no measurement has corners and a camera's intrinsics"
     if any(pair.is_motion for pair in problem.pairs):
@@ -543,11 +501,11 @@ def _with_corners(problem: Problem) -> dict[Pair, np.ndarray]:
     return found
 
 
-def _observed(run: Run, found: Answer) -> tuple[Observations, CornerOptions, dict[Pair, int]]:
+def _observed(
+    run: Run, base: Refined, model: NoiseInData | None
+) -> tuple[Observations, CornerOptions, dict[Pair, int]]:
     """The corners of the images that agree with the answer, the options, and how many measurements have none."""
-    base, problem = found.refined, run.problem
-    assert base is not None
-    noise, model = run.options.carrier_noise, found.noise.model
+    problem, noise = run.problem, run.options.carrier_noise
     options = run.options.corners or CornerOptions(
         carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
         about="targetcarrier" if model is None else model.hand,
@@ -585,7 +543,7 @@ def by_told_intrinsics(run: Run, sensors: Collection[str]) -> Run:
             (problem.boards[pair.target][known], image[known])
             for pair in problem.pairs
             if pair.sensor == name and pair.target in problem.boards and not problem.boards[pair.target][:, 2].any()
-            for image in _images(problem, pair)
+            for image in _pixels(problem, pair)
             if (known := np.isfinite(image[:, 0])).sum() >= CORNERS
         ]
         lens: Lens = "equidistant" if stated.model == "equidistant" else "any"
@@ -598,9 +556,10 @@ def by_told_intrinsics(run: Run, sensors: Collection[str]) -> Run:
     return replace(run.attempt(), problem=again, options=options, times=2)
 
 
-def _images(problem: Problem, pair: Pair) -> Array:
+def _pixels(problem: Problem, pair: Pair) -> Array:
+    """The corners (N, n, 2) of a pair's images; N = 0 where none has some."""
     pixels = problem.measurements(*pair).pixels
-    return np.zeros((0, 0, 2)) if pixels is None else pixels[np.isfinite(pixels).any(axis=(1, 2))]
+    return np.zeros((0, 0, 2)) if pixels is None else pixels
 
 
 def by_intrinsics(problem: Problem, cameras: Mapping[str, Camera]) -> Problem:

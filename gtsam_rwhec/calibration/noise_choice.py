@@ -13,7 +13,7 @@ from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.fit_options import Component, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio_words
 from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.fitting.refined import Refined
@@ -85,11 +85,13 @@ def estimated(
     kept = agreeing(problem, inliers)
     residual = "geodesic" if problem.has_measurements else "chordal"
     how = options.refinement(offsets_of(kept, options), residual=residual)
+    # the whole model holds standard deviations of A, and no covariances
+    stated = options.carrier_noise
+    is_asked = options.noise != "given" and options.noise_groups == "all"
     why, failed = "a model of all noise was not asked for", False
     if not problem.has_measurements:
         why = "the raw measurements were not kept"
-    is_whole = options.noise != "given" and options.noise_groups == "all" and _is_plain(options.carrier_noise)
-    if is_whole and problem.has_measurements:
+    elif is_asked and (stated is None or stated.covariances is None):
         try:
             return _by_the_whole_model(problem, solution, how, options, inliers, progress)
         except CountError as error:
@@ -108,7 +110,7 @@ def estimated(
         else:
             raise
     counts = {pair: (int(mask.sum()), len(mask)) for pair, mask in inliers.items()}
-    noise = replace(_noise_of(refined, options, None, why), has_failed=failed)
+    noise = _noise_of(refined, options, None, why, has_failed=failed)
     return replace(refined, inliers=inliers, inlier_counts=counts), noise, inliers
 
 
@@ -144,15 +146,12 @@ def _by_the_whole_model(
         solution = solve(agreeing(problem, inliers), options=options.solve, progress=progress)
     progress("covariances")
     refined, noise_found = found.refined(inliers)
-    return refined, _noise_of(refined, options, noise_found, ""), inliers
+    return refined, _noise_of(refined, options, noise_found), inliers
 
 
-def _is_plain(noise: CarrierNoise | None) -> bool:
-    """Whether the whole model can hold the stated noise of A: standard deviations, no covariances."""
-    return noise is None or noise.covariances is None
-
-
-def _noise_of(refined: Refined, options: CalibrateOptions, model: NoiseInData | None, why: str) -> NoiseFound:
+def _noise_of(
+    refined: Refined, options: CalibrateOptions, model: NoiseInData | None, why: str = "", *, has_failed: bool = False
+) -> NoiseFound:
     return NoiseFound(
         source="estimated from the residuals" if refined.noise_source == "estimated" else "as given",
         rotation_rad={pair: noise.rotation_rad for pair, noise in refined.noise.items()},
@@ -160,6 +159,7 @@ def _noise_of(refined: Refined, options: CalibrateOptions, model: NoiseInData | 
         carriers="as given" if options.carrier_noise is not None else "none, A counts as exact",
         model=model,
         simple=why,
+        has_failed=has_failed,
     )
 
 
@@ -170,7 +170,7 @@ def refined_under_its_noise(
 
     Inliers are judged again under the noise, so the last two may differ from those that were given.
     """
-    record = run.record
+    record, number = run.record, run.problem.number_of_measurements
     run.tell("refining")
     try:
         if run.agreed is not None and inliers:  # a log's were chosen under each detection's own noise, and stay
@@ -180,42 +180,38 @@ def refined_under_its_noise(
             refined, noise, inliers = estimated(run.problem, solution, inliers, run.options, run.tell)
     except (NoiseError, CountError, UnderdeterminedError) as error:
         record.choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
-        number = run.problem.number_of_measurements
         words = f"the {number} measurements are too few to tell how well the poses are known"
         record.find(Ground.NO_COVARIANCE, words)
         return None, NOT_KNOWN, solution, inliers
-    if run.options.noise == "given":
-        record.choose("noise of B", "as given", run.says_so)
-        _doubt_stated_noise(run, refined, inliers)
-    elif refined.noise_source == "given":
-        record.choose("noise of B", "as given", "the residuals are too few to estimate it")
-        _doubt_stated_noise(run, refined, inliers)
+    spare = spare_equations(agreeing(run.problem, inliers))
+    if run.options.noise == "given" or refined.noise_source == "given":
+        is_option = run.options.noise == "given"
+        why = run.says_so if is_option else "the residuals are too few to estimate it"
+        record.choose("noise of B", "as given", why)
+        ratio = contradicted_by(refined.cost, spare)
+        if ratio is not None:  # standard deviations are too small by this factor
+            words = f"the residuals are {rounded(math.sqrt(ratio))} times as large as the stated noise allows"
+            record.find(Ground.NOISE_UNDERSTATED, words)
     elif noise.model is None:
         record.choose("noise", "that of B alone is estimated", noise.simple)
         if noise.has_failed:
             words = "the standard deviations lack the noise of A and errors that vary with the configuration"
             record.find(Ground.COVARIANCE_DOUBTED, words)
     else:
-        _say_sizes(run, refined, noise.model, inliers)
+        kept = sum(int(mask.sum()) for mask in inliers.values()) or number
+        _say_sizes(run, noise.model, f"that is what the residuals of {kept} measurements show")
+        ratio = overstated_by(refined.cost, spare) if run.options.carrier_noise is not None else None
+        if ratio is not None:  # deviations are then too large
+            times = f"{rounded(1.0 / math.sqrt(ratio))} times"
+            words = f"the residuals are far smaller ({times}) than the noise that you stated for A makes them"
+            record.find(Ground.NOISE_OVERSTATED, words)
         _say_drift(run, noise.model)
         _say_systematic(run, noise.model)
     return refined, noise, refined.solution, inliers
 
 
-def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Record a finding if the noise is larger than stated: standard deviations are too small by this factor."""
-    if refined.options.robust not in ("none", "gnc"):
-        return  # the cost of another loss is no chi-square
-    ratio = contradicted_by(refined.cost, spare_equations(agreeing(run.problem, inliers)))
-    if ratio is not None:
-        words = f"the residuals are {rounded(math.sqrt(ratio))} times as large as the stated noise allows"
-        run.record.find(Ground.NOISE_UNDERSTATED, words)
-
-
-def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers) -> None:
+def _say_sizes(run: Run, model: NoiseInData, shown: str) -> None:
     """Record the size of the noise in one line; the notes of ``model`` have the rest."""
-    number = sum(int(mask.sum()) for mask in inliers.values()) or run.problem.number_of_measurements
-    shown = f"that is what the residuals of {number} measurements show"
     stated = run.options.carrier_noise
     if stated is None:
         run.record.choose("noise of A and B", f"estimated, for each axis {model.size_words}", shown)
@@ -223,16 +219,6 @@ def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers)
     run.record.choose("noise of B", f"estimated, for each axis {model.size_words_of_B}", f"{shown} beside A's")
     size = f"{rounded(math.degrees(stated.rotation_rad))}° and {rounded(1e3 * stated.translation_m)} mm for each axis"
     run.record.choose("noise of A", f"{size}, as you stated", run.says_so)
-    _doubt_noise_of_A(run, refined, inliers)
-
-
-def _doubt_noise_of_A(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Record a finding if the noise stated for A is far larger than the residuals: deviations are then too large."""
-    ratio = overstated_by(refined.cost, spare_equations(agreeing(run.problem, inliers)))
-    if ratio is not None:
-        factor = rounded(1.0 / math.sqrt(ratio))
-        words = f"the residuals are far smaller ({factor} times) than the noise that you stated for A makes them"
-        run.record.find(Ground.NOISE_OVERSTATED, words)
 
 
 def _say_drift(run: Run, model: NoiseInData) -> None:

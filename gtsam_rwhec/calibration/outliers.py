@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, offsets_of
+from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing, offsets_of
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Sampled, TrialFit, fitted, implausible, residuals
 from gtsam_rwhec.calibration.verdict import OUTLIERS, Choice, Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
@@ -23,7 +23,6 @@ from gtsam_rwhec.fitting.robust_solution import NoiseScale, robust_solution
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution, solve
 
 #: "Half of its measurements".
@@ -157,9 +156,8 @@ class Outliers:
 
 def few_words(frame: str, number: int) -> str:
     """The words for a frame with so few measurements."""
-    if number == 1:
-        return f"{frame} rests on 1 measurement: a wrong one would not show"
-    return f"{frame} rests on {number} measurements: a wrong one could not be told from the other"
+    rest = ": a wrong one would not show" if number == 1 else "s: a wrong one could not be told from the other"
+    return f"{frame} rests on {number} measurement{rest}"
 
 
 #: An error of so many medians is gross. Of Gaussian errors none is; of Student's t one in 4,000 with 5 degrees of
@@ -173,40 +171,33 @@ MOST_PAIRS_ASKED, MOST_ASKED = 200, 10_000
 FEWEST_ASKED = 8
 
 
-@dataclass(frozen=True)
-class GrossErrors:
-    """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part."""
+def gross_errors(problem: Problem) -> str:
+    """How many measurements look wrong, as a sentence's part; empty where none does, or none can be told.
 
-    #: The numbers of measurements that look wrong, that were tested, and of the problem: of a large problem only a
-    #: sample is tested, without pairs with few measurements
-    number: int
-    looked_at: int
-    in_all: int
-
-    def __str__(self) -> str:
-        look = "looks" if self.number == 1 else "look"
-        rest = self.in_all - self.looked_at
-        others = f"; {rest} more {'was' if rest == 1 else 'were'} not looked at" if rest else ""
-        return (
-            f"{self.number} of {self.looked_at} measurements {look} wrong (off by more than {GROSS:g} times what half "
-            f"of the others are off by{others}), and still every measurement counts"
-        )
-
-
-def gross_errors(problem: Problem) -> GrossErrors | None:
-    """Measurements of a problem, or of a sample of it, that look wrong; None where none does, or none can be told."""
+    Of a large problem only a sample is tested, without pairs with few measurements.
+    """
     sampled = Sampled.of(problem, MOST_PAIRS_ASKED, MOST_ASKED)
     if sampled is None or sampled.count < FEWEST_ASKED:
-        return None
+        return ""
     fit = fitted(problem, sampled.as_read())
     if fit is None:
-        return None
+        return ""
     ends = np.cumsum([len(rows) for rows in sampled.rows.values()])[:-1]
     errors = fit.errors / _stated(sampled)
     medians = np.median(errors, axis=1, keepdims=True)
-    ratios = [_in_medians(of_pair, medians) for of_pair in np.split(errors, ends, axis=1)]
-    number = int((np.concatenate(ratios) > GROSS).sum())
-    return GrossErrors(number, sampled.count, problem.number_of_measurements) if number else None
+    number = 0
+    for of_pair in np.split(errors, ends, axis=1):  # the larger of both errors, in medians of the pair, or of all
+        few = of_pair.shape[1] < FEWEST_ROWS_OF_MEDIAN
+        own = medians if few else np.maximum(medians, np.median(of_pair, axis=1, keepdims=True))
+        number += int(((of_pair / np.maximum(own, 1e-12)).max(axis=0) > GROSS).sum())
+    if not number:
+        return ""
+    rest = problem.number_of_measurements - sampled.count
+    others = f"; {rest} more {'was' if rest == 1 else 'were'} not looked at" if rest else ""
+    return (
+        f"{number} of {sampled.count} measurements {'looks' if number == 1 else 'look'} wrong (off by more than "
+        f"{GROSS:g} times what half of the others are off by{others}), and still every measurement counts"
+    )
 
 
 def _stated(sampled: Sampled) -> Array:
@@ -214,12 +205,6 @@ def _stated(sampled: Sampled) -> Array:
     rows = [(sampled.whole[pair], chosen) for pair, chosen in sampled.rows.items()]
     rotation = np.concatenate([np.sqrt(0.5 / raw.kappa[chosen]) for raw, chosen in rows])
     return np.stack([rotation, np.concatenate([raw.sigma[chosen] for raw, chosen in rows])])
-
-
-def _in_medians(errors: Array, medians: Array) -> Array:
-    """The larger of both errors (2, N) of each measurement (N,), in medians of the pair, or of all pairs."""
-    own = np.median(errors, axis=1, keepdims=True) if errors.shape[1] >= FEWEST_ROWS_OF_MEDIAN else medians
-    return np.asarray((errors / np.maximum(np.maximum(own, medians), 1e-12)).max(axis=0))
 
 
 #: The measurements that were left out are tested if they are at least this share of all, and so many.
@@ -288,34 +273,31 @@ def without_outliers(
         Sensors whose clocks are clearly off. Their offsets are estimated here too, since a late clock makes outliers.
     """
     problem, options, record = run.problem, run.options, run.record
-    spare = spare_equations(problem)
+    lacking = -((spare_equations(problem) - SPARE_EQUATIONS) // 6)
+    why = ""
     if options.robust == "none":
-        record.choose(OUTLIERS, "every measurement counts", run.says_so)
+        why = run.says_so
         if gross := gross_errors(problem):
-            record.find(Ground.OUTLIERS_KEPT, str(gross))
+            record.find(Ground.OUTLIERS_KEPT, gross)
+    elif not problem.has_measurements:
+        why = "the raw measurements were not kept"
+    if why:
+        record.choose(OUTLIERS, "every measurement counts", why)
         return first, {}
-    if not problem.has_measurements:
-        record.choose(OUTLIERS, "every measurement counts", "the raw measurements were not kept")
-        return first, {}
-    if options.robust == "auto" and spare < SPARE_EQUATIONS:
-        record.choose(
-            OUTLIERS,
-            "not looked for",
-            f"{problem.number_of_measurements} measurements are too few to tell a wrong one from the others; "
-            f"{-((spare - SPARE_EQUATIONS) // 6)} more would do",
-        )
+    if options.robust == "auto" and lacking > 0:
+        why = f"{problem.number_of_measurements} measurements are too few to tell a wrong one from the others"
+        record.choose(OUTLIERS, "not looked for", f"{why}; {lacking} more would do")
         return first, {}
     offsets = clearly_off or offsets_of(problem, options)
     try:
         solution, inliers = run.agreed or _agreeing(run, first, offsets)
         other = more_consistent(problem, inliers)
         if other is not None:
-            solution, inliers = solve(selected(problem, other), options=options.solve), other
+            return solve(agreeing(problem, other), options=options.solve), other
         return solution, inliers
     except (OutlierError, NoiseError, ScaleError) as error:
         record.choose(OUTLIERS, "not left out", f"it is not possible: {error}")
-        words = "too few measurements agree with one another to find out which are wrong"
-        record.find(Ground.CONTRADICTED, words)
+        record.find(Ground.CONTRADICTED, "too few measurements agree with one another to find out which are wrong")
         return first, {}
 
 
@@ -386,7 +368,7 @@ def share_that_agrees_plausibly(run: Run, first: Solution | None) -> float | Non
     solution, inliers = without_outliers(attempt, first)
     if solution is None or not inliers or _share_kept(inliers) < MAJORITY:
         return None
-    return None if implausible(selected(run.problem, inliers), solution) else _share_kept(inliers)
+    return None if implausible(agreeing(run.problem, inliers), solution) else _share_kept(inliers)
 
 
 def say_outliers(run: Run, inliers: Inliers) -> None:

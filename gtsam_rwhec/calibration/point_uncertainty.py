@@ -23,7 +23,7 @@ from scipy.special import chdtr, chdtri, fdtr, fdtri
 from gtsam_rwhec.errors import FrameError, OptionError, PoseError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import LARGEST_M, Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_real
@@ -129,17 +129,10 @@ def ball_radius(variances: Array, level: float, degrees_of_freedom: float = np.i
         return 0.0
     x, wx = np.polynomial.legendre.leggauss(NODES[0])
     y, wy = np.polynomial.legendre.leggauss(NODES[1])
-    cosine, azimuth = 0.5 * (x + 1.0), 0.25 * np.pi * (y + 1.0)  # one octant; the others are alike
+    cosine, azimuth = 0.5 * (x[:, None] + 1.0), 0.25 * np.pi * (y + 1.0)  # one octant; the others are alike
     weight = 0.25 * wx[:, None] * wy
-    sine = np.sqrt(1.0 - cosine**2)
-    direction = np.stack(
-        [
-            np.broadcast_to(cosine[:, None], weight.shape),
-            sine[:, None] * np.cos(azimuth),
-            sine[:, None] * np.sin(azimuth),
-        ]
-    )
-    spread = np.einsum("i,ixy->xy", np.sort(variances)[::-1] / largest, direction**2)
+    first, second, third = np.sort(variances)[::-1] / largest
+    spread = first * cosine**2 + (1.0 - cosine**2) * (second * np.cos(azimuth) ** 2 + third * np.sin(azimuth) ** 2)
 
     def lacking(square: float) -> float:
         ratio = square / spread
@@ -177,15 +170,6 @@ class Carriers:
 
 
 @dataclass(frozen=True)
-class Side:
-    """The frames on one carrier."""
-
-    kind: str
-    poses: Mapping[str, gtsam.Pose3]  #: On the carrier
-    words: tuple[str, ...]  #: What the carrier is called
-
-
-@dataclass(frozen=True)
 class Place:
     """Where a point is expressed."""
 
@@ -194,29 +178,34 @@ class Place:
     is_across: bool  #: Whether it is on the other carrier than the point's own frame
 
 
-def sides_of(refined: RefinedPoses, frame: object, carriers: Carriers, *, has_A: bool) -> tuple[Side, Side]:
-    """The carrier of a frame, and the other one. A FrameError where there is no such frame."""
-    poses = {"sensor": refined.Y, "target": refined.X}
-    own = next((kind for kind, of in poses.items() if isinstance(frame, str) and frame in of), None)
-    if own is None:
-        raise FrameError(
-            f"there is no frame {brief(frame)}; there are the sensors {', '.join(refined.Y) or '(none)'} and the "
-            f"targets {', '.join(refined.X) or '(none)'}"
-        )
+def places_of(
+    frame: str, own: str, poses: Mapping[str, Mapping[str, gtsam.Pose3]], carriers: Carriers, *, has_A: bool
+) -> dict[str, Place]:
+    """By its word: each place where a point of ``frame``, a "sensor" or a "target", can be expressed or not without A.
 
-    def side(kind: str, *, all_words: bool) -> Side:
-        name = carriers.of(kind)
-        known: tuple[str, ...] = CARRIER_WORDS[kind]
+    ``poses`` has the frames on the carrier of the sensors, and of the targets.
+    """
+    places: dict[str, Place] = {}
+    kinds = [own, *(kind for kind in poses if kind != own)]
+    for kind in kinds:
+        name, known = carriers.of(kind), list(CARRIER_WORDS[kind])
         if not has_A:
-            known = tuple(word for word in known if word != MORE_OFTEN_THE_OTHER[kind])
-        words = (known if all_words else known[:1]) if name is None else (name, known[0])
-        return Side(kind, poses[kind], words)
+            known.remove(MORE_OFTEN_THE_OTHER[kind])
+        is_across = kind != own
+        usual = f"the frame that carries {f'the {kind}s' if is_across else frame}"
+        words = (known if is_across == has_A else known[:1]) if name is None else [name, known[0]]
+        for word in words:
+            places.setdefault(word, Place(name or usual, None, is_across))
+    for kind in kinds:
+        for name, pose in poses[kind].items():
+            if name != frame:
+                places.setdefault(name, Place(name, pose, kind != own))
+    return places
 
-    other = "target" if own == "sensor" else "sensor"
-    return side(own, all_words=not has_A), side(other, all_words=has_A)
 
-
-def place_of(seen_from: object, frame: str, own: Side, other: Side, carriers: Carriers, *, has_A: bool) -> Place:
+def place_of(
+    seen_from: object, frame: str, own: str, places: Mapping[str, Place], carriers: Carriers, *, has_A: bool
+) -> Place:
     """Where a point of ``frame`` is expressed, by the word that a user gave, or None.
 
     Raises
@@ -226,51 +215,41 @@ def place_of(seen_from: object, frame: str, own: Side, other: Side, carriers: Ca
     OptionError
         A is given, and has no use.
     """
-    place = _named(seen_from, frame, own, other, carriers, has_A=has_A)
-    is_unclear = isinstance(seen_from, str) and seen_from == MORE_OFTEN_THE_OTHER[own.kind]
-    if place is None and is_unclear and not has_A and carriers.of(own.kind) is None:
+    if seen_from is None:
+        return next(place for place in places.values() if place.frame is None and place.is_across == has_A)
+    place = places.get(seen_from) if isinstance(seen_from, str) else None
+    with_A = "uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
+    if place is None and seen_from == MORE_OFTEN_THE_OTHER[own] and not has_A and carriers.of(own) is None:
         raise FrameError(
             f"it is not clear which carrier {seen_from!r} is, as the problem does not name its carriers; name them: "
-            f'rw.Problem(sensor_carrier="hand", target_carrier="base"), or say seen_from="{own.words[0]}" for the '
-            f"carrier of {frame}; for the other carrier, which moves relative to {frame}, give the pose at that moment "
-            "too: uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
+            f'rw.Problem(sensor_carrier="hand", target_carrier="base"), or say seen_from="{CARRIER_WORDS[own][0]}" for '
+            f"the carrier of {frame}; for the other carrier, which moves relative to {frame}, give the pose at that "
+            f"moment too: {with_A}"
         )
+    across = _listed(places, is_across=True)
     if place is None:
         raise FrameError(
             f"{brief(seen_from)} is no frame in which a point of {frame} can be expressed; there are its carrier "
-            f"{_listed(own, frame)}, and with A = T_sensorcarrier_targetcarrier the other carrier "
-            f"{_listed(other, frame)}"
+            f"{_listed(places, is_across=False)}, and with A = T_sensorcarrier_targetcarrier the other carrier {across}"
         )
     if place.is_across and not has_A:
+        other = "target" if own == "sensor" else "sensor"
         raise FrameError(
-            f"{place.name} is on the carrier of the {other.kind}s, which moves relative to {frame}; give the pose at "
-            "that moment too: uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
+            f"{place.name} is on the carrier of the {other}s, which moves relative to {frame}; give the pose at that "
+            f"moment too: {with_A}"
         )
     if has_A and not place.is_across:
         raise OptionError(
             f"A has no use: {place.name} and {frame} are on one carrier; leave A out, or take a frame on the other "
-            f"carrier {_listed(other, frame)}"
+            f"carrier {across}"
         )
     return place
 
 
-def _named(seen_from: object, frame: str, own: Side, other: Side, carriers: Carriers, *, has_A: bool) -> Place | None:
-    word = seen_from if isinstance(seen_from, str) else None
-    asked = next((side for side in (own, other) if word in side.words), None)
-    if seen_from is None:
-        asked = other if has_A else own
-    if asked is not None:
-        standing_in = f"the frame that carries {frame}" if asked is own else f"the frame that carries the {other.kind}s"
-        return Place(carriers.of(asked.kind) or standing_in, None, asked is other)
-    for side in (own, other):
-        if word is not None and word != frame and word in side.poses:
-            return Place(word, side.poses[word], side is other)
-    return None
-
-
-def _listed(side: Side, frame: str) -> str:
-    others = [name for name in side.poses if name != frame]
-    return f"({', '.join(side.words)}){' and ' + ', '.join(others) if others else ''}"
+def _listed(places: Mapping[str, Place], *, is_across: bool) -> str:
+    there = {word: place for word, place in places.items() if place.is_across == is_across}
+    carrier, frames = ([word for word, of in there.items() if (of.frame is None) is it] for it in (True, False))
+    return f"({', '.join(carrier)}){' and ' if frames else ''}{', '.join(frames)}"
 
 
 #: Unit vectors whose mean is shorter than this have no common direction.
@@ -329,15 +308,22 @@ def point_uncertainty(
 ) -> PointUncertainty:
     """As ``Calibration.uncertainty_at``; ``noise_m`` is that of one measurement's translation, by pair, metres."""
     p, level = checked_point(point), checked_level(level)
-    own, other = sides_of(refined, frame, carriers, has_A=A is not None)
+    poses = {"sensor": refined.Y, "target": refined.X}
+    own = next((kind for kind, of in poses.items() if isinstance(frame, str) and frame in of), None)
+    if own is None:
+        raise FrameError(
+            f"there is no frame {brief(frame)}; there are the sensors {', '.join(refined.Y) or '(none)'} and the "
+            f"targets {', '.join(refined.X) or '(none)'}"
+        )
     if frame in views and views[frame].in_front and p[2] <= 0.0:
         raise PoseError(
             f"the point {p.tolist()} is behind {frame}, which saw every target in front of it (z > 0); give a "
             "point in the sensor's own frame, z forward, metres"
         )
-    place = place_of(seen_from, frame, own, other, carriers, has_A=A is not None)
-    is_sensor = own.kind == "sensor"
-    on_carrier = own.poses[frame]
+    places = places_of(frame, own, poses, carriers, has_A=A is not None)
+    place = place_of(seen_from, frame, own, places, carriers, has_A=A is not None)
+    is_sensor = own == "sensor"
+    on_carrier = poses[own][frame]
     T, levers = on_carrier, None
     if A is not None:
         given = gtsam.Pose3(one_transform(A, "A"))
@@ -354,8 +340,11 @@ def point_uncertainty(
         jacobians["scale"] = -(R @ p)[:, None] / float(np.asarray(refined.scale))
     covariance = refined.covariance_of(jacobians)
     axes, half_lengths, radius = ellipsoid(covariance, level, refined.degrees_of_freedom)
-    sigma = _noise_of_sensor(noise_m, frame) if is_sensor else 0.0
     lever = None if levers is None or noise_of_A is None else levers[noise_of_A.about]
+    sigma_m: float | None = 0.0
+    if is_sensor:  # the median of its pairs
+        noise = [value for pair, value in noise_m.items() if pair.sensor == frame]
+        sigma_m = float(np.median(noise)) if noise else None
     return PointUncertainty(
         point_m=p,
         frame=frame,
@@ -366,14 +355,8 @@ def point_uncertainty(
         axes=axes,
         half_lengths_mm=1e3 * half_lengths,
         radius_mm=1e3 * radius,
-        measurement_mm=_measurement_mm(sigma, noise_of_A, lever, level),
+        measurement_mm=_measurement_mm(sigma_m, noise_of_A, lever, level),
     )
-
-
-def _noise_of_sensor(noise_m: Mapping[Pair, float], sensor: str) -> float | None:
-    """The noise of one measurement's translation along each axis, m: the median of the sensor's pairs."""
-    noise = [value for pair, value in noise_m.items() if pair.sensor == sensor]
-    return float(np.median(noise)) if noise else None
 
 
 def _measurement_mm(

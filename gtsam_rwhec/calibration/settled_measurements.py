@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing, offsets_of, with_sizes_of
-from gtsam_rwhec.calibration.from_corners import ByCorners, with_estimated_intrinsics
+from gtsam_rwhec.calibration.from_corners import CornersFound, with_estimated_intrinsics
 from gtsam_rwhec.calibration.outliers import refined_with_outliers
 from gtsam_rwhec.calibration.sizes import TargetSize, sizes_in
 from gtsam_rwhec.errors import (
@@ -52,7 +52,7 @@ class _Settled:
     inliers: Inliers = field(default_factory=dict)
 
 
-def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorners | None]:
+def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], CornersFound | None]:
     """The run with A at the clocks' offsets and with sizes that are estimated; sizes; what a log's corners give.
 
     A stays as it was if options leave clocks to the data, A lies on no path, or no measurements agree.
@@ -90,7 +90,7 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], ByCorne
         better, by = with_estimated_intrinsics(run, told.refined, told.inliers)
         if better.times > run.times:
             again, other_sizes, other = settled_measurements(better)
-            if other is not None and other.found.corners is not None:
+            if other is not None and other.corners is not None:
                 return again, other_sizes, other
         else:
             run = better

@@ -8,6 +8,7 @@ is estimated again under the whole model of the noise; where there is none, bloc
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -25,8 +26,6 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -95,36 +94,23 @@ class TargetSize:
         )
 
 
-@dataclass(frozen=True)
-class CommonFactor:
-    """One factor by which all stated sizes are wrong; ``str()`` is one sentence."""
-
-    targets: int  #: How many targets' sizes the motion tells
-    #: As of a ``TargetSize``
-    scale: float
-    sigma: float
-
-    def __str__(self) -> str:
-        return (
-            f"the stated sizes of all {self.targets} targets are {_off(self.scale)} than the motion says (standard "
-            f"deviation {rounded(100.0 * self.sigma)} %), by one factor: the unit of lengths in A, or the focal "
-            "length, may be wrong as well (the motion gives this factor with scale='shared' or --scale shared)"
-        )
-
-
-def common_factor(found: Sequence[TargetSize]) -> CommonFactor | None:
-    """The factor by which all sizes are wrong that the motion determines; None if they are right, or factors differ."""
+def common_factor(found: Sequence[TargetSize]) -> str:
+    """A sentence about the factor by which all sizes are wrong; empty if they are right, or factors differ."""
     told = [(size.scale, size.sigma) for size in found if size.sigma is not None]
     if len(told) < 2:
-        return None
+        return ""
     scales, sigmas = np.array(told).T
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
     scale, sigma = float(weights @ scales / weights.sum()), float(sigmas.min())  # their errors may be alike
     alike = np.abs(scales - scale) <= np.maximum(UNCERTAIN_SIGMAS * sigmas, SIZE_SHARE)
     speaks = (scales - 1.0) * np.sign(scale - 1.0) > SPEAKING_SIGMAS * sigmas
     if not alike.all() or speaks.sum() < 2 or not is_size_doubted(scale, sigma):
-        return None
-    return CommonFactor(len(told), scale, sigma)
+        return ""
+    return (
+        f"the stated sizes of all {len(told)} targets are {_off(scale)} than the motion says (standard deviation "
+        f"{rounded(100.0 * sigma)} %), by one factor: the unit of lengths in A, or the focal length, may be wrong as "
+        "well (the motion gives this factor with scale='shared' or --scale shared)"
+    )
 
 
 def _off(scale: float) -> str:
@@ -164,9 +150,13 @@ def sizes(
     if problem.scale != "known" or not problem.has_measurements or not problem.pairs:
         return ()
     (progress or silent)("looking at the targets' sizes")
-    free = problem.with_measurements({pair: problem.measurements(*pair) for pair in problem.pairs})
-    free.scale = "per_target"
-    _loosen_fixed(free)
+    free = copy.copy(problem)  # the measurements are shared, what was stated is not
+    free.scale, free.fixed, free.priors = "per_target", dict(problem.fixed), dict(problem.priors)
+    # Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are.
+    for name in {pair.target for pair in free.pairs} & set(free.fixed):
+        T = free.fixed.pop(name)
+        free.priors.pop(name, None)
+        free.add_prior(name, T, FIXED_M, 0.5 / FIXED_RAD**2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
         try:
@@ -179,12 +169,12 @@ def sizes(
             return ()
         found = sizes_in(refined)
         if any(size.is_doubted or size.is_uncertain for size in found):
-            found = _under_all_noise(free, options, like, progress or silent) or _with_jackknife(free, found)
+            found = _under_all_noise(free, start, options, like, progress or silent) or _with_jackknife(free, found)
     return tuple(found)
 
 
 def _under_all_noise(
-    free: Problem, options: RefineOptions | None, like: NoiseInData | None, progress: Progress
+    free: Problem, start: Solution, options: RefineOptions | None, like: NoiseInData | None, progress: Progress
 ) -> list[TargetSize]:
     """The sizes under the noise that the data have; none where that cannot be modelled, or is given."""
     if options is not None and (options.noise != "estimate" or options.carrier_noise is not None):
@@ -196,65 +186,45 @@ def _under_all_noise(
         walk = None if like.correlation is None or like.frame is None else Walk(like.correlation, like.frame)
         kinds = NoiseOptions(drift=walk or "none", side=like.hand, systematic=like.arms_assumed)
     try:
-        refined, noise = refine_under_noise(free, solve(free), options, kinds, progress=progress)
+        refined, noise = refine_under_noise(free, start, options, kinds, progress=progress)
     except (CountError, np.linalg.LinAlgError, RuntimeError):
         return []
-    if noise.is_drift_untried:
-        return []  # errors of neighbours in time are alike, and the deviations do not know it
-    return sizes_in(refined)
+    # where drift is untried, errors of neighbours in time are alike, and the deviations do not know it
+    return [] if noise.is_drift_untried else sizes_in(refined)
 
 
 def sizes_in(refined: Refined) -> list[TargetSize]:
     """The sizes of an answer with a scale of each target."""
     assert isinstance(refined.scale, Mapping)
-    return [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
+    variances = {name: float(refined.covariance(Unknown(UnknownKind.SCALE, name))[0, 0]) for name in refined.scale}
+    sigmas = {name: math.sqrt(of) if math.isfinite(of) else None for name, of in variances.items()}
+    return [TargetSize(name, scale, sigmas[name]) for name, scale in refined.scale.items()]
 
 
 def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:
-    spread = _jackknife(free)
-    return [replace(size, sigma=_larger(size.sigma, spread.get(size.target))) for size in found]
+    """The sizes with the larger standard deviation of theirs and of leaving out a block of each pair at a time.
 
-
-def _loosen_fixed(free: Problem) -> None:
-    """Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are."""
-    for name in {pair.target for pair in free.pairs} & set(free.fixed):
-        T = free.fixed.pop(name)
-        free.priors.pop(name, None)
-        free.add_prior(name, T, FIXED_M, 0.5 / FIXED_RAD**2)
-
-
-def _sigma_of(refined: Refined, target: str) -> float | None:
-    variance = float(refined.covariance(Unknown(UnknownKind.SCALE, target))[0, 0])
-    return math.sqrt(variance) if math.isfinite(variance) else None
-
-
-def _larger(first: float | None, second: float | None) -> float | None:
-    """The larger standard deviation; None where either is not determined."""
-    return None if first is None or second is None else max(first, second)
-
-
-def _jackknife(free: Problem) -> dict[str, float]:
-    """Standard deviations of the scales, from leaving out one of `BLOCKS` blocks of each pair at a time."""
-    found: list[dict[str, float]] = []
-    numbers = {pair: np.arange(count) * BLOCKS // count for pair, count in _counts(free).items()}
+    None where either is not determined.
+    """
+    counts = {pair: free.moments(*pair).count for pair in free.pairs}
+    numbers = {pair: np.arange(count) * BLOCKS // count for pair, count in counts.items()}
+    scales: dict[str, list[float]] = {size.target: [] for size in found}
     for block in range(BLOCKS):
         try:
             scale = solve(selected(free, {pair: of != block for pair, of in numbers.items()})).scale
         except (ScaleError, CountError, UnderdeterminedError):
-            return {}  # the sizes hang on single blocks
+            return [replace(size, sigma=None) for size in found]  # the sizes hang on single blocks
         assert isinstance(scale, dict)
-        found.append(scale)
-    result = {}
-    for target in found[0]:
-        if all(target in scales for scales in found):
-            values = np.array([scales[target] for scales in found])
-            variance = (BLOCKS - 1) * float(np.var(values))
-            result[target] = math.sqrt(variance) * STUDENT
-    return result
-
-
-def _counts(problem: Problem) -> dict[tuple[str, str], int]:
-    return {pair: problem.moments(*pair).count for pair in problem.pairs}
+        for name in scales.keys() & scale.keys():
+            scales[name].append(scale[name])
+    sigmas = {
+        name: STUDENT * math.sqrt((BLOCKS - 1) * float(np.var(of))) for name, of in scales.items() if len(of) == BLOCKS
+    }
+    known = [size.sigma is not None and size.target in sigmas for size in found]
+    return [
+        replace(size, sigma=max(size.sigma or 0.0, sigmas[size.target]) if is_known else None)
+        for size, is_known in zip(found, known, strict=True)
+    ]
 
 
 #: No target is seen from farther away (m).
@@ -263,54 +233,36 @@ FAR_M = 100.0
 LONG_ARM_M = 50.0
 
 
-@dataclass(frozen=True)
-class DoubtedLengths:
-    """Lengths that no rig has; ``str()`` is one sentence. Residuals do not show the unit that A and B share."""
+def doubted_lengths(problem: Problem, solution: Solution) -> str:
+    """A sentence about lengths that no rig has: a target 800 m from a camera, a hand-eye lever arm of 300 m.
 
-    distance_m: float  #: The median distance of targets from their sensors
-    #: How far frames are from their carriers, as a median of the side where they are closer; nan if not determined
-    arm_m: float
-
-    def __str__(self) -> str:
-        found = []
-        if self.distance_m > FAR_M:
-            found.append(f"targets are seen from {rounded(self.distance_m, 4)} m")
-        if self.arm_m > LONG_ARM_M:
-            found.append(f"targets and sensors are {rounded(self.arm_m, 4)} m from their carriers")
-        return (
-            f"{' and '.join(found)}: this looks like millimetres in A and B, which no residual shows; give metres: "
-            "divide both by 1000"
-        )
-
-
-def doubted_lengths(problem: Problem, solution: Solution) -> DoubtedLengths | None:
-    """Find lengths that no rig has: a target 800 m from a camera, a hand-eye lever arm of 300 m.
-
-    Parameters
-    ----------
-    problem : Problem
-        Needs its raw measurements for the distances.
-    solution : Solution
-
-    Returns
-    -------
-    DoubtedLengths or None
-        None where all lengths are those of a rig.
+    Residuals do not show the unit that A and B share. Empty where all lengths are those of a rig; distances of targets
+    need the raw measurements.
     """
     distances = [
-        np.linalg.norm(batch.B[:, :3, 3], axis=1) / _scale_of(solution, pair)
+        np.linalg.norm(batch.B[:, :3, 3], axis=1)
+        / (solution.scale[pair.target] if isinstance(solution.scale, Mapping) else solution.scale)
         for pair in problem.pairs
         if not pair.is_motion
         for batch in problem.batches(*pair)
     ]
-    distance = float(np.median(np.concatenate(distances))) if distances else np.nan
-    sides = [
+    distance_m = float(np.median(np.concatenate(distances))) if distances else np.nan
+    # How far frames are from their carriers, as a median of the side where they are closer, if it is determined.
+    arms_m = [
         float(np.median([np.linalg.norm(T.translation()) for T in frames.values()]))
         for frames in (solution.X, solution.Y)
-        if frames
+        if frames and solution.identifiability.is_unique
     ]
-    arm = min(sides) if solution.identifiability.is_unique else np.nan
-    return DoubtedLengths(distance, arm) if distance > FAR_M or arm > LONG_ARM_M else None
+    arm_m = min(arms_m, default=np.nan)
+    found = [f"targets are seen from {rounded(distance_m, 4)} m"] if distance_m > FAR_M else []
+    if arm_m > LONG_ARM_M:
+        found.append(f"targets and sensors are {rounded(arm_m, 4)} m from their carriers")
+    if not found:
+        return ""
+    return (
+        f"{' and '.join(found)}: this looks like millimetres in A and B, which no residual shows; give metres: divide "
+        "both by 1000"
+    )
 
 
 def undetectable(problem: Problem, *, unit_is_told: bool = False) -> tuple[str, ...]:
@@ -331,8 +283,3 @@ def undetectable(problem: Problem, *, unit_is_told: bool = False) -> tuple[str, 
             "the target"
         )
     return tuple(f"data cannot tell: {each}" for each in found)
-
-
-def _scale_of(solution: Solution, pair: Pair) -> float | Array:
-    scale = solution.scale
-    return scale[pair.target] if isinstance(scale, Mapping) else scale

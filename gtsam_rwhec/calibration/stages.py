@@ -14,7 +14,7 @@ import numpy as np
 from rwhec_factors.se3 import inverse
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Recording, Run
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Recording, Run, agreeing
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.clock_offsets import Answer, answer, check_offsets, late_in_place_of_shifted
 from gtsam_rwhec.calibration.from_corners import (
@@ -39,12 +39,10 @@ from gtsam_rwhec.calibration.trial_fits import implausible
 from gtsam_rwhec.calibration.verdict import READING, Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError, RwhecError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
-from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.solver.solution import Solution, solve
 
@@ -68,16 +66,6 @@ class Turning:
     along_m: float
     across_m: float
 
-    @property
-    def is_little(self) -> bool:
-        """Whether it hardly turned about a second axis."""
-        return bool(self.spread_rad[1] < LITTLE_RAD)
-
-    @property
-    def is_planar(self) -> bool:
-        """Whether it moved in a plane, if it turned about one axis only."""
-        return self.along_m < FLAT * self.across_m
-
 
 def turning_of(A: Array) -> Turning:
     """How a carrier turned in poses A (N, 4, 4), T_sensorcarrier_targetcarrier."""
@@ -85,13 +73,9 @@ def turning_of(A: Array) -> Turning:
     rotations = Rotation.from_matrix(moved[:, :3, :3])
     turns = (rotations * rotations.mean().inv()).as_rotvec()
     values, axes = np.linalg.eigh(turns.T @ turns / len(A))
-    places = moved[:, :3, 3] - moved[:, :3, 3].mean(axis=0)
-    along = places @ axes[:, -1]
-    across = places - along[:, None] * axes[:, -1]
+    squares = (((moved[:, :3, 3] - moved[:, :3, 3].mean(axis=0)) @ axes) ** 2).mean(axis=0)
     return Turning(
-        np.sqrt(np.maximum(values[::-1], 0.0)),
-        float(np.sqrt(np.mean(along**2))),
-        float(np.sqrt(np.mean((across**2).sum(axis=1)))),
+        np.sqrt(np.maximum(values[::-1], 0.0)), float(np.sqrt(squares[2])), float(np.sqrt(squares[0] + squares[1]))
     )
 
 
@@ -112,7 +96,7 @@ def of_turning(
     if FreeReason.NO_ROTATION in reasons:
         return [Finding(Ground.NOT_UNIQUE, "too little rotation: the carriers hardly turn")]
     if FreeReason.ONE_AXIS in reasons:
-        if most.is_planar:
+        if most.along_m < FLAT * most.across_m:
             words = (
                 f"planar motion: the carriers turn about one axis only, and move {1e3 * most.across_m:.0f} mm across "
                 f"it but {1e3 * most.along_m:.1f} mm along it (standard deviations)"
@@ -120,14 +104,14 @@ def of_turning(
         else:
             words = "motion about one axis only: the carriers never turn about a second one"
         return [Finding(Ground.NOT_UNIQUE, words)]
-    if reasons or not is_answered or not most.is_little:
+    if reasons or not is_answered or most.spread_rad[1] >= LITTLE_RAD:
         return []
     first, second = (f"{np.degrees(spread):.2g} degrees" for spread in most.spread_rad[:2])
-    about = f"{first} about one axis and {second} about a second one"
     words = (
-        f"too little rotation: the carriers turn by {about} (standard deviations), which magnifies every error that "
+        f"too little rotation: the carriers turn by {first} about one axis and {second} about a second one (standard "
+        "deviations), which magnifies every error that does not average out, and no residual shows it"
     )
-    return [Finding(Ground.LITTLE_ROTATION, f"{words}does not average out, and no residual shows it")]
+    return [Finding(Ground.LITTLE_ROTATION, words)]
 
 
 def _of_sensors(problem: Problem, inliers: Mapping[Pair, np.ndarray]) -> dict[str, Array]:
@@ -222,7 +206,9 @@ def _calibrated(run: Run) -> Calibration:
         late = () if run.recording is None else run.recording.late
         if reading.finding is not None or late:
             first, why = _solved(run)
-            found = _nothing_else(run, first, [*([reading.finding] if reading.finding else []), *late])
+            run.record.choose(READING, "nothing else is computed", "the poses were misread, or are of another time")
+            run.record.findings += [*([reading.finding] if reading.finding else []), *late]
+            found = Answer(first)
         else:
             run, found_sizes, by_corners = settled_measurements(run)
             first, why = _solved(run)
@@ -237,26 +223,29 @@ def _calibrated(run: Run) -> Calibration:
             found_sizes = found_sizes or doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
             found = answered_by_corners(run, found, thin, by_corners)
     problem, record = run.problem, run.record
-    lengths = None
+    lengths = ""
     if found.solution is not None and not reading.misreadings:
         lengths = doubted_lengths(problem, found.solution)
-    if lengths is not None and (reading.finding is not None or not run.options.misreadings):
-        record.find(Ground.MISREAD, str(lengths))
-    elif lengths is not None:
-        record.start_again(Ground.MISREAD, str(lengths))
+    if lengths and (reading.finding is not None or not run.options.misreadings):
+        record.find(Ground.MISREAD, lengths)
+    elif lengths:
+        record.start_again(Ground.MISREAD, lengths)
         record.choose(READING, "nothing else is told", "lengths of the answer are those of no rig")
         found, found_sizes = Answer(found.solution), ()
     elif reading.finding is not None:
         record.notes.clear()  # they warn of attempts at an answer that is not given
     solution, inliers = found.solution, found.inliers
-    refined = None if found.refined is None else _as_stamped(found.refined, run.moved_s)
-    if refined is not None:
+    refined = found.refined
+    if refined is not None:  # with offsets from the given stamps, including those that A was already corrected by
+        offsets = {name: run.moved_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
+        refined = replace(refined, time_offsets_s=offsets)
         say_estimated_sizes(run, found_sizes, refined)
     if solution is None:
         record.find(Ground.NO_SCALE, why)
-    outliers = outliers_of(run, inliers, is_answered=refined is not None and not refined.free_directions)
-    is_few = refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS
-    if is_few and refined is not None and refined.noise_source == "estimated":
+    is_determined = refined is not None and not refined.free_directions
+    outliers = outliers_of(run, inliers, is_answered=is_determined)
+    is_few = is_determined and spare_equations(problem) < SPARE_EQUATIONS
+    if refined is not None and is_few and refined.noise_source == "estimated":
         words = f"{problem.number_of_measurements} measurements are too few to tell how large their noise is"
         record.find(Ground.COVARIANCE_DOUBTED, words)
     elif refined is not None and found.noise.model is not None and found.noise.model.instants < FEWEST_POSES:
@@ -280,7 +269,7 @@ def _calibrated(run: Run) -> Calibration:
         misreadings=reading.misreadings,
         implausible=reading.implausible,
         sizes=found_sizes,
-        cannot_tell=undetectable(problem, unit_is_told=lengths is not None),
+        cannot_tell=undetectable(problem, unit_is_told=bool(lengths)),
         findings=tuple(record.findings),
         choices=tuple(record.choices),
         notes=tuple(record.notes),
@@ -291,19 +280,6 @@ def _calibrated(run: Run) -> Calibration:
     )
 
 
-def _as_stamped(refined: Refined, moved_s: Mapping[str, float]) -> Refined:
-    """The answer with time offsets from the given stamps, including those that A was already corrected by."""
-    offsets = {name: moved_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
-    return replace(refined, time_offsets_s=offsets)
-
-
-def _nothing_else(run: Run, first: Solution | None, findings: list[Finding]) -> Answer:
-    """The first solution as the answer, since measurements were misread or a stated clock is wrong."""
-    run.record.choose(READING, "nothing else is computed", "the poses were misread, or are of another time")
-    run.record.findings += findings
-    return Answer(first)
-
-
 def _solved(run: Run) -> tuple[Solution | None, str]:
     """The certified solution of all measurements; without one, why there is none."""
     try:
@@ -312,40 +288,31 @@ def _solved(run: Run) -> tuple[Solution | None, str]:
         return None, str(error)
 
 
-def _why_as_given(problem: Problem) -> str:
-    """Why the reading counts as right: it was tested, or nothing could test it."""
-    if are_too_few_to_tell(problem):
-        return f"{problem.number_of_measurements} measurements are too few to show a mistake of reading"
-    return "no likely mistake of reading explains the measurements far better"
-
-
 def _read_and_answered(run: Run, first: Solution | None) -> tuple[Reading, Answer]:
     """How the poses were read, and the answer. If they were misread, the answer is only the first solution.
 
     Outliers alone may cause residuals that no sensor has: then the measurements that agree decide.
     """
-    what, tries = READING, run.options.misreadings
-    problem, agreeing = run.problem, first
+    tries, problem, solution = run.options.misreadings, run.problem, first
     if run.agreed is not None:  # a log's poses were read, with those that cleaning removed, before
-        agreeing, problem = run.agreed[0], selected(run.problem, run.agreed[1])
-    reading = reading_of(problem, agreeing, run.tell) if tries else Reading(implausible=implausible(problem, agreeing))
+        solution, problem = run.agreed[0], agreeing(run.problem, run.agreed[1])
+    reading = reading_of(problem, solution, run.tell) if tries else Reading(implausible=implausible(problem, solution))
     if reading.misreadings and all(one.mistake is Mistake.ROWS_SHIFTED for one in reading.misreadings):
         late = late_in_place_of_shifted(run, first)
         if late is not None:
             return Reading(), late
+    why = ""
     if reading.finding is None:
-        why = _why_as_given(run.problem) if tries else "an option says so"
-        run.record.choose(what, "as given", why)
-        return reading, answer(run, first)
-    if reading.implausible is not None and (share := share_that_agrees_plausibly(run, first)) is not None:
+        why = "no likely mistake of reading explains the measurements far better" if tries else "an option says so"
+        if tries and are_too_few_to_tell(run.problem):
+            why = f"{run.problem.number_of_measurements} measurements are too few to show a mistake of reading"
+    elif reading.implausible is not None and (share := share_that_agrees_plausibly(run, first)) is not None:
         why = f"{100.0 * share:.0f} % of the measurements agree with one another, with residuals that a sensor may have"
-        run.record.choose(what, "as given", why)
-        return Reading(), answer(run, first)
-    why = (
-        "another reading of the poses fits far better"
-        if reading.misreadings
-        else "the residuals are those of no sensor"
-    )
-    run.record.choose(what, "nothing else is computed", why)
+        reading = Reading()
+    if reading.finding is None:
+        run.record.choose(READING, "as given", why)
+        return reading, answer(run, first)
+    why = "another reading of the poses fits far better" if reading.misreadings else "the residuals are of no sensor"
+    run.record.choose(READING, "nothing else is computed", why)
     run.record.findings.append(reading.finding)
     return reading, Answer(first)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -75,52 +75,21 @@ class StatedPose:
         )
 
 
-def contradicted_poses(problem: Problem, answer: Callable[[Problem], Refined | None]) -> tuple[StatedPose, ...]:
-    """Stated poses of a problem that its measurements contradict, or that fit them badly.
-
-    Parameters
-    ----------
-    problem : Problem
-    answer : callable
-        The refined calibration of a problem; None where it has none.
-    """
-    stated = stated_poses(problem)
-    found: list[StatedPose] = []
-    loose: set[str] = set()
-    without = _without(problem, loose)
-    for _ in range(2):
-        # What the motion leaves free is held loosely in the second round.
-        free = set()
-        refined = answer(without)
-        for name, priors in stated.items():
-            if refined is None or name not in refined.names or not np.isfinite(refined.covariance(name)).all():
-                free.add(name)
-            else:
-                found += [one for prior in priors if (one := _compared(name, prior, refined)) is not None]
-        if loose or not free:
-            break
-        loose, stated = free, {name: stated[name] for name in free}
-        without = _without(problem, loose)
-    return tuple(found)
-
-
 def stated_poses(problem: Problem) -> dict[str, list[Prior]]:
     """What was stated of each frame that is measured; a fixed pose counts as a prior without noise."""
-    names = (*problem.targets, *problem.sensors)
-    found = {name: list(problem.priors.get(name, [])) for name in names}
-    for name in names:
-        if name in problem.fixed:
-            found[name] = [Prior(problem.fixed[name], 0.0, math.inf)]
+    found = {
+        name: [Prior(problem.fixed[name], 0.0, math.inf)] if name in problem.fixed else problem.priors.get(name, [])
+        for name in (*problem.targets, *problem.sensors)
+    }
     return {name: priors for name, priors in found.items() if priors}
 
 
-def _without(problem: Problem, loose: set[str]) -> Problem:
+def _without(problem: Problem, loose: Mapping[str, list[Prior]]) -> Problem:
     """The problem without what was stated of frames; those of ``loose`` keep the pose with a large noise."""
-    stated = stated_poses(problem)
     without = copy.copy(problem)  # the measurements are shared, what was stated is not
     without.fixed, without.priors = {}, {}
-    for name in loose:
-        without.add_prior(name, stated[name][0].transform, LOOSE_M, 0.5 / LOOSE_RAD**2)
+    for name, priors in loose.items():
+        without.add_prior(name, priors[0].transform, LOOSE_M, 0.5 / LOOSE_RAD**2)
     return without
 
 
@@ -145,21 +114,32 @@ def _compared(name: str, prior: Prior, refined: Refined) -> StatedPose | None:
 
 
 def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Record findings for priors and fixed poses that the measurements contradict."""
-    if not stated_poses(run.problem):
+    """Record findings for priors and fixed poses that the measurements contradict, or that fit them badly."""
+    stated = stated_poses(run.problem)
+    if not stated:
         return
     run.tell("comparing the stated poses with the measurements")
     options = replace(run.options, time_offsets=tuple(refined.time_offsets_s))
-    with_outliers = any(not mask.all() for mask in inliers.values())
-
-    def answer(without: Problem) -> Refined | None:
+    has_outliers = any(not mask.all() for mask in inliers.values())
+    found: list[StatedPose] = []
+    without = _without(run.problem, {})
+    for is_last in (False, True):
         try:
-            agree = robust_solution(without, noise_scale="estimate").inliers if with_outliers else {}
-            return estimated(without, solve(agreeing(without, agree), options=options.solve), agree, options, silent)[0]
-        except (RwhecError, np.linalg.LinAlgError):
-            return None  # without what was stated there is no answer to compare with
-
-    found = contradicted_poses(run.problem, answer)
+            agree = robust_solution(without, noise_scale="estimate").inliers if has_outliers else {}
+            solution = solve(agreeing(without, agree), options=options.solve)
+            alone = estimated(without, solution, agree, options, silent)[0]
+        except (RwhecError, np.linalg.LinAlgError):  # without what was stated there is no answer to compare with
+            alone = None
+        free = {}
+        for name, priors in stated.items():
+            if alone is None or name not in alone.names or not np.isfinite(alone.covariance(name)).all():
+                free[name] = priors
+            else:
+                found += [one for prior in priors if (one := _compared(name, prior, alone)) is not None]
+        if is_last or not free:
+            break
+        stated = free
+        without = _without(run.problem, free)  # what the motion leaves free is held loosely in the second round
     for one in found:
         off = Ground.COVARIANCE_DOUBTED if one.is_small else Ground.POSE_DOUBTED
         run.record.find(off if one.is_surely_off else Ground.POSE_UNCERTAIN, str(one))
@@ -208,14 +188,12 @@ def doubt_stated_sizes(
     doubted = [size for size in found if size.is_doubted]
     together = common_factor(found)
     uncertain = [size for size in found if size.is_uncertain]
-    if together is not None:
-        record.find(Ground.SIZE_DOUBTED, str(together))
+    if together:
+        record.find(Ground.SIZE_DOUBTED, together)
     else:
-        for size in doubted:
-            record.find(Ground.SIZE_DOUBTED, str(size))
-        for size in uncertain:
-            record.find(Ground.SIZE_UNCERTAIN, str(size))
-    if doubted or uncertain or together is not None:
+        for size in (*doubted, *uncertain):
+            record.find(Ground.SIZE_DOUBTED if size.is_doubted else Ground.SIZE_UNCERTAIN, str(size))
+    if doubted or uncertain or together:
         record.choose(what, "as stated, and doubted", "the motion contradicts them")
     elif any(size.sigma is not None for size in found):
         record.choose(what, "as stated", "the motion does not contradict them")

@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 from rwhec_factors.se3 import inverse, pose
@@ -76,8 +77,7 @@ class TrialFit:
         """Of each measurement (N,), up to a constant: Student's t in six dimensions, with the fit's own spreads."""
         s_R, s_t = self.residual.rotation_rad, self.residual.translation_m
         squared = (self.errors[0] / s_R) ** 2 + (self.errors[1] / s_t) ** 2
-        dimensions = 6.0
-        tails = 0.5 * (DEGREES_OF_T + dimensions) * np.log1p(MEDIAN_OF_CHI**2 * squared / DEGREES_OF_T)
+        tails = 0.5 * (DEGREES_OF_T + 6.0) * np.log1p(MEDIAN_OF_CHI**2 * squared / DEGREES_OF_T)
         result: Array = -3.0 * np.log(s_R * s_t) - tails
         return result
 
@@ -85,13 +85,6 @@ class TrialFit:
     def one_scale(self) -> float:
         """The scale, or the median of the targets' scales."""
         return float(np.median(list(self.scale.values()))) if isinstance(self.scale, dict) else self.scale
-
-
-@dataclass(frozen=True)
-class _Answer:
-    frames: dict[str, Array]  #: (4, 4) by name
-    scales: dict[str, float]  #: by the first name of a pair
-    rotations: list[Array]  #: of each part, where the next round starts
 
 
 def fitted(
@@ -117,18 +110,15 @@ def _fitted(problem: Problem, sample: Sample, mode: ScaleMode, rounds: int) -> T
     best: TrialFit | None = None
     for _ in range(rounds):
         trial = _problem_of(problem, sample, mode, weights, sigma, kappa)
-        answer = _solved(trial, starts)
-        starts = answer.rotations
-        errors = {pair: residuals(answer.frames, answer.scales[pair.target], pair, *sample[pair]) for pair in sample}
+        frames, scales, starts = _solved(trial, starts)
+        errors = {pair: residuals(frames, scales[pair.target], pair, *sample[pair]) for pair in sample}
         joined = np.concatenate(list(errors.values()), axis=1)
         if not np.isfinite(joined).all():
             return best
         spread = Spread.of(*joined)
-        kept = best is None or _volume(spread, distance) < _volume(best.residual, distance)
-        if kept:
-            scales = {pair.target: answer.scales[pair.target] for pair in sample}
-            own = scales if mode == "per_target" else next(iter(scales.values()))
-            best = TrialFit(spread, own, joined, answer.frames)
+        if best is None or _volume(spread, distance) < _volume(best.residual, distance):
+            own = {pair.target: scales[pair.target] for pair in sample}
+            best = TrialFit(spread, own if mode == "per_target" else next(iter(own.values())), joined, frames)
         s_R = max(spread.rotation_rad, SMALLEST_SHARE) / MEDIAN_OF_CHI
         s_t = max(spread.translation_m, SMALLEST_SHARE * distance) / MEDIAN_OF_CHI
         kappa, sigma = 0.5 / s_R**2, s_t
@@ -150,10 +140,8 @@ def _problem_of(
     trial = Problem(mode, keep_measurements=False)
     for pair, (A, B) in sample.items():
         w = weights[pair]
-        if pair.is_motion:
-            trial.add_motion(pair.sensor, A, B, sigma / np.sqrt(w), kappa * w)
-        else:
-            trial.add(*pair, A, B, sigma / np.sqrt(w), kappa * w)
+        add = partial(trial.add_motion, pair.sensor) if pair.is_motion else partial(trial.add, *pair)
+        add(A, B, sigma / np.sqrt(w), kappa * w)
     names = trial.targets + trial.sensors
     trial.fixed = {name: T for name, T in problem.fixed.items() if name in names}
     if mode == "per_target":
@@ -161,8 +149,8 @@ def _problem_of(
     return trial
 
 
-def _solved(trial: Problem, starts: list[Array] | None) -> _Answer:
-    """The best of a few descents, part by part; no proof."""
+def _solved(trial: Problem, starts: list[Array] | None) -> tuple[dict[str, Array], dict[str, float], list[Array]]:
+    """Poses by name, scales by a pair's first name, and rotations by part, of the best of a few descents; no proof."""
     frames: dict[str, Array] = dict(trial.fixed)
     scales: dict[str, float] = {}
     rotations = []
@@ -176,7 +164,7 @@ def _solved(trial: Problem, starts: list[Array] | None) -> _Answer:
         for name, R_name, t in zip(part.free, answer.R, answer.t, strict=True):
             frames[name] = pose(R_name, t + part.frame_shift(name))
         scales |= scales_of(part, answer)
-    return _Answer(frames, scales, rotations)
+    return frames, scales, rotations
 
 
 def residuals(frames: Mapping[str, Array], scale: float, pair: Pair, A: Array, B: Array) -> Array:
@@ -419,11 +407,10 @@ def implausible(problem: Problem, solution: Solution | None) -> Implausible | No
         return None
     fit = fitted(problem, sample)
     found = [spread for spread in (residual, fit.residual if fit else None) if spread is not None]
-    reasons = [_why(spread, signal, median_distance(sample)) for spread in found]
-    if not found or None in reasons:
+    reasons = [why for spread in found if (why := _why(spread, signal, median_distance(sample))) is not None]
+    if not found or len(reasons) < len(found):
         return None
     why, best = min(zip(reasons, found, strict=True), key=lambda each: each[1].rotation_rad * each[1].translation_m)
-    assert why is not None
     return _record(why, best, signal)
 
 

@@ -118,7 +118,7 @@ def _of_clocks(refined: CornersRefined) -> Iterator[str]:
             why = "move alike" if moves else "stand still"
             yield (
                 f"The images do not tell the time offset of {name}, since the carriers {why} in all of them: it is "
-                f"{offset_s:+.2g} s, with a deviation of {deviation:.2g} s. Leave {name} out of "
+                f"{round(offset_s, 9):+.2g} s, with a deviation of {deviation:.2g} s. Leave {name} out of "
                 "CornerOptions.time_offsets, or take images in motion that speeds up, slows down and turns back."
             )
         elif abs(offset_s) > CONSTANT_S:

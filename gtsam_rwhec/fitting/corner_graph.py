@@ -50,6 +50,7 @@ class CornerGraph:
     model: Model
     start: Point
     graph: gtsam.NonlinearFactorGraph = field(init=False)
+    keys: dict[tuple[str, str], int] = field(init=False)  #: By a variable's letter and name; without those of A
     _at: dict[int, bytes] = field(init=False, default_factory=dict)
     _point: Point = field(init=False)
     _errors: list[Array] = field(init=False, default_factory=list)
@@ -57,17 +58,13 @@ class CornerGraph:
 
     def __post_init__(self) -> None:
         model = self.model
-        self.x = {name: key_of("x", i) for i, name in enumerate(model.targets)}
-        self.y = {name: key_of("y", i) for i, name in enumerate(model.sensors)}
-        self.k = {name: key_of("k", i) for i, name in enumerate(model.camera_priors)}
-        self.b = {name: key_of("b", i) for i, name in enumerate(model.shape_priors)}
-        self.t = {name: key_of("t", i) for i, name in enumerate(model.offset_priors)}
-        self.p = {name: key_of("p", i) for i, name in enumerate(model.corner_priors)}
+        vectors = model.vectors(self.start)
+        names = [*(("x", name) for name in model.targets), *(("y", name) for name in model.sensors), *vectors]
+        letters = [letter for letter, _ in names]
+        self.keys = {at: key_of(at[0], letters[:i].count(at[0])) for i, at in enumerate(names)}
+        self._widths = {at: len(vectors.get(at, np.zeros(6))) for at in names}
         carriers = range(len(model.A)) if model.A_noise is not None else ()
-        self._keys = [
-            *self.x.values(), *self.y.values(), *self.k.values(), *self.b.values(), *self.t.values(),
-            *self.p.values(), *(key_of("a", i) for i in carriers),
-        ]  # fmt: skip
+        self._keys = [*self.keys.values(), *(key_of("a", i) for i in carriers)]
         self.graph = gtsam.NonlinearFactorGraph()
         self._add_priors()
         for s, stack in enumerate(model.stacks):
@@ -78,42 +75,31 @@ class CornerGraph:
     def values(self, point: Point) -> gtsam.Values:
         """A point as GTSAM's values."""
         values = gtsam.Values()
-        for keys, poses in ((self.x, point.X), (self.y, point.Y)):
-            for name, key in keys.items():
-                values.insert(key, gtsam.Pose3(poses[name]))
+        for letter, poses in (("x", point.X), ("y", point.Y)):
+            for name, T in poses.items():
+                values.insert(self.keys[letter, name], gtsam.Pose3(T))
         if self.model.A_noise is not None:
             for i, T in enumerate(point.A):
                 values.insert(key_of("a", i), gtsam.Pose3(T))
-        for name, key in self.k.items():
-            values.insert(key, np.asarray(point.cameras[name], dtype=float))
-        for name, key in self.b.items():
-            values.insert(key, point.shapes[name][self.model.free_shape(name)])
-        for name, key in self.t.items():
-            values.insert(key, np.array([point.offsets_s.get(name, 0.0)]))
-        for name, key in self.p.items():
-            values.insert(key, point.corners[name].ravel())
+        for at, value in self.model.vectors(point).items():
+            values.insert(self.keys[at], np.asarray(value, dtype=float))
         return values
 
     def point(self, values: gtsam.Values) -> Point:
         """GTSAM's values as a point."""
+        start = self.start
+        found: dict[str, dict[str, Array]] = {letter: {} for letter in "xykbtp"}
+        for (letter, name), key in self.keys.items():
+            found[letter][name] = values.atPose3(key).matrix() if letter in "xy" else values.atVector(key)
         A = self.model.A
         if self.model.A_noise is not None:
             A = np.array([values.atPose3(key_of("a", i)).matrix() for i in range(len(A))])
-        return Point(
-            {name: values.atPose3(key).matrix() for name, key in self.x.items()},
-            {name: values.atPose3(key).matrix() for name, key in self.y.items()},
-            A,
-            {name: values.atVector(key) for name, key in self.k.items()},
-            {name: self._shape(values, name) for name in self.start.shapes},
-            self.start.offsets_s | {name: float(values.atVector(key)[0]) for name, key in self.t.items()},
-            {name: values.atVector(key).reshape(-1, 3) for name, key in self.p.items()},
-        )
-
-    def _shape(self, values: gtsam.Values, name: str) -> Array:
-        shape = self.start.shapes[name].copy()
-        if name in self.b:
-            shape[self.model.free_shape(name)] = values.atVector(self.b[name])
-        return shape
+        shapes = {name: shape.copy() for name, shape in start.shapes.items()}
+        for name, free in found["b"].items():
+            shapes[name][self.model.free_shape(name)] = free
+        offsets_s = start.offsets_s | {name: float(offset[0]) for name, offset in found["t"].items()}
+        corners = {name: off.reshape(-1, 3) for name, off in found["p"].items()}
+        return Point(found["x"], found["y"], A, found["k"], shapes, offsets_s, corners)
 
     def covariance(self, values: gtsam.Values, slots: Mapping[tuple[str, str], slice]) -> tuple[Array, float]:
         """The covariance (d, d) of the unknowns in `slots`, all else eliminated; and how far off the optimum is.
@@ -122,8 +108,7 @@ class CornerGraph:
         ("k", camera), ("b", target), ("t", sensor) and ("p", target).
         """
         linear = self.graph.linearize(values)
-        of_letter = {"x": self.x, "y": self.y, "k": self.k, "b": self.b, "t": self.t, "p": self.p}
-        keys = [of_letter[letter][name] for letter, name in slots]
+        keys = [self.keys[at] for at in slots]
         marginal = linear.marginal(keys)
         ordering = gtsam.Ordering()
         for key in keys:
@@ -141,39 +126,27 @@ class CornerGraph:
             for i, (T, covariance) in enumerate(zip(model.A, columns @ columns.transpose(0, 2, 1), strict=True)):
                 noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
                 self.graph.add(gtsam.PriorFactorPose3(key_of("a", i), gtsam.Pose3(T), noise))
-        for name, key in self.k.items():
-            mean, deviation = model.camera_priors[name]
+        for at, (mean, deviation) in model.priors(self.start).items():
             # an infinite deviation is a weight of zero
-            self.graph.add(gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Diagonal.Precisions(deviation**-2.0)))
-        for name, key in self.b.items():
-            deviation = model.shape_priors[name][model.free_shape(name)]
-            noise = gtsam.noiseModel.Diagonal.Sigmas(deviation)
-            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(len(deviation)), noise))
-        for name, key in self.t.items():
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, model.offset_priors[name])
-            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
-        for name, key in self.p.items():
-            number = self.start.corners[name].size
-            noise = gtsam.noiseModel.Isotropic.Sigma(number, model.corner_priors[name])
-            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(number), noise))
+            self.graph.add(gtsam.PriorFactorVector(self.keys[at], mean, gtsam.noiseModel.Diagonal.Sigmas(deviation)))
 
-    def _variables_of(self, s: int) -> dict[str, int]:
-        """The keys of a stack's variables by their names in `Model`, without A."""
+    def _variables_of(self, s: int) -> dict[str, tuple[str, str]]:
+        """The letters and names of a stack's variables by their names in `Model`, without A."""
         stack = self.model.stacks[s]
-        keys = {
-            "X": self.x[stack.target],
-            "Y": self.y[stack.sensor],
-            "camera": self.k[self.model.camera_of[stack.sensor]],
-            "shape": self.b.get(stack.target, 0),
-            "time": self.t.get(stack.sensor, 0),
-            "corners": self.p.get(stack.target, 0),
+        names = {
+            "X": ("x", stack.target),
+            "Y": ("y", stack.sensor),
+            "camera": ("k", self.model.camera_of[stack.sensor]),
+            "shape": ("b", stack.target),
+            "time": ("t", stack.sensor),
+            "corners": ("p", stack.target),
         }
-        return {name: keys[name] for name in self.model.variables_of(stack) if name != "A"}
+        return {name: names[name] for name in self.model.variables_of(stack) if name != "A"}
 
     def _add_pair(self, s: int) -> None:
         """What a stack's rows say without A. Where A is free, its images' factors have the cost."""
         variables = self._variables_of(s)
-        size = self._columns(s) + 1
+        size = sum(self._widths[at] for at in variables.values()) + 1
         exact = self.model.A_noise is None
 
         def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
@@ -187,11 +160,12 @@ class CornerGraph:
                 jacobians[i] = rows.together[:, rows.columns[name]]
             return np.asarray(rows.together[:, -1])
 
-        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), list(variables.values()), error))
+        keys = [self.keys[at] for at in variables.values()]
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
 
     def _add_image(self, s: int, v: int) -> None:
         variables = self._variables_of(s)
-        keys = [*variables.values(), key_of("a", int(self.model.stacks[s].instant[v]))]
+        keys = [*(self.keys[at] for at in variables.values()), key_of("a", int(self.model.stacks[s].instant[v]))]
 
         def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
             self._come_to(keys, values)
@@ -206,17 +180,6 @@ class CornerGraph:
             return np.asarray(rows.of_images[v][:, -1])
 
         self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error))
-
-    def _columns(self, s: int) -> int:
-        """How many columns a stack's variables have without A."""
-        stack, start = self.model.stacks[s], self.start
-        numbers = {
-            "camera": len(start.cameras[self.model.camera_of[stack.sensor]]),
-            "shape": len(self.model.free_shape(stack.target)),
-            "time": 1,
-            "corners": 3 * len(stack.points),
-        }
-        return sum(numbers.get(name, 6) for name in self._variables_of(s))
 
     def _rows_there(self) -> list[FewRows]:
         """The linear rows at the values that were come to."""

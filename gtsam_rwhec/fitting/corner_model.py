@@ -122,6 +122,25 @@ class Model:
             result.append(FewRows(*few_rows(Rows(J, B, _finite(rows.residual, root)), J_A), columns))
         return result
 
+    def vectors(self, point: Point) -> dict[tuple[str, str], Array]:
+        """What is not known besides poses, by letter and name: "k" cameras, "b" shapes, "t" clocks, "p" corners."""
+        return (
+            {("k", name): point.cameras[name] for name in self.camera_priors}
+            | {("b", name): point.shapes[name][self.free_shape(name)] for name in self.shape_priors}
+            | {("t", name): np.array([point.offsets_s.get(name, 0.0)]) for name in self.offset_priors}
+            | {("p", name): point.corners[name].ravel() for name in self.corner_priors}
+        )
+
+    def priors(self, point: Point) -> dict[tuple[str, str], tuple[Array, Array]]:
+        """Mean and deviations of the prior of each of the `vectors`."""
+        deviations: dict[tuple[str, str], float | Array] = {}
+        deviations |= {("t", name): in_s for name, in_s in self.offset_priors.items()}
+        deviations |= {("p", name): in_m for name, in_m in self.corner_priors.items()}
+        deviations |= {("b", name): of[self.free_shape(name)] for name, of in self.shape_priors.items()}
+        priors = {at: (np.zeros(len(of)), deviations.get(at, 0.0)) for at, of in self.vectors(point).items()}
+        priors |= {("k", name): prior for name, prior in self.camera_priors.items()}
+        return {at: (mean, np.broadcast_to(deviation, mean.shape)) for at, (mean, deviation) in priors.items()}
+
     def free_shape(self, target: str) -> np.ndarray:
         """Which of the three numbers of a board's shape are free."""
         return np.flatnonzero(self.shape_priors.get(target, ()))

@@ -86,32 +86,18 @@ class Reduced:
     @staticmethod
     def of(model: Model, point: Point) -> Reduced:
         """The sums at a point. The errors of its A are taken off the residuals, to first order."""
-        slots: dict[tuple[str, str], slice] = {}
-        size = 0
-
-        def add(letter: str, name: str, number: int) -> None:
-            nonlocal size
-            slots[letter, name] = slice(size, size + number)
-            size += number
-
-        for name in model.targets:
-            add("x", name, 6)
-        for name in model.sensors:
-            add("y", name, 6)
-        for name, (mean, _) in model.camera_priors.items():
-            add("k", name, len(mean))
-        for name in model.shape_priors:
-            add("b", name, len(model.free_shape(name)))
-        for name in model.offset_priors:
-            add("t", name, 1)
-        for name in model.corner_priors:
-            add("p", name, point.corners[name].size)
+        vectors = model.vectors(point)
+        widths = {("x", name): 6 for name in model.targets} | {("y", name): 6 for name in model.sensors}
+        widths |= {at: len(vector) for at, vector in vectors.items()}
+        ends = np.cumsum(list(widths.values())).tolist()
+        slots = {at: slice(end - width, end) for (at, width), end in zip(widths.items(), ends, strict=True)}
+        size = ends[-1]
         count = len(model.A)
         G, g = np.zeros((size, size)), np.zeros(size)
         C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
         rr = number = 0.0
         to_right = model.to_right
-        at = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
+        off_A = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
         for stack, weights in zip(model.stacks, model.weights, strict=True):
             rows = model.linearised(stack, point)
             parts = {("x", stack.target): rows.by_X, ("y", stack.sensor): rows.by_Y}
@@ -124,11 +110,10 @@ class Reduced:
             where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in names])
             root = np.repeat(np.sqrt(weights), 2, axis=1)
             by_A = rows.by_A @ to_right[stack.instant]
-            off_A = np.einsum("vni,vi->vn", by_A, at[stack.instant])
             of_stack = Rows(
                 np.concatenate(list(parts.values()), axis=2) * root[..., None],
                 rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if len(names) > len(parts) else None,
-                (rows.residual - off_A) * root,
+                (rows.residual - np.einsum("vni,vi->vn", by_A, off_A[stack.instant])) * root,
             )
             J_A = by_A * root[..., None]
             squares, of_A = of_stack.squares(), of_stack.times(J_A)
@@ -142,19 +127,9 @@ class Reduced:
             np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
             np.add.at(b, stack.instant, of_A[..., -1])
         prior, off = np.zeros(size), np.zeros(size)
-        for name, (mean, deviation) in model.camera_priors.items():
-            prior[slots["k", name]] = deviation**-2.0
-            off[slots["k", name]] = point.cameras[name] - mean
-        for name, deviation in model.shape_priors.items():
-            free = model.free_shape(name)
-            prior[slots["b", name]] = deviation[free] ** -2.0
-            off[slots["b", name]] = point.shapes[name][free]
-        for name, in_s in model.offset_priors.items():
-            prior[slots["t", name]] = in_s**-2.0
-            off[slots["t", name]] = point.offsets_s.get(name, 0.0)
-        for name, in_m in model.corner_priors.items():
-            prior[slots["p", name]] = in_m**-2.0
-            off[slots["p", name]] = point.corners[name].ravel()
+        for at, (mean, deviation) in model.priors(point).items():
+            prior[slots[at]] = deviation**-2.0
+            off[slots[at]] = vectors[at] - mean
         return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:

@@ -7,6 +7,7 @@ that are alike in neighbours in time make N images worth W: the covariance grows
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions, Stated
 from gtsam_rwhec.fitting.held_out import HeldOut
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.projection_uncertainty import by_region
+from gtsam_rwhec.fitting.projection_uncertainty import as_regions, by_region
 from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements
 from gtsam_rwhec.fitting.reprojection_record import (
@@ -28,14 +29,12 @@ from gtsam_rwhec.fitting.reprojection_record import (
     BoardShape,
     Consequence,
     Intrinsics,
-    Regions,
     Reprojection,
     SensorReprojection,
     TriedModel,
 )
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
 
 #: The numbers of a board's shape.
 SHAPE_NAMES = (SIZE, "warp_x", "warp_y")
@@ -66,18 +65,14 @@ def as_refined(
     joint = _joint(base, corners)
     freedom = min((value for (letter, _), value in corners.freedom.items() if letter in "xy"), default=np.inf)
     cost = float(corners.graph.graph.error(corners.graph.values(corners.point)))
-    graph = corners.graph
-    keys = {name: key for keys in (graph.x, graph.y) for name, key in keys.items()}
-    keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
-    keys |= {f"shape:{name}": key for name, key in graph.b.items()}
-    keys |= {f"time_offset:{name}": key for name, key in graph.t.items()}
-    keys |= {f"corners:{name}": key for name, key in graph.p.items()}
+    graph, scale = corners.graph, _scale(base, corners)
+    keys = {name: graph.keys[at] for name, at in corners.names.items()}
     refined = replace(
         base,
         X=corners.X,
         Y=corners.Y,
-        scale=_scale(base, corners),
-        scale_mode=_scale_mode(base, corners),
+        scale=scale,
+        scale_mode="known" if isinstance(scale, float) else "per_target",
         time_offsets_s=base.time_offsets_s | corners.time_offsets_s,
         factor_graph=partial(FactorGraph, graph.graph, graph.values(corners.point), keys),
         noise_source="estimated",
@@ -168,42 +163,33 @@ def _joint(base: Refined, corners: CornersRefined) -> JointCovariance:
     Sensors that share a camera have its rows each: the covariance is singular there, as it is. Places of single corners
     are left out: they are unknowns of the graph, and of no interest beside a board's.
     """
-    parts: list[tuple[Unknown, slice, float | Array]] = []
-    for name, (letter, owner) in corners.names.items():
-        rows = corners.slots[letter, owner]
-        if letter in "xy":
-            parts.append((Unknown(UnknownKind.FRAME, owner), rows, 1.0))
-        elif letter == "b":
-            free = corners.graph.model.free_shape(owner)
-            first = rows.start
-            if free[0] == 0:  # the size: scale = stated / true = 1 / (1 + s)
-                by_s = -1.0 / (1.0 + corners.shapes[owner][0]) ** 2
-                parts.append((Unknown(UnknownKind.SCALE, owner), slice(first, first + 1), by_s))
-                first += 1
-            if first < rows.stop:
-                parts.append((Unknown(UnknownKind.SHAPE, owner), slice(first, rows.stop), 1.0))
-        elif letter == "k":
-            parts.append((Unknown(UnknownKind.INTRINSICS, name.partition(":")[2]), rows, 1.0))
-        elif letter == "t":
-            parts.append((Unknown(UnknownKind.TIME_OFFSET, owner), rows, 1.0))
+    kinds = {"x": UnknownKind.FRAME, "y": UnknownKind.FRAME, "k": UnknownKind.INTRINSICS, "b": UnknownKind.SHAPE}
+    kinds["t"] = UnknownKind.TIME_OFFSET
     slots: dict[Unknown, slice] = {}
     index: list[int] = []
-    factors: list[Array] = []
-    end = 0
-    for unknown, rows, factor in parts:
-        width = rows.stop - rows.start
-        slots[unknown] = slice(end, end + width)
-        index += range(rows.start, rows.stop)
-        factors.append(np.full(width, factor))
-        end += width
-    scaling = np.concatenate(factors)
-    finite = corners.joint[np.ix_(index, index)] * np.outer(scaling, scaling)
+    factors: list[float] = []
+
+    def add(unknown: Unknown, rows: list[int], factor: float = 1.0) -> None:
+        if rows:
+            slots[unknown] = slice(len(index), len(index) + len(rows))
+            index.extend(rows)
+            factors.extend([factor] * len(rows))
+
+    for name, (letter, owner) in corners.names.items():
+        at = corners.slots[letter, owner]
+        rows = list(range(at.start, at.stop))
+        if letter == "b" and 0 in corners.graph.model.free_shape(owner):  # scale = stated / true = 1 / (1 + s)
+            add(Unknown(UnknownKind.SCALE, owner), rows[:1], -1.0 / (1.0 + corners.shapes[owner][0]) ** 2)
+            rows = rows[1:]
+        if letter in kinds:
+            add(Unknown(kinds[letter], name.partition(":")[2] if letter == "k" else owner), rows)
+    finite = corners.joint[np.ix_(index, index)] * np.outer(factors, factors)
     length = float(base.joint.unit[base.joint.slots[Unknown(UnknownKind.FRAME, next(iter(corners.X)))]][3])
-    unit = np.ones(end)
-    for unknown, rows in slots.items():
+    unit = np.ones(len(index))
+    for unknown, where in slots.items():
         if unknown.kind is UnknownKind.FRAME:
-            unit[rows.start + 3 : rows.stop] = length
-    return JointCovariance(slots, finite, np.zeros((end, 0)), unit)
+            unit[where.start + 3 : where.stop] = length
+    return JointCovariance(slots, finite, np.zeros((len(index), 0)), unit)
 
 
 def _scale(base: Refined, corners: CornersRefined) -> float | dict[str, float]:
@@ -215,10 +201,6 @@ def _scale(base: Refined, corners: CornersRefined) -> float | dict[str, float]:
     if isinstance(base.scale, float):
         return dict.fromkeys(corners.X, base.scale) | free if free else base.scale
     return base.scale | free
-
-
-def _scale_mode(base: Refined, corners: CornersRefined) -> ScaleMode:
-    return "known" if isinstance(_scale(base, corners), float) else "per_target"
 
 
 def numbers_of(
@@ -261,21 +243,20 @@ def _of_sensor(
 ) -> SensorReprojection:
     views = {pair: view for pair, view in observations.views.items() if pair[1] == name}
     left_out = sum(int(corners.left_out[pair].sum()) for pair in views)
-    return SensorReprojection(
+    found = SensorReprojection(
         images=sum(len(view.A) for view in views.values()),
         corners=sum(int(view.known.sum()) for view in views.values()) - left_out,
         left_out=left_out,
         rms_px=corners.intrinsics[name].rms_px,
-        held_out_px=None if held_out is None else held_out.rms_px,
-        held_out_mm=None if held_out is None else held_out.rms_mm,
-        regions_px=() if held_out is None else _regions(held_out),
-        expected_px=None if held_out is None else held_out.expected_px,
     )
-
-
-def _regions(held_out: HeldOut) -> Regions:
-    return tuple(
-        tuple(None if np.isnan(value) else float(value) for value in row) for row in held_out.regions_px.tolist()
+    if held_out is None:
+        return found
+    return replace(
+        found,
+        held_out_px=held_out.rms_px,
+        held_out_mm=held_out.rms_mm,
+        regions_px=as_regions(held_out.regions_px),
+        expected_px=held_out.expected_px,
     )
 
 
@@ -285,22 +266,6 @@ CENTRE_PX, FOCAL_SHARE, CARRIER_RAD = 1.0, 1e-3, np.radians(0.1)
 
 #: The cause of A's, in words: how they begin.
 OF_CARRIERS = f"{np.degrees(CARRIER_RAD):.1f} degrees of A's noise about each axis"
-
-
-def carrier_cause(refined: CornersRefined) -> str:
-    """A's noise, in words: rotations of A leave the origin of one of the two carriers where it is."""
-    about = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}[refined.graph.model.about]
-    return f"{OF_CARRIERS} (one standard deviation; A turns about the origin of the {about})"
-
-
-def centre_causes(sensor: str) -> tuple[str, str]:
-    """Errors of a camera's centre, in words."""
-    return f"{CENTRE_PX:g} pixel of {sensor}'s cx", f"{CENTRE_PX:g} pixel of {sensor}'s cy"
-
-
-def focal_cause(sensor: str) -> str:
-    """An error of a camera's focal length, in words."""
-    return f"{FOCAL_SHARE:.1%} of {sensor}'s focal length"
 
 
 def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
@@ -314,28 +279,28 @@ def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
         if letter != "k":
             continue
         focal = refined.intrinsics[name].camera.K[[0, 1], [0, 1]]
-        of_cx, of_cy = centre_causes(name)
         steps: dict[str, tuple[int | slice, float | Array]] = {
-            of_cx: (2, CENTRE_PX),
-            of_cy: (3, CENTRE_PX),
-            focal_cause(name): (slice(0, 2), FOCAL_SHARE * focal),
+            f"{CENTRE_PX:g} pixel of {name}'s cx": (2, CENTRE_PX),
+            f"{CENTRE_PX:g} pixel of {name}'s cy": (3, CENTRE_PX),
+            f"{FOCAL_SHARE:.1%} of {name}'s focal length": (slice(0, 2), FOCAL_SHARE * focal),
         }
         for cause, (which, size) in steps.items():
             dk = np.zeros(at.stop - at.start)
             dk[which] = size
             moved = np.zeros(len(information))
             moved[rest] = -np.linalg.solve(information[np.ix_(rest, rest)], information[rest, at] @ dk)
-            result += [_moved(frame, cause, moved[rows]) for frame, rows in poses.items()]
-    covariance, cause = _of_carrier_noise(refined), carrier_cause(refined)
+            for frame, rows in poses.items():
+                angle, distance = np.linalg.norm(moved[rows].reshape(2, 3), axis=1).tolist()
+                result.append(Consequence(frame, cause, math.degrees(angle), 1e3 * distance))
+    # Rotations of A leave the origin of one of the two carriers where it is.
+    about = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}[refined.graph.model.about]
+    cause = f"{OF_CARRIERS} (one standard deviation; A turns about the origin of the {about})"
+    covariance = _of_carrier_noise(refined)
     for frame, rows in poses.items():
         block = covariance[rows, rows]
-        worst = [np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (block[:3, :3], block[3:, 3:])]
-        result.append(Consequence(frame, cause, float(np.degrees(worst[0])), float(1e3 * worst[1])))
+        worst = [float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (block[:3, :3], block[3:, 3:])]
+        result.append(Consequence(frame, cause, math.degrees(worst[0]), 1e3 * worst[1]))
     return tuple(result)
-
-
-def _moved(frame: str, cause: str, xi: Array) -> Consequence:
-    return Consequence(frame, cause, float(np.degrees(np.linalg.norm(xi[:3]))), float(1e3 * np.linalg.norm(xi[3:])))
 
 
 def _of_carrier_noise(refined: CornersRefined) -> Array:

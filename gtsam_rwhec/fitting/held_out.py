@@ -114,8 +114,9 @@ def left_out(
         rest = _some(counted, stacks, block != fold)
         again = refine_corners(rest, refined.X, refined.Y, told)
         parts.append(again)
-        for stack in _some_stacks(stacks, block == fold):
-            found[stack.sensor].append(_predicted(stack, A, again))
+        for stack in stacks:
+            if (seen := block[stack.instant] == fold).any():
+                found[stack.sensor].append(_predicted(stack.selected(seen), A, again))
     errors = {
         name: _of_sensor(
             *(np.concatenate(values) for values in zip(*each, strict=True)), camera=observations.cameras[name]
@@ -177,20 +178,21 @@ def _blocks(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarray:
     return np.minimum((folds * place / count).astype(np.int64), folds - 1)
 
 
-def _of_sensor(length: Array, on_target: Array, expected: Array, pixels: Array, *, camera: Camera) -> HeldOut:
+def rms_by_region(camera: Camera, pixels: Array, values: Array) -> Array:
+    """Root mean squares (3, 3) of values (n,) at pixels (n, 2) by region of the image; nan where there are none."""
     size = np.array([camera.width, camera.height])
-    at = np.clip((REGIONS * (pixels + 0.5) / size).astype(int), 0, REGIONS - 1)
-    count, total = np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
-    np.add.at(count, (at[:, 1], at[:, 0]), 1.0)
-    np.add.at(total, (at[:, 1], at[:, 0]), length**2)
-    regions = np.full((REGIONS, REGIONS), np.nan)
-    regions[count > 0] = np.sqrt(total[count > 0] / count[count > 0])
+    at = np.clip((REGIONS * (pixels + 0.5) / size).astype(int), 0, REGIONS - 1) @ [1, REGIONS]
+    count, total = np.bincount(at, minlength=REGIONS**2), np.bincount(at, values**2, REGIONS**2)
+    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan)).reshape(REGIONS, REGIONS)
+
+
+def _of_sensor(length: Array, on_target: Array, expected: Array, pixels: Array, *, camera: Camera) -> HeldOut:
     return HeldOut(
         float(np.sqrt((length**2).mean())),
         float(1e3 * np.sqrt((on_target**2).mean())),
         len(length),
         float(np.sqrt(expected.mean())),
-        regions,
+        rms_by_region(camera, pixels, length),
     )
 
 
@@ -225,10 +227,6 @@ def _some(observations: Observations, stacks: tuple[Stack, ...], instants: np.nd
     return some
 
 
-def _some_stacks(stacks: tuple[Stack, ...], instants: np.ndarray) -> list[Stack]:
-    return [stack.selected(kept) for stack in stacks if (kept := instants[stack.instant]).any()]
-
-
 def spread_over_claims(refined: CornersRefined, parts: Sequence[CornersRefined]) -> dict[tuple[str, str], float]:
     """By unknown: the jackknife's deviation over the claimed one, root mean square of its numbers.
 
@@ -251,16 +249,9 @@ def spread_over_claims(refined: CornersRefined, parts: Sequence[CornersRefined])
 def _off(refined: CornersRefined, part: CornersRefined, slot: tuple[str, str]) -> Array:
     """How far a part's unknown is from that of all images."""
     letter, name = slot
-    point, other = refined.point, part.point
     if letter in "xy":
         first, second = (each.X if letter == "x" else each.Y for each in (refined, part))
         moved: Array = gtsam.Pose3.Logmap(first[name].between(second[name]))
         return moved
-    if letter == "k":
-        return other.cameras[name] - point.cameras[name]
-    if letter == "b":
-        changed: Array = (other.shapes[name] - point.shapes[name])[refined.graph.model.free_shape(name)]
-        return changed
-    if letter == "t":
-        return np.array([other.offsets_s.get(name, 0.0) - point.offsets_s.get(name, 0.0)])
-    return (other.corners[name] - point.corners[name]).ravel()
+    vectors = refined.graph.model.vectors
+    return vectors(part.point)[slot] - vectors(refined.point)[slot]

@@ -11,6 +11,8 @@ pose by what hides dk best where corners were seen, dp = -(sum Jp' Jp)^-1 sum Jp
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from rwhec_factors import se3
 
@@ -18,7 +20,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.held_out import REGIONS
+from gtsam_rwhec.fitting.held_out import REGIONS, rms_by_region
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.reprojection_record import Regions
 from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
@@ -63,12 +65,7 @@ def projection_deviations(
     if sensor not in refined.intrinsics:
         there = ", ".join(refined.intrinsics) or "none"
         raise FrameError(f"{sensor!r} is no sensor whose intrinsics were estimated; they are {there}")
-    covariance = refined.covariance(sensor, f"intrinsics:{sensor}")
-    return deviations_over(refined.intrinsics[sensor].camera, covariance, distance_m, steps=steps)
-
-
-def deviations_over(camera: Camera, covariance: Array, distance_m: float, *, steps: int = 20) -> tuple[Array, Array]:
-    """The same, of a camera and the covariance (6 + m, 6 + m) of its pose's right perturbation and its m parameters."""
+    camera, covariance = refined.intrinsics[sensor].camera, refined.covariance(sensor, f"intrinsics:{sensor}")
     pixels, P = _points_over(camera, distance_m, steps)
     by_pose, by_camera = _derivatives(camera, P)
     return pixels, _worst(np.concatenate([by_pose, by_camera], axis=-1), covariance)
@@ -77,7 +74,7 @@ def deviations_over(camera: Camera, covariance: Array, distance_m: float, *, ste
 def lens_deviations_over(
     camera: Camera, covariance: Array, seen: Array, distance_m: float, *, steps: int = 20
 ) -> tuple[Array, Array]:
-    """The same, of the lens alone: with the pose that hides errors of the intrinsics best where corners were seen.
+    """As `projection_deviations`, of the lens alone: with the pose that hides its errors best where corners were seen.
 
     Parameters
     ----------
@@ -107,16 +104,13 @@ def by_region(camera: Camera, covariance: Array, seen: Array, distance_m: float)
         Pixels, rows from the top; None where the lens has no ray.
     """
     pixels, deviations = lens_deviations_over(camera, covariance, seen, distance_m, steps=10 * REGIONS)
-    size = np.array([camera.width, camera.height])
-    at = np.minimum((REGIONS * (pixels + 0.5) / size).astype(int), REGIONS - 1)
     known = np.isfinite(deviations)
-    count, total = np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
-    np.add.at(count, (at[known][:, 1], at[known][:, 0]), 1.0)
-    np.add.at(total, (at[known][:, 1], at[known][:, 0]), deviations[known] ** 2)
-    return tuple(
-        tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(*row, strict=True))
-        for row in zip(total, count, strict=True)
-    )
+    return as_regions(rms_by_region(camera, pixels[known], deviations[known]))
+
+
+def as_regions(values: Array) -> Regions:
+    """Values (3, 3) by region; None in the place of nan."""
+    return tuple(tuple(None if math.isnan(value) else value for value in row) for row in values.tolist())
 
 
 def uneven_words(projection_px: Regions, corners: Regions = ()) -> str:

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from one_pair import X, Y, noisy, poses, problem_of
 from refinement_problems import KAPPA, SIGMA_M, copied, rig
 from rwhec_factors import se3
 from said import choice
@@ -212,19 +213,16 @@ def test_input_that_cannot_be_used_raises() -> None:
         rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.0, 0.001))
 
 
-def exact_and_truth(count: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A, B with 1 mm and 1 mrad of noise, X and Y of one sensor and one target."""
+def measured() -> tuple[np.ndarray, np.ndarray]:
+    """A, and B with 1 mm and 1 mrad of noise."""
     chance = np.random.default_rng(3)
-    A = se3.expmap(np.hstack([0.6 * chance.normal(size=(count, 3)), 0.3 * chance.normal(size=(count, 3))]))
-    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
-    return A, np.linalg.inv(Y) @ A @ X @ se3.expmap(1e-3 * chance.normal(size=(count, 6))), X, Y
+    A = poses(chance, 20, 0.6, 0.3)
+    return A, noisy(chance, A, 1e-3)
 
 
 @pytest.mark.parametrize("both", [False, True])
 def test_a_fixed_target_whose_size_is_known_is_calibrated(both: bool, capfd: pytest.CaptureFixture[str]) -> None:
-    A, B, X, Y = exact_and_truth()
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B)
+    problem = problem_of(*measured())
     problem.fix("board", X)
     if both:
         problem.fix("camera", Y)
@@ -236,25 +234,22 @@ def test_a_fixed_target_whose_size_is_known_is_calibrated(both: bool, capfd: pyt
 
 
 def test_a_wrong_size_of_a_fixed_target_is_doubted() -> None:
-    A, B, X, _ = exact_and_truth()
+    A, B = measured()
     B[:, :3, 3] *= 1.05
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B)
+    problem = problem_of(A, B)
     problem.fix("board", X)
     assert rw.Ground.SIZE_DOUBTED in rw.calibrate(problem).judgement.grounds
 
 
 def test_more_noise_stated_for_A_than_the_residuals_have_asks_for_care() -> None:
-    A, B, X, _ = exact_and_truth()
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B)
+    problem = problem_of(*measured())
     calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.01, 0.01)))
     assert calibration.judgement.grounds == (rw.Ground.NOISE_OVERSTATED,)
     assert calibration.verdict is rw.Verdict.CARE
     assert "than the noise that you stated for A makes them" in calibration.verdict_reason
     assert choice(calibration, "noise of A").chosen == "0.57° and 10 mm for each axis, as you stated"
     assert calibration.contains("board", X)
-    covariances = {problem.pairs[0]: np.tile(1e-4 * np.eye(6), (len(A), 1, 1))}
+    covariances = {problem.pairs[0]: np.tile(1e-4 * np.eye(6), (20, 1, 1))}
     calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(covariances=covariances)))
     assert calibration.verdict is rw.Verdict.CARE
     assert "stated for A was not used" in choice(calibration, "noise").evidence
@@ -262,7 +257,7 @@ def test_more_noise_stated_for_A_than_the_residuals_have_asks_for_care() -> None
 
 
 def test_motions_alone_say_nothing_of_an_empty_mean() -> None:
-    A, _, _, Y = exact_and_truth()
+    A, _ = measured()
     problem = rw.Problem()
     noise = 1e-3 * np.random.default_rng(4).normal(size=(len(A), 6))
     problem.add_motion("camera", A, np.linalg.inv(Y) @ A @ Y @ se3.expmap(noise))
@@ -275,11 +270,9 @@ def test_motions_alone_say_nothing_of_an_empty_mean() -> None:
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.UnitsWarning")
 def test_a_noise_model_that_cannot_be_computed_is_said_and_b_alone_is_estimated() -> None:
     """A map whose origin is 100,000 km away: the whole model has no Cholesky factor in double precision."""
-    A, _, X, Y = exact_and_truth()
+    A, _ = measured()
     A[:, 0, 3] += 1e8
-    noise = 1e-3 * np.random.default_rng(4).normal(size=(len(A), 6))
-    problem = rw.Problem()
-    problem.add("board", "camera", A, np.linalg.inv(Y) @ A @ X @ se3.expmap(noise))
+    problem = problem_of(A, noisy(np.random.default_rng(4), A, 1e-3))
     calibration = rw.calibrate(problem, rw.CalibrateOptions(misreadings=False))
     assert calibration.noise.has_failed
     assert calibration.noise.model is None
@@ -290,13 +283,10 @@ def test_a_noise_model_that_cannot_be_computed_is_said_and_b_alone_is_estimated(
 
 def test_three_stations_are_too_few_for_a_covariance_that_is_relied_on() -> None:
     chance = np.random.default_rng(0)
-    A = se3.expmap(np.hstack([0.7 * chance.normal(size=(3, 3)), 0.3 * chance.normal(size=(3, 3))]))
-    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
-    problem = rw.Problem()
-    problem.add("board", "camera", A, np.linalg.inv(Y) @ A @ X @ se3.expmap(0.001 * chance.normal(size=(3, 6))))
-    calibration = rw.calibrate(problem)
+    A = poses(chance, 3, 0.7, 0.3)
+    B = noisy(chance, A, 0.001)
+    calibration = rw.calibrate(problem_of(A, B))
     assert calibration.verdict is not rw.Verdict.USE
     assert "3 measurements are too few to tell how large their noise is" in calibration.verdict_reason
-    raw, given = problem.measurements("board", "camera"), rw.Problem()
-    given.add("board", "camera", raw.A, raw.B, sigma=0.001, kappa=5e5)
+    given = problem_of(A, B, 0.001, 5e5)
     assert "too few" not in rw.calibrate(given, rw.CalibrateOptions(noise="given")).verdict_reason

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_pair import problem_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -17,9 +18,7 @@ def at_stations(number: int, *, exchanged: bool, seed: int = 0, turn: float = 1.
     X, Y = random_poses(2, 1.0, rng)
     A = se3.expmap(turn * rng.normal(size=(number, 6)) * np.repeat([1.0, 0.3], 3))
     B = np.linalg.inv(Y) @ A @ X @ se3.expmap(rng.normal(size=(number, 6)) * np.repeat([2e-3, 1e-3], 3))
-    problem = rw.Problem()
-    problem.add("board", "camera", np.linalg.inv(A) if exchanged else A, B)
-    return problem
+    return problem_of(np.linalg.inv(A) if exchanged else A, B)
 
 
 @pytest.mark.parametrize("number", [6, 12])

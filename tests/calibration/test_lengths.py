@@ -19,16 +19,14 @@ BOTH = Kind("both in millimetres", Mistake.UNIT, "", in_millimetres, in_millimet
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.UnitsWarning", "ignore::gtsam_rwhec.errors.WeightsWarning")
 def test_millimetres_in_both_are_seen_in_the_lengths_alone() -> None:
     good = general(2, 1, seed=0, noise=NOISE).problem
-    assert doubted_lengths(good, rw.solve(good)) is None
+    assert not doubted_lengths(good, rw.solve(good))
     wrong = misread(good, BOTH)
     solution = rw.solve(wrong)
     assert misreadings(wrong, solution) == ()
     found = doubted_lengths(wrong, solution)
-    assert found is not None
-    assert found.distance_m > 100.0
-    assert found.arm_m > 50.0
-    assert "divide both by 1000" in str(found)
-    assert f"{found.distance_m:.4g} m" in str(found)
+    assert found.startswith("targets are seen from ")
+    assert " m and targets and sensors are " in found
+    assert "divide both by 1000" in found
 
 
 def test_a_distant_origin_is_no_doubt() -> None:
@@ -39,7 +37,7 @@ def test_a_distant_origin_is_no_doubt() -> None:
     for pair in good.pairs:
         raw = good.measurements(*pair)
         far.add(*pair, raw.A @ T, raw.B, raw.sigma, raw.kappa)
-    assert doubted_lengths(far, rw.solve(far)) is None
+    assert not doubted_lengths(far, rw.solve(far))
 
 
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.WeightsWarning")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_pair import poses, problem_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -12,10 +13,6 @@ from gtsam_rwhec.calibration.trial_fits import Sample
 from gtsam_rwhec.fitting.noise_search import CORRELATED, likeness_of_neighbours
 
 COUNT = 120
-
-
-def poses(chance: np.random.Generator, count: int, angle: float, length: float) -> np.ndarray:
-    return se3.expmap(np.hstack([angle * chance.normal(size=(count, 3)), length * chance.normal(size=(count, 3))]))
 
 
 def stream(step_m: float, seed: int = 0, walk: float = 0.0) -> rw.Problem:
@@ -30,9 +27,7 @@ def stream(step_m: float, seed: int = 0, walk: float = 0.0) -> rw.Problem:
     moved[0, 3] = step_m
     B[60:] = B[60:] @ moved
     B = B @ se3.expmap(walk * np.cumsum(chance.normal(size=(COUNT, 6)), axis=0)) @ poses(chance, COUNT, 3e-3, 3e-3)
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B, stamps_ns=np.arange(COUNT) * 10**8)
-    return problem
+    return problem_of(A, B, stamps_ns=np.arange(COUNT) * 10**8)
 
 
 def sample_of(problem: rw.Problem) -> Sample:
@@ -68,8 +63,7 @@ def test_few_poses_hold_no_step() -> None:
     A = np.repeat(poses(chance, 5, 0.6, 0.3), 10, axis=0)
     X, Y = poses(chance, 2, 1.0, 0.4)
     B = np.linalg.inv(Y) @ A @ np.repeat(poses(chance, 5, 4e-3, 4e-3), 10, axis=0) @ X @ poses(chance, 50, 1e-4, 1e-4)
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B)
+    problem = problem_of(A, B)
     assert step_of(problem, sample_of(problem)) is None
     calibration = rw.calibrate(problem)
     assert calibration.verdict is rw.Verdict.CARE

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from one_pair import X, noisy, poses, problem_of
 from refinement_problems import KAPPA, SIGMA_M, copied, rig
 from rwhec_factors import se3
 from said import choice
@@ -87,13 +88,10 @@ def test_two_measurements_are_too_few_to_leave_one_out() -> None:
 def test_a_target_of_which_half_of_the_measurements_disagree_is_not_to_be_used() -> None:
     """Outliers that agree with each other, as the other pose of a planar target does, win by chance."""
     chance = np.random.default_rng(0)
-    A = se3.expmap(np.hstack([0.7 * chance.normal(size=(30, 3)), 0.3 * chance.normal(size=(30, 3))]))
-    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
+    A = poses(chance, 30, 0.7, 0.3)
     turned = X @ se3.expmap(np.array([[0.0, 0.0, np.pi - 0.1, 0.0, 0.0, 0.0]]))[0]
-    B = np.linalg.inv(Y) @ A @ np.where(np.arange(30)[:, None, None] < 15, X, turned)
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B @ se3.expmap(0.002 * chance.normal(size=(30, 6))))
-    calibration = rw.calibrate(problem)
+    B = noisy(chance, A, 0.002, np.where(np.arange(30)[:, None, None] < 15, X, turned))
+    calibration = rw.calibrate(problem_of(A, B))
     assert calibration.verdict is rw.Verdict.DO_NOT_USE
 
 
@@ -180,11 +178,8 @@ def test_outliers_that_pull_the_fit_of_all_beyond_any_sensor_are_left_out() -> N
 def test_noise_stated_too_small_for_few_measurements_leaves_no_good_one_out(seed: int) -> None:
     """Six rows, 5 mm and 5 mrad, a third of which is stated: under it four rows agree."""
     chance = np.random.default_rng(seed)
-    A = se3.expmap(np.hstack([0.6 * chance.normal(size=(6, 3)), 0.3 * chance.normal(size=(6, 3))]))
-    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
-    B = np.linalg.inv(Y) @ A @ X @ se3.expmap(5e-3 * chance.normal(size=(6, 6)))
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B, 5e-3 / 3.0, 0.5 / (5e-3 / 3.0) ** 2)
+    A = poses(chance, 6, 0.6, 0.3)
+    problem = problem_of(A, noisy(chance, A, 5e-3), 5e-3 / 3.0, 0.5 / (5e-3 / 3.0) ** 2)
     calibration = rw.calibrate(problem, rw.CalibrateOptions(noise="given"))
     assert calibration.judgement.grounds == (rw.Ground.NOISE_UNDERSTATED,)
     assert calibration.outliers.number == 0

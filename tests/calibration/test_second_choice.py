@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
-from rwhec_factors import se3
+from one_pair import poses, problem_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.outliers import more_consistent
 
 COUNT, GOOD = 30, 14
-FRAMES = ("board", "camera")
 
 
-def problem_of(seed: int, wrong_noise: float) -> rw.Problem:
+def with_flipped(seed: int, wrong_noise: float) -> rw.Problem:
     """14 good measurements, and 16 of a board turned by half a turn, with another noise."""
     chance = np.random.default_rng(seed)
 
-    def poses(count: int, angle: float, length: float) -> np.ndarray:
-        return se3.expmap(np.hstack([angle * chance.normal(size=(count, 3)), length * chance.normal(size=(count, 3))]))
-
-    X, Y = poses(2, 1.0, 0.4)
-    A = poses(COUNT, 0.6, 0.3)
-    B = np.linalg.inv(Y) @ A @ X @ poses(COUNT, 2e-3, 2e-3)
+    X, Y = poses(chance, 2, 1.0, 0.4)
+    A = poses(chance, COUNT, 0.6, 0.3)
+    B = np.linalg.inv(Y) @ A @ X @ poses(chance, COUNT, 2e-3, 2e-3)
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
-    B[GOOD:] = B[GOOD:] @ flip @ poses(COUNT - GOOD, wrong_noise, 0.3 * wrong_noise)
-    problem = rw.Problem()
-    problem.add(*FRAMES, A, B)
-    return problem
+    B[GOOD:] = B[GOOD:] @ flip @ poses(chance, COUNT - GOOD, wrong_noise, 0.3 * wrong_noise)
+    return problem_of(A, B)
 
 
 def chosen(problem: rw.Problem, kept: np.ndarray) -> np.ndarray | None:
@@ -38,7 +32,7 @@ def chosen(problem: rw.Problem, kept: np.ndarray) -> np.ndarray | None:
 def test_what_agrees_far_better_with_itself_counts() -> None:
     kept = np.arange(COUNT) >= GOOD
     kept[:2] = True  # good ones between the flipped
-    found = chosen(problem_of(0, 0.12), kept)
+    found = chosen(with_flipped(0, 0.12), kept)
     assert found is not None
     assert found[:GOOD].all()
     assert not found[GOOD:].any()
@@ -46,14 +40,14 @@ def test_what_agrees_far_better_with_itself_counts() -> None:
 
 def test_a_choice_that_is_right_stands() -> None:
     good = np.arange(COUNT) < GOOD
-    assert chosen(problem_of(1, 0.12), good) is None  # what was left out agrees less
-    assert chosen(problem_of(2, 2e-3), good) is None  # as well
-    assert chosen(problem_of(3, 0.12), np.arange(COUNT) < COUNT - 5) is None  # few were left out
+    assert chosen(with_flipped(1, 0.12), good) is None  # what was left out agrees less
+    assert chosen(with_flipped(2, 2e-3), good) is None  # as well
+    assert chosen(with_flipped(3, 0.12), np.arange(COUNT) < COUNT - 5) is None  # few were left out
 
 
 def test_half_flipped_measurements_are_not_to_be_used_and_the_good_ones_are_kept() -> None:
     """18 of 30 were kept with a noise of 8 degrees: USE, and the camera upside down."""
-    problem = problem_of(0, 0.12)
+    problem = with_flipped(0, 0.12)
     calibration = rw.calibrate(problem)
     (pair,) = problem.pairs
     assert calibration.verdict is rw.Verdict.DO_NOT_USE

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_pair import X, Y, noisy, problem_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 
-X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
 
-
-def problem_of(seed: int = 3, planar: bool = False) -> rw.Problem:
+def seen(seed: int = 3, planar: bool = False) -> rw.Problem:
     """Twenty measurements of a board by a camera, 1 mm and 1 mrad."""
     chance = np.random.default_rng(seed)
     xi = np.hstack([0.6 * chance.normal(size=(20, 3)), 0.3 * chance.normal(size=(20, 3))])
     A = se3.expmap(xi * [0, 0, 1, 1, 1, 0] if planar else xi)
-    problem = rw.Problem()
-    problem.add("board", "camera", A, np.linalg.inv(Y) @ A @ X @ se3.expmap(1e-3 * chance.normal(size=(20, 6))))
-    return problem
+    return problem_of(A, noisy(chance, A, 1e-3))
 
 
 def off(T: np.ndarray, degrees: float, metres: float) -> np.ndarray:
@@ -27,7 +24,7 @@ def off(T: np.ndarray, degrees: float, metres: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("degrees", "metres"), [(29.0, 0.5), (3.0, 0.05), (0.6, 0.01)])
 def test_a_prior_far_from_what_the_measurements_say_is_not_to_be_used(degrees: float, metres: float) -> None:
-    problem = problem_of()
+    problem = seen()
     problem.add_prior("board", off(X, degrees, metres), 1e-3, 5e5)
     calibration = rw.calibrate(problem)
     assert calibration.verdict is rw.Verdict.DO_NOT_USE
@@ -39,7 +36,7 @@ def test_a_prior_far_from_what_the_measurements_say_is_not_to_be_used(degrees: f
 
 
 def test_wrong_fixed_poses_are_not_to_be_used() -> None:
-    problem = problem_of()
+    problem = seen()
     problem.fix("board", off(X, 5.7, 0.2))
     problem.fix("camera", Y)
     calibration = rw.calibrate(problem)
@@ -49,7 +46,7 @@ def test_wrong_fixed_poses_are_not_to_be_used() -> None:
 
 
 def test_measurements_that_were_not_kept_contradict_a_wrong_prior_too() -> None:
-    raw = problem_of().measurements("board", "camera")
+    raw = seen().measurements("board", "camera")
     problem = rw.Problem(keep_measurements=False)
     problem.add("board", "camera", raw.A, raw.B)
     problem.add_prior("board", off(X, 5.0, 0.1), 1e-3, 5e5)
@@ -62,7 +59,7 @@ def test_measurements_that_were_not_kept_contradict_a_wrong_prior_too() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_true_stated_poses_are_not_accused(seed: int) -> None:
-    problem = problem_of(seed)
+    problem = seen(seed)
     problem.add_prior("board", off(X, 0.05, 0.001), 1e-3, 5e5)
     problem.fix("camera", Y)
     assert rw.calibrate(problem).verdict is rw.Verdict.USE
@@ -71,7 +68,7 @@ def test_true_stated_poses_are_not_accused(seed: int) -> None:
 def test_what_the_motion_leaves_free_contradicts_nothing() -> None:
     """A planar robot cannot tell the height of the board; the rest of a stated pose is tested."""
     for metres, verdict in ((0.0, rw.Verdict.USE), (0.1, rw.Verdict.DO_NOT_USE)):
-        problem = problem_of(planar=True)
+        problem = seen(planar=True)
         problem.fix("board", off(X, 0.0, metres))
         assert rw.calibrate(problem).verdict is verdict
 
@@ -79,7 +76,7 @@ def test_what_the_motion_leaves_free_contradicts_nothing() -> None:
 @pytest.mark.parametrize(("sigmas", "ground"), [(5.7, rw.Ground.POSE_UNCERTAIN), (9.0, rw.Ground.CONTRADICTED)])
 def test_a_fixed_pose_that_fits_badly_asks_for_care(sigmas: float, ground: rw.Ground) -> None:
     """Between chance and contradiction: as with sizes, there is no sharp step from use to refusal."""
-    problem = problem_of()
+    problem = seen()
     free = rw.calibrate(problem)
     along = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
     size = sigmas / np.sqrt(along @ np.linalg.solve(free.covariance("board"), along))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_pair import problem_of
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
@@ -33,9 +34,7 @@ def over_a_board(seed: int, *, slips: bool, inverted: bool = False) -> rw.Proble
     if slips:
         hangs[n * 3 // 5 :] = Y @ se3.expmap(_step(chance)[None])[0]
     noise = se3.expmap(chance.normal(size=(n, 6)) * np.repeat([5e-4, 3e-4], 3))
-    problem = rw.Problem()
-    problem.add("board", "camera", np.linalg.inv(A) if inverted else A, np.linalg.inv(hangs) @ A @ X @ noise)
-    return problem
+    return problem_of(np.linalg.inv(A) if inverted else A, np.linalg.inv(hangs) @ A @ X @ noise)
 
 
 def _step(chance: np.random.Generator) -> Array:

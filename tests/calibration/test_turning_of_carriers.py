@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_pair import problem_of
 from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw
@@ -24,9 +25,7 @@ def calibrated(turns_deg: tuple[float, float, float], ways_m: tuple[float, float
     turned[:, :3, 3] = xi[:, 3:]
     A = askew @ turned @ inverse(askew[None])
     B = inverse(Y[None]) @ A @ X @ expmap(NOISE * rng.standard_normal((COUNT, 6)))
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B)
-    return rw.calibrate(problem)
+    return rw.calibrate(problem_of(A, B))
 
 
 @pytest.mark.parametrize(

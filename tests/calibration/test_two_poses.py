@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_pair import poses, problem_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -14,19 +15,13 @@ COUNT = 60
 MOVED = se3.expmap(np.array([[0.03, 0.0, 0.04, 0.03, 0.0, 0.02]]))[0]
 
 
-def poses(chance: np.random.Generator, count: int, angle: float, length: float) -> np.ndarray:
-    return se3.expmap(np.hstack([angle * chance.normal(size=(count, 3)), length * chance.normal(size=(count, 3))]))
-
-
-def problem_of(seed: int, is_moved: np.ndarray, frame: str = "board", noise: float = 1e-3) -> rw.Problem:
+def moving(seed: int, is_moved: np.ndarray, frame: str = "board", noise: float = 1e-3) -> rw.Problem:
     chance = np.random.default_rng(seed)
     X, Y = poses(chance, 2, 1.0, 0.5)
     A = poses(chance, COUNT, 0.5, 0.3)
     B = np.linalg.inv(Y) @ A @ X
     B[is_moved] = B[is_moved] @ MOVED if frame == "board" else MOVED @ B[is_moved]
-    problem = rw.Problem()
-    problem.add("board", "camera", A, B @ poses(chance, COUNT, noise, noise))
-    return problem
+    return problem_of(A, B @ poses(chance, COUNT, noise, noise))
 
 
 def found_in(
@@ -38,13 +33,13 @@ def found_in(
 @pytest.mark.parametrize("frame", ["board", "camera"])
 def test_a_frame_that_moved_half_way_is_named(frame: str) -> None:
     """Least squares and outlier rejection alike put the answer between the two poses, and said USE."""
-    calibration = rw.calibrate(problem_of(1, np.arange(COUNT) >= COUNT // 2, frame))
+    calibration = rw.calibrate(moving(1, np.arange(COUNT) >= COUNT // 2, frame))
     assert calibration.verdict is rw.Verdict.DO_NOT_USE
     assert calibration.judgement.grounds[0] is rw.Ground.MOVED
 
 
 def test_the_sentence_says_how_far_and_from_when() -> None:
-    problem = problem_of(2, np.arange(COUNT) >= 31)
+    problem = moving(2, np.arange(COUNT) >= 31)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     found = found_in(problem, refined)
     assert found is not None
@@ -56,7 +51,7 @@ def test_the_sentence_says_how_far_and_from_when() -> None:
 
 
 def test_two_poses_that_alternate_have_no_first_row() -> None:
-    problem = problem_of(3, np.arange(COUNT) % 2 == 1)
+    problem = moving(3, np.arange(COUNT) % 2 == 1)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     found = found_in(problem, refined)
     assert found is not None
@@ -66,7 +61,7 @@ def test_two_poses_that_alternate_have_no_first_row() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_one_pose_is_not_accused(seed: int) -> None:
-    problem = problem_of(seed, np.zeros(COUNT, dtype=bool), noise=3e-3)
+    problem = moving(seed, np.zeros(COUNT, dtype=bool), noise=3e-3)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     assert found_in(problem, refined) is None
     few = {pair: np.arange(COUNT) < 12 for pair in problem.pairs}
@@ -74,7 +69,7 @@ def test_one_pose_is_not_accused(seed: int) -> None:
 
 
 def test_the_row_is_that_of_all_measurements_with_those_that_were_left_out() -> None:
-    problem = problem_of(2, np.arange(COUNT) >= 31)
+    problem = moving(2, np.arange(COUNT) >= 31)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     kept = np.arange(COUNT) % 10 != 3
     found = found_in(problem, refined, {pair: kept for pair in problem.pairs})

@@ -70,7 +70,7 @@ def test_linear_rows_have_the_gradient_of_the_cost(small: Cell, about: str) -> N
     values = graph.values(point)
     assert graph.point(values).offsets_s == point.offsets_s
     gradient = graph.graph.linearize(values).gradientAtZero()
-    key = graph.t["cam_0"]
+    key = graph.keys["t", "cam_0"]
     above, below = gtsam.Values(values), gtsam.Values(values)
     above.update(key, np.array([0.03 + 1e-6]))
     below.update(key, np.array([0.03 - 1e-6]))

@@ -41,7 +41,7 @@ def test_linear_rows_have_the_cost_and_the_gradient_of_the_residuals(small: Cell
     values = graph.values(point)
     linear = graph.graph.linearize(values)
     error = graph.graph.error(values)
-    for key in (graph.x["board"], graph.y["cam_0"], key_of("a", 0)):
+    for key in (graph.keys["x", "board"], graph.keys["y", "cam_0"], key_of("a", 0)):
         for step in 1e-7 * np.eye(6):
             moved = [gtsam.Values(values), gtsam.Values(values)]
             for at, sign in zip(moved, (1.0, -1.0), strict=True):

@@ -57,11 +57,11 @@ def test_linear_rows_have_the_gradient_of_the_cost(small: Cell) -> None:
     graph = CornerGraph(model, point)
     values = graph.values(point)
     assert graph.point(values).corners["board"] == pytest.approx(point.corners["board"], abs=0.0)
-    gradient = graph.graph.linearize(values).gradientAtZero().at(graph.p["board"])
+    gradient = graph.graph.linearize(values).gradientAtZero().at(graph.keys["p", "board"])
     for i in (0, 52, 104):
         moved = [gtsam.Values(values), gtsam.Values(values)]
         for to, sign in zip(moved, (1.0, -1.0), strict=True):
-            to.update(graph.p["board"], point.corners["board"].ravel() + sign * 1e-7 * (np.arange(105) == i))
+            to.update(graph.keys["p", "board"], point.corners["board"].ravel() + sign * 1e-7 * (np.arange(105) == i))
         numeric = (graph.graph.error(moved[0]) - graph.graph.error(moved[1])) / 2e-7
         assert gradient[i] == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.abs(gradient).max())
 
