@@ -73,20 +73,10 @@ def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(back.covariance(), refined.covariance(), rtol=1e-9, atol=1e-20)
     np.testing.assert_array_equal(back.joint.finite, refined.joint.finite)
     np.testing.assert_array_equal(back.joint.free, refined.joint.free)
-    for name in [
-        "scale",
-        "scale_mode",
-        "time_offsets_s",
-        "noise_source",
-        "noise",
-        "cost",
-        "initial_cost",
-        "iterations",
-        "inlier_counts",
-        "free_directions",
-        "names",
-        "degrees_of_freedom",
-    ]:
+    for name in (
+        *("scale", "scale_mode", "time_offsets_s", "noise_source", "noise", "cost", "initial_cost", "iterations"),
+        *("inlier_counts", "free_directions", "names", "degrees_of_freedom"),
+    ):
         assert getattr(back, name) == getattr(refined, name), name
     assert back.moved == movements(refined.solution, back.X, back.Y)  # from the certified poses in the file
     if len(refined.Y) > 1:
@@ -140,8 +130,6 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
         (lambda raw: raw["refined"]["joint"]["finite"][3].pop(), "$.refined.joint.finite: rows of different lengths"),
         (lambda raw: raw["refined"]["joint"]["unit"].__setitem__(3, 0.0), "$.refined.joint.unit[3]"),
         (lambda raw: raw["refined"]["joint"]["free"].pop(), "slots have 24 rows"),
-        (lambda raw: raw["refined"]["joint"]["slots"].update(moon=[0, 6]), "have no value: moon"),
-        (lambda raw: raw["refined"]["frames"].popitem(), "$.refined.frames: must have"),
         (lambda raw: raw["sensors"][0].pop("translation_m"), "$.sensors[0].translation_m"),
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
         (lambda raw: raw["refined"]["noise"][1].update(degrees_of_freedom=[1.0]), "degrees_of_freedom"),
@@ -182,8 +170,3 @@ def test_a_missing_offset_is_refused(tmp_path: Path) -> None:
         raw["refined"]["joint"]["slots"].pop("time_offset:sensor1")
 
     assert_refused("time offsets", damage, "that have no rows: time_offset:sensor1", tmp_path / "refined.json")
-
-
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="cannot be written"):
-        rw.write_refined(KINDS["known scale"](), tmp_path / "nowhere" / "refined.json")
