@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,8 +27,13 @@ from gtsam_rwhec.report.figures import (
 from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.image_errors import SeenCamera
-from gtsam_rwhec.results.residual_evidence import BEYOND_3_BY_CHANCE, FEWEST, Dependence, ResidualsEvidence
-from gtsam_rwhec.solver.answers import Residual
+from gtsam_rwhec.results.residual_evidence import (
+    BEYOND_3_BY_CHANCE,
+    FEWEST,
+    Dependence,
+    ResidualsEvidence,
+    pooled_residual,
+)
 from gtsam_rwhec.solver.solution import Solution
 
 if TYPE_CHECKING:
@@ -111,20 +116,6 @@ def residual_cells(solution: Solution, name: str) -> tuple[str, ...]:
         f"{math.degrees(residual.rotation_rms_rad):.2f}",
         str(residual.number_of_measurements),
     )
-
-
-def pooled_residual(residuals: Iterable[Residual]) -> Residual:
-    """The root mean square over all measurements of several pairs."""
-    residuals = tuple(residuals)
-    number = sum(residual.number_of_measurements for residual in residuals)
-    if number == 0:
-        return Residual(0, math.nan, math.nan)
-
-    def pool(rms: Iterable[float]) -> float:
-        squares = (r.number_of_measurements * value**2 for r, value in zip(residuals, rms, strict=True))
-        return math.sqrt(sum(squares) / number)
-
-    return Residual(number, pool(r.translation_rms_m for r in residuals), pool(r.rotation_rms_rad for r in residuals))
 
 
 def _cameras_with_corners(shown: ShownResult) -> tuple[SeenCamera, ...]:

@@ -29,6 +29,7 @@ from gtsam_rwhec.results.changed_frames import (
 )
 from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
 from gtsam_rwhec.results.near_answer import NearAnswer, near, stated_as
+from gtsam_rwhec.results.residual_evidence import pooled_residual
 from gtsam_rwhec.results.result_file import Result
 
 #: Why frames are not checked.
@@ -155,10 +156,9 @@ def checks_of(
 
 def _residual_m(result: Result, sensor: str) -> float | None:
     """The root mean square of a sensor's residuals in the old log, m."""
-    residuals = [residual for pair, residual in result.solution.residuals.items() if pair.sensor == sensor]
-    count = sum(one.number_of_measurements for one in residuals)
-    square = sum(one.number_of_measurements * one.translation_rms_m**2 for one in residuals)
-    return float(np.sqrt(square / count)) if count and square > 0.0 else None
+    of_sensor = (residual for pair, residual in result.solution.residuals.items() if pair.sensor == sensor)
+    rms_m = pooled_residual(of_sensor).translation_rms_m
+    return rms_m if rms_m > 0.0 else None
 
 
 def far_off(result: Result, old: RefinedPoses, problem: Problem) -> dict[str, SensorCheck]:
