@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.report.figures import LIGHT_BLUE, SvgFigure, svg_figure
-from gtsam_rwhec.report.report_blocks import Block, Chart, Paragraph, Section, Table, Words, significant
+from gtsam_rwhec.report.report_blocks import Block, Chart, Paragraph, Section, Table, Words, significant, worded
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.contribution import ContributionEvidence, ImageContribution
 
@@ -52,17 +52,13 @@ def _fewer(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterat
     for i, one in enumerate(found.fewer):
         if one.growth == 0.1:
             of = what if found.bundle == 1 else f"bundles of {found.bundle} {what}"
-            yield Paragraph(
-                (
-                    shown.evident(*at, i, "bundles", spec=".0f"),
-                    " of ",
-                    shown.evident("contribution", "bundles", spec=".0f"),
-                    f" {of}, chosen well, tell nearly as much as all: no standard deviation is larger by more than ",
-                    shown.evident(*at, i, "growth", times=100.0, spec=".0f"),
-                    " %. The others could be left out.",
-                ),
-                "lead",
+            words = (
+                "{enough} of {bundles} {of}, chosen well, tell nearly as much as all: no standard deviation is larger "
+                "by more than {growth} %. The others could be left out."
             )
+            enough, bundles = (shown.evident(*each, "bundles", spec=".0f") for each in ((*at, i), ("contribution",)))
+            growth = shown.evident(*at, i, "growth", times=100.0, spec=".0f")
+            yield Paragraph(worded(words, enough=enough, bundles=bundles, of=of, growth=growth), "lead")
     rows = tuple(
         ((shown.evident(*at, i, "growth", times=100.0, spec=".0f"), " %"), shown.evident(*at, i, "bundles", spec=".0f"))
         for i in range(len(found.fewer))
@@ -102,15 +98,12 @@ def _influential(shown: ShownResult, found: ContributionEvidence, what: str) -> 
         if worst.moved > MOVES
         else f"No single one of the {what} decides the answer."
     )
-    yield Paragraph(
-        (
-            f"Without the one that matters most, {worst.moved_frame} would move by ",
-            significant(shown.evident(*at, 0, "moved"), 2),
-            " of its standard deviations (",
-            significant(shown.evident(*at, 0, "moved_mm"), 2),
-            f" mm). {said}",
-        )
+    words = (
+        "Without the one that matters most, {frame} would move by {moved} of its standard deviations ({moved_mm} mm). "
+        f"{said}"
     )
+    numbers = {field: significant(shown.evident(*at, 0, field), 2) for field in ("moved", "moved_mm")}
+    yield Paragraph(worded(words, frame=worst.moved_frame, **numbers))
     yield Table(
         f"The {len(found.influential)} {what} without which the answer moves most",
         _headings(found),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from string import Formatter
 from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
@@ -78,6 +79,18 @@ Words = Piece | tuple[Piece, ...]
 def pieces_of(words: Words) -> tuple[Piece, ...]:
     """The pieces of words."""
     return words if isinstance(words, tuple) else (words,)
+
+
+def worded(template: str, **pieces: Piece) -> Words:
+    """A sentence with pieces in the place of their names in braces."""
+    said: list[Piece] = [""]
+    for text, name, _, _ in Formatter().parse(template):
+        for piece in (text, "" if name is None else pieces[name]):
+            if isinstance(piece, str) and isinstance(said[-1], str):
+                said[-1] += piece
+            else:
+                said.append(piece)
+    return tuple(said)
 
 
 def plain_text(words: Words) -> str:
