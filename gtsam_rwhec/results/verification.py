@@ -250,9 +250,13 @@ def verify(
         noise="estimate", time_offsets=tuple(time_offsets) or False, carrier_path=carrier_path if time_offsets else None
     )
     try:
-        found, common = _compared(
-            refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress, targets_may_move
-        )
+        found = near(refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress)
+        common = quantities(refined, found.refined, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
+        if targets_may_move:
+            common = common.only(lambda unknown: unknown.owner in refined.Y)
+        if not common.slots:
+            said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
+            raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
     except (UnderdeterminedError, CountError) as error:
         far = {} if targets_may_move else far_off(result, refined, stated)
         if not far:
@@ -272,25 +276,6 @@ def verify(
         targets_may_move=targets_may_move,
         remarks=tuple(_remarks(refined, problem, found, checks, targets_may_move=targets_may_move)),
     )
-
-
-def _compared(
-    old: RefinedPoses,
-    problem: Problem,
-    how: RefineOptions,
-    noise: NoiseOptions,
-    progress: Progress | None,
-    targets_may_move: bool,
-) -> tuple[NearAnswer, Quantities]:
-    """What the new measurements say near the old poses, and what of it can be compared."""
-    found = near(old, problem, how, noise, progress)
-    common = quantities(old, found.refined, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
-    if targets_may_move:
-        common = common.only(lambda unknown: unknown.owner in old.Y)
-    if not common.slots:
-        said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
-        raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
-    return found, common
 
 
 def in_words(common: Quantities) -> dict[str, str]:
