@@ -59,8 +59,6 @@ def print_calibration(
     ----------
     calibration : Calibration
         The result of `gtsam_rwhec.calibrate`.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
     log : LogFields, optional
         What became of the measurements, if they come from a log.
     verbose : bool
@@ -100,8 +98,6 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
     ----------
     refined : Refined
         The result of `gtsam_rwhec.refine`.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
     log : LogFields, optional
         What became of the measurements, if they come from a log.
     """
@@ -125,8 +121,6 @@ def print_solution(
     ----------
     solution : Solution
         The result of `gtsam_rwhec.solve`.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
     findings : sequence of Finding, optional
         What else is known against the poses: how A and B were read.
     verbose : bool

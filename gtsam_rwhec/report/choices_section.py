@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from rich.console import Console
 
-from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Section, Table, Words
+from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Section, Table, Words, worded
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.report.terminal_report import print_blocks, report_console
 from gtsam_rwhec.results.log_history import LogFields, TrackCount
@@ -70,21 +70,16 @@ def _refinement(shown: ShownResult) -> Iterator[Block]:
         said = f"{left_out} of {total} measurements left out: {', '.join(out)}" if out else f"none of {total}"
         yield Paragraph(f"Outliers: {said}.")
     moved = max(refined.moved.items(), key=lambda item: item[1].translation_mm)
-    start: tuple[str | object, ...] = ()
-    if refined.reprojection is None:
-        start = ("from ", shown.number("refined", "initial_cost", spec=".6g"), " ")
+    start = "" if refined.reprojection is not None else "from {initial_cost} "
     words = (
-        "Cost of the refinement: ",
-        *start,
-        "to ",
-        shown.number("refined", "cost", spec=".6g"),
-        " after ",
-        shown.number("refined", "iterations", spec=".0f"),
-        f" steps ({shown.tree['refined']['residual']} residual, robust loss: {shown.tree['refined']['robust']}). Do "
-        "not compare it with the certified cost, which has other weights. It moved the poses by up to "
-        f"{moved[1].translation_mm:.2f} mm ({moved[0]}).",
+        f"Cost of the refinement: {start}to {{cost}} after {{iterations}} steps "
+        f"({shown.tree['refined']['residual']} residual, robust loss: {shown.tree['refined']['robust']}). Do not "
+        "compare it with the certified cost, which has other weights. It moved the poses by up to "
+        f"{moved[1].translation_mm:.2f} mm ({{frame}})."
     )
-    yield Paragraph(words)  # type: ignore[arg-type]
+    specs = {"initial_cost": ".6g", "cost": ".6g", "iterations": ".0f"}
+    numbers = {field: shown.number("refined", field, spec=spec) for field, spec in specs.items()}
+    yield Paragraph(worded(words, frame=moved[0], **numbers))
 
 
 def print_log(log: LogFields, console: Console | None = None) -> None:

@@ -48,8 +48,6 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     ----------
     comparison : Comparison
         The result of `gtsam_rwhec.methods.compare`.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
     """
     print_blocks(report_console() if console is None else console, comparison_blocks(comparison))
 
@@ -158,8 +156,6 @@ def print_cross_validation(result: CrossValidation, console: Console | None = No
     ----------
     result : CrossValidation
         The result of `gtsam_rwhec.cross_validate`.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
     pairs : bool
         Print a line for each pair as well.
     """

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from gtsam_rwhec.report.figures import LIGHT_BLUE, SvgFigure, svg_figure
-from gtsam_rwhec.report.report_blocks import Block, Chart, Paragraph, Section, Table, Words, significant
+from gtsam_rwhec.report.report_blocks import Block, Chart, Paragraph, Section, Table, Words, significant, worded
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.contribution import ContributionEvidence, ImageContribution
+from gtsam_rwhec.results.contribution import ContributionEvidence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,6 +21,10 @@ ABOUT = (
     "same in all images, fewer images tell less than this says. An image here is all that one camera saw at one stamp."
 )
 WITHOUT_STAMPS = " There are no stamps, so each measurement counts by itself."
+LEGEND = (
+    "share: of all that was learnt. moves: without it the pose that moves most moves by so many of its standard "
+    "deviations, and millimetres. grows: the standard deviation that grows most without it."
+)
 #: An image without which a pose moves more than this many of its deviations deserves a look.
 MOVES = 2.0
 
@@ -33,15 +37,8 @@ def contribution_section(shown: ShownResult) -> Section:
         return Section("contribution", TITLE, missing=why)
     what = "images" if found.has_stamps else "measurements"
     blocks: list[Block] = [*_fewer(shown, found, what)]
-    blocks.append(
-        Table(
-            f"The {len(found.important)} {what} that tell most",
-            _headings(found),
-            tuple(_row(shown, "important", i, one) for i, one in enumerate(found.important)),
-            "share: of all that was learnt. moves: without it the pose that moves most moves by so many of its "
-            "standard deviations, and millimetres. grows: the standard deviation that grows most without it.",
-        )
-    )
+    caption = f"The {len(found.important)} {what} that tell most"
+    blocks.append(_table(shown, found, "important", caption, LEGEND))
     blocks += _influential(shown, found, what)
     blocks.append(Paragraph(ABOUT + ("" if found.has_stamps else WITHOUT_STAMPS), "note"))
     return Section("contribution", TITLE, tuple(blocks))
@@ -52,17 +49,13 @@ def _fewer(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterat
     for i, one in enumerate(found.fewer):
         if one.growth == 0.1:
             of = what if found.bundle == 1 else f"bundles of {found.bundle} {what}"
-            yield Paragraph(
-                (
-                    shown.evident(*at, i, "bundles", spec=".0f"),
-                    " of ",
-                    shown.evident("contribution", "bundles", spec=".0f"),
-                    f" {of}, chosen well, tell nearly as much as all: no standard deviation is larger by more than ",
-                    shown.evident(*at, i, "growth", times=100.0, spec=".0f"),
-                    " %. The others could be left out.",
-                ),
-                "lead",
+            words = (
+                "{enough} of {bundles} {of}, chosen well, tell nearly as much as all: no standard deviation is larger "
+                "by more than {growth} %. The others could be left out."
             )
+            enough, bundles = (shown.evident(*each, "bundles", spec=".0f") for each in ((*at, i), ("contribution",)))
+            growth = shown.evident(*at, i, "growth", times=100.0, spec=".0f")
+            yield Paragraph(worded(words, enough=enough, bundles=bundles, of=of, growth=growth), "lead")
     rows = tuple(
         ((shown.evident(*at, i, "growth", times=100.0, spec=".0f"), " %"), shown.evident(*at, i, "bundles", spec=".0f"))
         for i in range(len(found.fewer))
@@ -102,35 +95,26 @@ def _influential(shown: ShownResult, found: ContributionEvidence, what: str) -> 
         if worst.moved > MOVES
         else f"No single one of the {what} decides the answer."
     )
-    yield Paragraph(
-        (
-            f"Without the one that matters most, {worst.moved_frame} would move by ",
-            significant(shown.evident(*at, 0, "moved"), 2),
-            " of its standard deviations (",
-            significant(shown.evident(*at, 0, "moved_mm"), 2),
-            f" mm). {said}",
-        )
+    words = (
+        "Without the one that matters most, {frame} would move by {moved} of its standard deviations ({moved_mm} mm). "
+        f"{said}"
     )
-    yield Table(
-        f"The {len(found.influential)} {what} without which the answer moves most",
-        _headings(found),
-        tuple(_row(shown, "influential", i, one) for i, one in enumerate(found.influential)),
-    )
+    numbers = {field: significant(shown.evident(*at, 0, field), 2) for field in ("moved", "moved_mm")}
+    yield Paragraph(worded(words, frame=worst.moved_frame, **numbers))
+    caption = f"The {len(found.influential)} {what} without which the answer moves most"
+    yield _table(shown, found, "influential", caption)
 
 
-def _headings(found: ContributionEvidence) -> tuple[str, ...]:
-    return ("sensor", "time s" if found.has_stamps else "place", "targets", "share %", "moves", "", "mm", "grows %")
-
-
-def _row(shown: ShownResult, which: str, i: int, one: ImageContribution) -> tuple[Words, ...]:
-    at = ("contribution", which, i)
-    return (
-        one.sensor,
-        shown.evident(*at, "time", spec=".2f" if one.stamp_ns is not None else ".0f"),
-        ", ".join(one.targets),
-        significant(shown.evident(*at, "share", times=100.0), 2),
-        one.moved_frame,
-        significant(shown.evident(*at, "moved"), 2),
-        significant(shown.evident(*at, "moved_mm"), 2),
-        significant(shown.evident(*at, "growth", times=100.0), 2),
-    )
+def _table(
+    shown: ShownResult, found: ContributionEvidence, which: Literal["important", "influential"], caption: str,
+    legend: str = "",
+) -> Table:  # fmt: skip
+    time, spec = ("time s", ".2f") if found.has_stamps else ("place", ".0f")
+    rows: list[tuple[Words, ...]] = []
+    for i, one in enumerate(getattr(found, which)):
+        at = ("contribution", which, i)
+        share, growth = (significant(shown.evident(*at, field, times=100.0), 2) for field in ("share", "growth"))
+        moved = (significant(shown.evident(*at, field), 2) for field in ("moved", "moved_mm"))
+        when = shown.evident(*at, "time", spec=spec)
+        rows.append((one.sensor, when, ", ".join(one.targets), share, one.moved_frame, *moved, growth))
+    return Table(caption, ("sensor", time, "targets", "share %", "moves", "", "mm", "grows %"), tuple(rows), legend)

@@ -57,8 +57,6 @@ def print_corners(refined: RefinedPoses, console: Console | None = None) -> None
     ----------
     refined : RefinedPoses
         A refinement from corners, also as a result file has it.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
 
     Raises
     ------

@@ -37,8 +37,6 @@ def print_demo(
         The truth with which the log was made.
     folder : Path
         The folder of the demo's files.
-    console : rich.console.Console, optional
-        Where to print; standard output by default.
     """
     console = report_console() if console is None else console
     print_heading(console, "Errors that we put into this log, and what was found", tight=True)

@@ -18,6 +18,7 @@ from gtsam_rwhec.report.report_blocks import (
     Table,
     Words,
     significant,
+    worded,
 )
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
@@ -92,15 +93,11 @@ def _distance_to_free(shown: ShownResult) -> Iterator[Block]:
     if weakest.value is None or threshold.value is None:
         return
     near = " That is near: turn more before you rely on it." if weakest.value < NEAR * threshold.value else ""
-    yield Paragraph(
-        (
-            "The least known direction of all holds ",
-            weakest,
-            " times the information that noise alone would make; up to ",
-            threshold,
-            f" times it would count as free.{near}",
-        )
+    words = (
+        "The least known direction of all holds {weakest} times the information that noise alone would make; up to "
+        f"{{threshold}} times it would count as free.{near}"
     )
+    yield Paragraph(worded(words, weakest=weakest, threshold=threshold))
 
 
 def _grid(shown: ShownResult) -> Iterator[Block]:
@@ -224,29 +221,25 @@ def axis_words(axis: tuple[float, float, float], frame: str) -> str:
 def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
     """A weak direction and its cure."""
     along, unit = ("along", " mm") if one.kind == "translation" else ("about", "°")
-    deviation = significant(shown.evident("weak", i, "deviation"), 2)
-    words: tuple[str | object, ...] = (
-        f"{one.frame} {along} {axis_words(one.axis_in_carrier, one.carrier)}: ± ",
-        deviation,
-        f"{unit}.",
-    )
+    numbers = {
+        field: significant(shown.evident("weak", i, field), 2) for field in ("deviation", "after_turning", "after_more")
+    }
+    words = "{frame} {along} {axis}: ± {deviation}{unit}."
+    turn = view = ""
     if one.turn is not None:
+        turn, view = axis_words(one.turn, sensor_carrier(shown)), _in_view(shown, one)
         words += (
-            f" Turn by {np.degrees(TURN_RAD):.0f} degrees to both sides about "
-            f"{axis_words(one.turn, sensor_carrier(shown))}, with {_in_view(shown, one)}: {MORE} "
-            "measurements would bring it to about ± ",
-            significant(shown.evident("weak", i, "after_turning"), 2),
-            f"{unit}, as many like those there are to ± ",
-            significant(shown.evident("weak", i, "after_more"), 2),
-            f"{unit}.",
+            f" Turn by {np.degrees(TURN_RAD):.0f} degrees to both sides about {{turn}}, with {{view}}: {MORE} "
+            "measurements would bring it to about ± {after_turning}{unit}, as many like those there are to ± "
+            "{after_more}{unit}."
         )
     elif one.after_more is not None:
         words += (
-            f" No turn helps more than measuring on: {MORE} more measurements would bring it to about ± ",
-            significant(shown.evident("weak", i, "after_more"), 2),
-            f"{unit}.",
+            f" No turn helps more than measuring on: {MORE} more measurements would bring it to about ± "
+            "{after_more}{unit}."
         )
-    return words  # type: ignore[return-value]
+    axis = axis_words(one.axis_in_carrier, one.carrier)
+    return worded(words, frame=one.frame, along=along, axis=axis, unit=unit, turn=turn, view=view, **numbers)
 
 
 def _in_view(shown: ShownResult, one: WeakDirection) -> str:

@@ -10,7 +10,18 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.advice import limits_of, time_sentence, weights_sentence
 from gtsam_rwhec.report.figures import BLUE, GREY, INK, ORANGE, VERMILLION, SvgFigure, svg_figure
-from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Listing, Paragraph, Section, Table, Tone, Words
+from gtsam_rwhec.report.report_blocks import (
+    Block,
+    Chart,
+    Folded,
+    Listing,
+    Paragraph,
+    Section,
+    Table,
+    Tone,
+    Words,
+    worded,
+)
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.solver.certificate import Certificate, Status
 
@@ -27,6 +38,8 @@ ABOUT = (
     "It says nothing of the measurements: of wrong ones it proves the best answer to wrong measurements. The verdict "
     "judges those, and the standard deviations say how far off a pose may be."
 )
+#: Of what the proof is, where the poses are of another fit.
+OF_CERTIFIED = "This is about the certified answer, at which the refinement began. "
 ABSENT = "Not shown: the spectrum of Z"
 
 
@@ -45,16 +58,9 @@ def proof_section(shown: ShownResult) -> Section:
         Listing(tuple(_facts(shown, certificate))),
         *_spectra(shown),
         *_parts(shown),
-        Paragraph(_which_answer(shown) + ABOUT, "note"),
+        Paragraph(("" if shown.result.refined is None else OF_CERTIFIED) + ABOUT, "note"),
     ]
     return Section("proof", title, tuple(blocks))
-
-
-def _which_answer(shown: ShownResult) -> str:
-    """Of what the proof is, where the poses are of another fit."""
-    assert shown.result is not None
-    refined = shown.result.refined
-    return "" if refined is None else "This is about the certified answer, at which the refinement began. "
 
 
 def _facts(shown: ShownResult, certificate: Certificate) -> Iterator[Words]:
@@ -66,17 +72,17 @@ def _facts(shown: ShownResult, certificate: Certificate) -> Iterator[Words]:
         if certificate.objective.form == "inverse"
         else "is half a chi-square, if the stated noise is true"
     )
-    yield (
-        "Cost of the answer: ",
-        shown.number(*at, "cost", spec=".8g"),
-        f". It sums the squared residuals, weighted, and {meaning}. A small cost does not mean that poses are right.",
+    yield worded(
+        f"Cost of the answer: {{cost}}. It sums the squared residuals, weighted, and {meaning}. A small cost does not "
+        "mean that poses are right.",
+        cost=shown.number(*at, "cost", spec=".8g"),
     )
     if np.isfinite(certificate.lower_bound):
         region = "no answer" if certificate.region is None else f"no answer within {certificate.region.distance}"
-        yield (
-            "Lower bound: ",
-            shown.number(*at, "lower_bound", spec=".8g"),
-            f". It means that {region} costs less, rounding counted. It does not mean that no answer costs as much.",
+        yield worded(
+            f"Lower bound: {{bound}}. It means that {region} costs less, rounding counted. It does not mean that no "
+            "answer costs as much.",
+            bound=shown.number(*at, "lower_bound", spec=".8g"),
         )
     else:
         yield "Lower bound: none was found. It does not mean that the answer is bad, only that nothing is known."
@@ -99,10 +105,10 @@ def _facts(shown: ShownResult, certificate: Certificate) -> Iterator[Words]:
     yield time_sentence(certificate)
     eigenvalue = shown.number(*at, "min_eigenvalue", spec=".2g")
     if eigenvalue.value is not None:
-        yield (
-            "Smallest eigenvalue of Z, at least: ",
-            eigenvalue,
-            ". Zero up to rounding means that no direction lowers the cost; it does not say how fast the cost rises.",
+        yield worded(
+            "Smallest eigenvalue of Z, at least: {eigenvalue}. Zero up to rounding means that no direction lowers the "
+            "cost; it does not say how fast the cost rises.",
+            eigenvalue=eigenvalue,
         )
 
 
@@ -111,16 +117,15 @@ def _gap(shown: ShownResult) -> Iterator[Words]:
     proof = shown.evidence_tree.get("proof")
     if not proof or proof["gap"] is None:
         return
-    tolerance = shown.number("certified", "certificate", "tolerance", spec=".2g")
-    yield (
-        "Gap between the two: ",
-        shown.evident("proof", "gap", spec=".2g"),
-        " (",
-        shown.evident("proof", "relative_gap", spec=".1e"),
-        " of the cost; up to ",
-        tolerance,
-        " it counts as closed). A better answer could lower the cost by no more. It does not mean that the poses are "
-        "known as precisely.",
+    numbers = {
+        "gap": shown.evident("proof", "gap", spec=".2g"),
+        "relative": shown.evident("proof", "relative_gap", spec=".1e"),
+        "tolerance": shown.number("certified", "certificate", "tolerance", spec=".2g"),
+    }
+    yield worded(
+        "Gap between the two: {gap} ({relative} of the cost; up to {tolerance} it counts as closed). A better answer "
+        "could lower the cost by no more. It does not mean that the poses are known as precisely.",
+        **numbers,
     )
 
 
@@ -162,18 +167,13 @@ def _parts(shown: ShownResult) -> Iterator[Block]:
     parts = shown.result.solution.parts
     if len(parts) < 2:
         return
-    rows = tuple(
-        (
-            ", ".join(part.names),
-            str(part.certificate.status),
-            shown.number("certified", "parts", i, "certificate", "cost", spec=".8g"),
-            shown.number("certified", "parts", i, "certificate", "lower_bound", spec=".8g")
-            if np.isfinite(part.certificate.lower_bound)
-            else "none",
-        )
-        for i, part in enumerate(parts)
-    )
-    table = Table("Unconnected parts, each solved by itself", ("frames", "status", "cost", "lower bound"), rows)
+    rows: list[tuple[Words, ...]] = []
+    for i, part in enumerate(parts):
+        at = ("certified", "parts", i, "certificate")
+        cost, bound = (shown.number(*at, field, spec=".8g") for field in ("cost", "lower_bound"))
+        names, is_bound = ", ".join(part.names), np.isfinite(part.certificate.lower_bound)
+        rows.append((names, str(part.certificate.status), cost, bound if is_bound else "none"))
+    table = Table("Unconnected parts, each solved by itself", ("frames", "status", "cost", "lower bound"), tuple(rows))
     yield Folded(f"{len(parts)} unconnected parts", (table,))
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from string import Formatter
 from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
@@ -80,6 +81,18 @@ def pieces_of(words: Words) -> tuple[Piece, ...]:
     return words if isinstance(words, tuple) else (words,)
 
 
+def worded(template: str, **pieces: Piece) -> Words:
+    """A sentence with pieces in the place of their names in braces."""
+    said: list[Piece] = [""]
+    for text, name, _, _ in Formatter().parse(template):
+        for piece in (text, "" if name is None else pieces[name]):
+            if isinstance(piece, str) and isinstance(said[-1], str):
+                said[-1] += piece
+            else:
+                said.append(piece)
+    return tuple(said)
+
+
 def plain_text(words: Words) -> str:
     """Words as text."""
     said = (
@@ -95,7 +108,6 @@ class Paragraph:
 
     words: Words
     tone: Tone = "plain"
-    kind: str = field(default="paragraph", init=False)
 
 
 @dataclass(frozen=True)
@@ -104,7 +116,6 @@ class Listing:
 
     items: tuple[Words, ...]
     tone: Tone = "plain"
-    kind: str = field(default="listing", init=False)
 
 
 @dataclass(frozen=True)
@@ -119,7 +130,6 @@ class Table:
     rows: tuple[tuple[Words, ...], ...]
     legend: str = ""
     sorts: bool = False
-    kind: str = field(default="table", init=False)
 
     @staticmethod
     def of(
@@ -139,7 +149,6 @@ class Chart:
     says: str
     svg: SvgFigure
     is_wide: bool = False
-    kind: str = field(default="chart", init=False)
 
 
 @dataclass(frozen=True)
@@ -152,7 +161,6 @@ class Picture:
     content: bytes
     media_type: Literal["image/jpeg", "image/png"] = "image/jpeg"
     is_wide: bool = True
-    kind: str = field(default="picture", init=False)
 
 
 @dataclass(frozen=True)
@@ -165,7 +173,6 @@ class Drawing:
     traces: tuple[Mapping[str, Any], ...]
     layout: Mapping[str, Any]
     still_svg: SvgFigure
-    kind: str = field(default="drawing", init=False)
 
 
 @dataclass(frozen=True)
@@ -175,7 +182,6 @@ class CopyText:
     name: str
     title: str
     text: str
-    kind: str = field(default="copy", init=False)
 
 
 @dataclass(frozen=True)
@@ -184,7 +190,6 @@ class Folded:
 
     title: str
     blocks: tuple[Block, ...]
-    kind: str = field(default="folded", init=False)
 
 
 Block = Paragraph | Listing | Table | Chart | Picture | Drawing | CopyText | Folded

@@ -34,11 +34,9 @@ from gtsam_rwhec.results import Evidence, evidence_path, read_evidence
 from gtsam_rwhec.results.evidence import checksum
 from gtsam_rwhec.results.json_tree import MOST_BYTES
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_file import result_json
+from gtsam_rwhec.results.result_file import result_json, result_path
 from gtsam_rwhec.solver.solution import Solution
 
-#: The name of a result in an output folder.
-RESULT_FILE = "result.json"
 #: Rotations whose matrices differ by less are the same.
 SAME_ROTATION = 1e-6
 
@@ -152,8 +150,7 @@ def _result_file(result: object) -> Path:
         raise OptionError(
             f"result is a {type(result).__name__}; give what rw.calibrate returned, or the path of a result file"
         )
-    path = checked_path(result)
-    return path / RESULT_FILE if path.is_dir() else path
+    return result_path(checked_path(result))
 
 
 def read_shown(path: str | Path, evidence: Evidence | None = None, *, images: bool = True) -> ShownResult:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,11 +24,16 @@ from gtsam_rwhec.report.figures import (
     shortened,
     svg_figure,
 )
-from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Paragraph, Section, Table, Words, significant
+from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Paragraph, Section, Table, Words, significant, worded
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.image_errors import SeenCamera
-from gtsam_rwhec.results.residual_evidence import BEYOND_3_BY_CHANCE, FEWEST, Dependence, ResidualsEvidence
-from gtsam_rwhec.solver.answers import Residual
+from gtsam_rwhec.results.residual_evidence import (
+    BEYOND_3_BY_CHANCE,
+    FEWEST,
+    Dependence,
+    ResidualsEvidence,
+    pooled_residual,
+)
 from gtsam_rwhec.solver.solution import Solution
 
 if TYPE_CHECKING:
@@ -113,20 +118,6 @@ def residual_cells(solution: Solution, name: str) -> tuple[str, ...]:
     )
 
 
-def pooled_residual(residuals: Iterable[Residual]) -> Residual:
-    """The root mean square over all measurements of several pairs."""
-    residuals = tuple(residuals)
-    number = sum(residual.number_of_measurements for residual in residuals)
-    if number == 0:
-        return Residual(0, math.nan, math.nan)
-
-    def pool(rms: Iterable[float]) -> float:
-        squares = (r.number_of_measurements * value**2 for r, value in zip(residuals, rms, strict=True))
-        return math.sqrt(sum(squares) / number)
-
-    return Residual(number, pool(r.translation_rms_m for r in residuals), pool(r.rotation_rms_rad for r in residuals))
-
-
 def _cameras_with_corners(shown: ShownResult) -> tuple[SeenCamera, ...]:
     seen = None if shown.evidence is None else shown.evidence.seen
     return () if seen is None else tuple(camera for camera in seen.cameras if camera.x)
@@ -187,16 +178,13 @@ def _by_configuration(shown: ShownResult, found: ResidualsEvidence) -> Iterator[
         if abs(one.correlation) > one.by_chance
         else "That much is chance."
     )
-    yield Paragraph(
-        (
-            f"The strongest dependence on the carriers' pose: {one.component} of {one.sensor}, with {one.by}: "
-            "correlation ",
-            shown.evident(*at, "correlation", spec=".2f"),
-            ", where chance alone stays below ",
-            shown.evident(*at, "by_chance", spec=".2f"),
-            f". {verdict}",
-        )
+    correlation, by_chance = (shown.evident(*at, field, spec=".2f") for field in ("correlation", "by_chance"))
+    words = (
+        "The strongest dependence on the carriers' pose: {component} of {sensor}, with {by}: correlation "
+        "{correlation}, where chance alone stays below {by_chance}. {verdict}"
     )
+    of = {"component": one.component, "sensor": one.sensor, "by": one.by, "verdict": verdict}
+    yield Paragraph(worded(words, correlation=correlation, by_chance=by_chance, **of))
     yield Chart(
         "residuals-by-configuration",
         "Over the carriers' pose",
@@ -208,24 +196,18 @@ def _by_configuration(shown: ShownResult, found: ResidualsEvidence) -> Iterator[
 
 def _against_noise(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]:
     low, high = AS_LARGE
-    size = (
-        "as large as the noise that was found"
-        if low <= found.spread <= high
-        else "smaller than the noise that was found"
-        if found.spread < low
-        else "larger than the noise that was found"
+    size = "smaller than" if found.spread < low else "larger than" if found.spread > high else "as large as"
+    words = (
+        "Residuals are {size} the noise that was found: their root mean square is {spread} of it. Beyond three "
+        "deviations are {beyond} % ({by_chance} % of normal noise); excess kurtosis {kurtosis} (0 for normal noise; "
+        "heavy tails are positive)."
     )
-    yield Paragraph(
-        (
-            f"Residuals are {size}: their root mean square is ",
-            shown.evident("residuals", "spread", spec=".2f"),
-            " of it. Beyond three deviations are ",
-            shown.evident("residuals", "beyond_3", times=100.0, spec=".2f"),
-            f" % ({100.0 * BEYOND_3_BY_CHANCE:.2f} % of normal noise); excess kurtosis ",
-            shown.evident("residuals", "excess_kurtosis", spec=".1f"),
-            " (0 for normal noise; heavy tails are positive).",
-        )
-    )
+    numbers = {
+        "spread": shown.evident("residuals", "spread", spec=".2f"),
+        "beyond": shown.evident("residuals", "beyond_3", times=100.0, spec=".2f"),
+        "kurtosis": shown.evident("residuals", "excess_kurtosis", spec=".1f"),
+    }
+    yield Paragraph(worded(words, size=size, by_chance=f"{100.0 * BEYOND_3_BY_CHANCE:.2f}", **numbers))
     yield Chart(
         "residuals-against-noise",
         "Against the noise model",
@@ -237,25 +219,18 @@ def _against_noise(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Blo
 def _neighbours(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]:
     known = [(pair.neighbours, pair.band) for pair in found.pairs if pair.neighbours is not None]
     judged, beyond = len(known), sum(band is not None and abs(own) > band for own, band in known)
-    words: list[str] = []
+    words = ""
     if judged:
-        words.append(
+        words = (
             f"In {beyond} of {judged} pairs residuals follow or oppose those before more than chance allows in 95 %: "
             f"of {judged} pairs about {0.05 * judged:.1f} are so by chance."
         )
     if found.instants is None or found.worth is None:
-        yield Paragraph((*words, " No model of all noise was made, so what the data are worth is not known."), "plain")
+        yield Paragraph(f"{words} No model of all noise was made, so what the data are worth is not known.")
         return
-    yield Paragraph(
-        (
-            *words,
-            " With the correlation that was found, ",
-            shown.evident("residuals", "instants", spec=".0f"),
-            " poses of the carriers are worth ",
-            shown.evident("residuals", "worth", spec=".0f"),
-            " independent ones.",
-        )
-    )
+    more = " With the correlation that was found, {instants} poses of the carriers are worth {worth} independent ones."
+    numbers = {field: shown.evident("residuals", field, spec=".0f") for field in ("instants", "worth")}
+    yield Paragraph(worded(words + more, **numbers))
 
 
 def _pairs(shown: ShownResult, found: ResidualsEvidence) -> Block:
@@ -268,19 +243,13 @@ def _pairs(shown: ShownResult, found: ResidualsEvidence) -> Block:
         sizes = (significant(shown.evident(*at, field), 3) for field in ("rms_mm", "rms_deg", "spread"))
         rows.append((f"{pair.target}, {pair.sensor}", shown.evident(*at, "used", spec=".0f"), *sizes, neighbours, band))
     more = len(found.pairs) - len(rows)
-    return Folded(
-        f"Residuals of {len(found.pairs)} pairs",
-        (
-            Table(
-                "Residuals by pair",
-                ("pair", "n", "rms mm", "rms°", "of noise", "neighbours", "by chance"),
-                tuple(rows),
-                "of noise: root mean square in units of it. neighbours: correlation with the measurement before; "
-                "by chance it stays within the last column in 95 %."
-                + (f" {more} more pairs are in evidence.json." if more else ""),
-            ),
-        ),
+    legend = (
+        "of noise: root mean square in units of it. neighbours: correlation with the measurement before; by chance it "
+        "stays within the last column in 95 %." + (f" {more} more pairs are in evidence.json." if more else "")
     )
+    headings = ("pair", "n", "rms mm", "rms°", "of noise", "neighbours", "by chance")
+    table = Table("Residuals by pair", headings, tuple(rows), legend)
+    return Folded(f"Residuals of {len(found.pairs)} pairs", (table,))
 
 
 #: Sensors are told apart by colour and by sign, up to this number; more are drawn alike.

@@ -20,7 +20,7 @@ from gtsam_rwhec.report.figures import (
     shortened,
     svg_figure,
 )
-from gtsam_rwhec.report.report_blocks import Block, Drawing, Listing, Paragraph, Section, Table, Words
+from gtsam_rwhec.report.report_blocks import Block, Drawing, Listing, Paragraph, Section, Table, Words, worded
 from gtsam_rwhec.report.scene_model import (
     MANY,
     Line,
@@ -162,8 +162,11 @@ def _turned_away(shown: ShownResult, evidence: SceneEvidence) -> Iterator[Block]
                 shown.evident("scene", "sensors", name, field, 1, spec=".0f")
                 for field in ("off_axis_by_poses_deg", "off_axis_deg")
             )
-            words = (f"By the poses, targets that {name} saw are up to ", by_poses)
-            said.append((*words, "° off its z axis; as measured, at most ", measured, "°."))
+            words = (
+                "By the poses, targets that {name} saw are up to {by_poses}° off its z axis; as measured, at most "
+                "{measured}°."
+            )
+            said.append(worded(words, name=name, by_poses=by_poses, measured=measured))
     if said:
         yield Listing(tuple(said))
 

@@ -129,8 +129,6 @@ def lines_beside(messages: Sequence[str], console: Console | None = None) -> int
     ----------
     messages : sequence of str
         What else is said.
-    console : rich.console.Console, optional
-        Where; standard output by default.
     """
     room = _Room(report_console() if console is None else console, LINES)
     room.take(*messages)

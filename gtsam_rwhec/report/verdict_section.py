@@ -115,26 +115,20 @@ def _points(shown: ShownResult) -> Iterator[Block]:
             yield Paragraph(f"{points[i]['frame']}: not determined", "lead")
         else:
             yield Paragraph((f"{points[i]['frame']}: ", radius, " mm with ", level, " probability"), "lead")
-    rows = tuple(
-        (
-            point["frame"],
-            point["seen_from"],
-            f"{np.linalg.norm(point['point_m']):.2f}",
-            shown.number("calibration", "points", i, "level", times=100.0, spec="g"),
-            significant(shown.number("calibration", "points", i, "radius_mm"), 3),
-            "-"
-            if point.get("measurement_mm") is None
-            else significant(shown.number("calibration", "points", i, "measurement_mm"), 3),
+    rows: list[tuple[Words, ...]] = []
+    for i, point in enumerate(points):
+        at = ("calibration", "points", i)
+        level, radius = (
+            shown.number(*at, "level", times=100.0, spec="g"),
+            significant(shown.number(*at, "radius_mm"), 3),
         )
-        for i, point in enumerate(points)
-    )
+        has_noise = point.get("measurement_mm") is not None
+        noise: Words = significant(shown.number(*at, "measurement_mm"), 3) if has_noise else "-"
+        distance = f"{np.linalg.norm(point['point_m']):.2f}"
+        rows.append((point["frame"], point["seen_from"], distance, level, radius, noise))
     headings = ("sensor", "expressed in", "targets at m", "probability %", "within mm", "one new measurement adds mm")
-    yield Table(
-        "How far off a point is",
-        headings,
-        rows,
-        f"{POINTS} {OTHER_POINTS_IN_PYTHON if shown.in_memory else OTHER_POINTS}",
-    )
+    elsewhere = OTHER_POINTS_IN_PYTHON if shown.in_memory else OTHER_POINTS
+    yield Table("How far off a point is", headings, tuple(rows), f"{POINTS} {elsewhere}")
 
 
 LEGEND = (

@@ -169,27 +169,24 @@ def judge_night(nights: Nights, spread: Spread, rate: float) -> NightTest:
         return NightTest(nights.count, 1.0, 0.0)
     found = shifts(nights, steps(n), spread.correlation)
     square, dimensions = found.ratios()
-    names, chances, ratios, sizes = [""], [found.chances(square, dimensions, spread)], [square], [dimensions]
+    tested = {"": (square, dimensions)}
     for name, rows in nights.groups.items():
         square, size = found.ratios(rows)
         if size.any() and (size != dimensions).any():
-            names.append(name)
-            chances.append(found.chances(square, size, spread))
-            ratios.append(square)
-            sizes.append(size)
-    alone = len(names) - 1
+            tested[name] = square, size
+    alone = len(tested) - 1
     weights = np.array([OF_ALL, *[(1.0 - OF_ALL) / alone] * alone]) if alone else np.ones(1)
     # In logarithms, ties (of chances that are 0) go to the largest ratio.
-    shares = np.array(chances) / weights[:, None]
-    which, k = np.unravel_index(np.lexsort((-np.array(ratios).ravel(), shares.ravel()))[0], shares.shape)
-    largest = int(np.max(sizes[-1]))
+    shares = np.array([found.chances(*each, spread) for each in tested.values()]) / weights[:, None]
+    ratios = np.array([square for square, _ in tested.values()])
+    which, k = np.unravel_index(np.lexsort((-ratios.ravel(), shares.ravel()))[0], shares.shape)
     return NightTest(
         nights=nights.count,
         chance=min(float(shares[which, k]), 1.0),
-        limit=limit_of(nights.count, max(alone, 1), largest, rate),
+        limit=limit_of(nights.count, max(alone, 1), int(list(tested.values())[-1][1].max()), rate),
         moment=int(k) + 1,
-        group=names[which],
-        ratio=float(ratios[which][k]),
+        group=list(tested)[which],
+        ratio=float(ratios[which, k]),
     )
 
 
@@ -286,13 +283,11 @@ def change_of(nights: Nights, test: NightTest, spread: Spread) -> ChangeFound:
     """What changed, given an alarm at the last of the nights."""
     stepped = shifts(nights, steps(len(nights)), spread.correlation)
     tested = [name for name, rows in nights.groups.items() if stepped.seen[:, rows].any()]
-    groups, rows = _fewest(nights, stepped, test.moment - 1, tested, spread)
-    at = stepped.ratios(rows)[0]
-    k = int(np.argmax(at))
-    # The moment may have changed, and with it what explains everything.
-    groups, rows = _fewest(nights, stepped, k, tested, spread)
-    at = stepped.ratios(rows)[0]
-    k = int(np.argmax(at))
+    k = test.moment - 1
+    for _ in range(2):  # the moment may change, and with it what explains everything
+        groups, rows = _fewest(nights, stepped, k, tested, spread)
+        at = stepped.ratios(rows)[0]
+        k = int(np.argmax(at))
     drifted = shifts(nights, drifts(nights.days), spread.correlation)
     slow = drifted.ratios(rows)[0]
     slowest = int(np.argmax(slow))

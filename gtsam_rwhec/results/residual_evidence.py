@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from rwhec_factors import se3
@@ -11,6 +11,7 @@ from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row, Rows
 from gtsam_rwhec.results.linear_model import LinearModel, equilibrated, inverse_of
+from gtsam_rwhec.solver.answers import Residual
 
 #: So many measurements are kept one by one; of more, every so-many-th.
 MOST_KEPT = 5_000
@@ -126,6 +127,16 @@ def _of_pair(model: LinearModel, r: Array, number: int, every: int) -> PairResid
         mm=_rounded(millimetres[mine]),
         normalised=tuple(map(_rounded, r[mine & model.used])),
     )
+
+
+def pooled_residual(residuals: Iterable[Residual]) -> Residual:
+    """The root mean square over all measurements of several pairs; nan where there are none."""
+    all_ = list(residuals)
+    number = np.array([one.number_of_measurements for one in all_], dtype=int)
+    squares = np.array([(one.translation_rms_m**2, one.rotation_rms_rad**2) for one in all_]).reshape(-1, 2)
+    total = int(number.sum())
+    rms = np.sqrt(number @ squares / total) if total else np.full(2, np.nan)
+    return Residual(total, float(rms[0]), float(rms[1]))
 
 
 def sizes(residual: Array) -> tuple[Array, Array]:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable
-from dataclasses import fields, replace
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.reprojection_record import SIZE, BoardShape, Intrinsics, Regions, Reprojection, lens_of
+from gtsam_rwhec.fitting.reprojection_record import SIZE, BoardShape, Intrinsics, Regions, lens_of
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.log_history import LogFields
@@ -111,23 +110,18 @@ def check_log(log: LogFields) -> None:
 
 def check_sizes(solution: SolutionFields, refined: RefinedFields | None) -> None:
     """Root mean squares, counts and costs are not negative; scales are of one kind, unless corners estimate sizes."""
-    for pair, residual in solution.residuals.items():
-        _check_not_negative(residual, f"$.certified.residuals[{shown(pair)}]")
+    _check_not_negative(solution.residuals, "$.certified.residuals")
     for answer, place in ((solution, "$.certified.scale"), (refined, "$.scale")):
         if answer is not None and answer.scale_mode == "known" and answer.scale != 1.0:
             raise ValueError(f"{place}: must be 1.0 with scale_mode 'known' (found {answer.scale})")
     if refined is None:
         return
-    for name in ("cost", "initial_cost", "iterations"):
-        if not getattr(refined, name) >= 0:
-            raise ValueError(f"$.refined.{name}: must not be negative (found {getattr(refined, name)})")
-    for pair, noise in refined.noise.items():
-        _check_not_negative(noise, f"$.refined.noise[{shown(pair)}]")
+    for name in ("cost", "initial_cost", "iterations", "noise", "reprojection", "intrinsics"):
+        _check_not_negative(getattr(refined, name), f"$.refined.{name}")
     for pair, (inliers, number) in refined.inlier_counts.items():
         if not 0 <= inliers <= number:
             raise ValueError(f"$.refined.inlier_counts[{shown(pair)}]: {inliers} inliers of {number} measurements")
-    boards = {} if refined.reprojection is None else refined.reprojection.boards
-    has_sizes = any(SIZE in board.names for board in boards.values())
+    has_sizes = any(SIZE in board.names for board in _boards(refined).values())
     is_of_corners = refined.scale_mode == "per_target" and solution.scale_mode == "known" and has_sizes
     if refined.scale_mode != solution.scale_mode and not is_of_corners:
         raise ValueError(
@@ -144,11 +138,11 @@ def check_joint(refined: RefinedFields, certified: SolutionFields) -> None:
     if refined.frames.keys() != names:
         raise ValueError(f"$.refined.frames: must have the targets and sensors {', '.join(sorted(names))}")
     slots, place = refined.joint.slots, "$.refined.joint.slots"
-    boards = {} if refined.reprojection is None else refined.reprojection.boards
+    boards = _boards(refined)
     owners = {
         UnknownKind.FRAME: names,
         UnknownKind.TIME_OFFSET: refined.time_offsets_s,
-        UnknownKind.SCALE: [] if refined.scale_mode == "known" else _scale_owners(refined),
+        UnknownKind.SCALE: _scale_owners(refined),
         UnknownKind.INTRINSICS: refined.intrinsics,
         UnknownKind.SHAPE: boards,
     }
@@ -179,8 +173,14 @@ def check_joint(refined: RefinedFields, certified: SolutionFields) -> None:
     _check_matrices(refined.joint, end)
 
 
+def _boards(refined: RefinedFields) -> dict[str, BoardShape]:
+    return {} if refined.reprojection is None else refined.reprojection.boards
+
+
 def _scale_owners(refined: RefinedFields) -> Collection[str]:
-    return refined.scale if isinstance(refined.scale, dict) else [""]
+    if refined.scale_mode == "known":
+        return ()
+    return refined.scale if isinstance(refined.scale, dict) else ("",)
 
 
 def _may_be_known(unknown: Unknown, refined: RefinedFields, certified: SolutionFields) -> bool:
@@ -240,24 +240,18 @@ def check_corners(refined: RefinedFields) -> None:
         return
     _check_are_there(found.sensors, refined.Y, f"{place}.sensors", "sensors")
     _check_are_there(found.boards, refined.X, f"{place}.boards", "targets")
-    _check_reprojection(found, refined, place)
+    for index, one in enumerate(found.consequences):
+        _check_are_there(
+            [one.frame], refined.X.keys() | refined.Y.keys(), f"{place}.consequences[{index}].frame", "frames"
+        )
+    for name, sensor in found.sensors.items():
+        _check_regions(sensor.regions_px, f"{place}.sensors.{shown(name)}.regions_px")
+    if found.tried and sum(tried.is_chosen for tried in found.tried) != 1:
+        raise ValueError(f"{place}.tried: one model is chosen")
     for name, intrinsics in refined.intrinsics.items():
         _check_intrinsics(intrinsics, refined, f"$.refined.intrinsics.{shown(name)}")
     for name, board in found.boards.items():
         _check_board(board, f"{place}.boards.{shown(name)}")
-
-
-def _check_reprojection(found: Reprojection, refined: RefinedFields, place: str) -> None:
-    _check_not_negative(found, place)
-    for name, sensor in found.sensors.items():
-        _check_not_negative(sensor, f"{place}.sensors.{shown(name)}")
-        _check_regions(sensor.regions_px, f"{place}.sensors.{shown(name)}.regions_px")
-    if found.tried and sum(tried.is_chosen for tried in found.tried) != 1:
-        raise ValueError(f"{place}.tried: one model is chosen")
-    for index, consequence in enumerate(found.consequences):
-        _check_not_negative(consequence, f"{place}.consequences[{index}]")
-        frames = refined.X.keys() | refined.Y.keys()
-        _check_are_there([consequence.frame], frames, f"{place}.consequences[{index}].frame", "frames")
 
 
 def _check_intrinsics(intrinsics: Intrinsics, refined: RefinedFields, place: str) -> None:
@@ -277,7 +271,6 @@ def _check_intrinsics(intrinsics: Intrinsics, refined: RefinedFields, place: str
         raise ValueError(
             f"{place}.names: must be {', '.join(wanted)} (found {', '.join(map(shown, intrinsics.names))})"
         )
-    _check_not_negative(intrinsics, place, ("standard_deviations", "stated_deviations"))
     _check_are_there(intrinsics.held_by_prior, intrinsics.names, f"{place}.held_by_prior", "parameters")
     _check_are_there(intrinsics.shared_with, refined.intrinsics, f"{place}.shared_with", "cameras")
     _check_regions(intrinsics.projection_px, f"{place}.projection_px")
@@ -289,26 +282,31 @@ def _check_board(board: BoardShape, place: str) -> None:
     off, of_off = board.corners_off_m, board.corners_deviations_m
     if len(off) != len(of_off) or any(len(each) != 3 for each in (*off, *of_off)):
         raise ValueError(f"{place}: corners_off_m and corners_deviations_m must have x, y, z of every corner")
-    _check_not_negative(board, place, ("standard_deviations",))
 
 
 def _check_regions(regions: Regions, place: str) -> None:
-    """Rows of one length, without negative numbers; None stands where no corner was seen."""
     if len({len(row) for row in regions}) > 1:
         raise ValueError(f"{place}: rows of different lengths")
-    for value in (value for row in regions for value in row if value is not None):
-        if not value >= 0.0:
-            raise ValueError(f"{place}: must not be negative (found {value})")
 
 
-def _check_not_negative(record: Any, place: str, lists: Collection[str] = ("degrees_of_freedom",)) -> None:
-    """No number that a record holds directly, or in these lists, is below zero: counts, sizes and deviations."""
-    for each in fields(record):
-        value = getattr(record, each.name)
-        numbers = value if each.name in lists else [value]
-        for number in numbers:
-            if isinstance(number, int | float) and not number >= 0:
-                raise ValueError(f"{place}.{each.name}: must not be negative (found {number})")
+#: Fields whose numbers may be below zero.
+OF_EITHER_SIGN = ("values", "stated", "corners_off_m")
+
+
+def _check_not_negative(value: object, place: str) -> None:
+    """No number in records, lists or dictionaries is below zero, but those of `OF_EITHER_SIGN`."""
+    if is_dataclass(value):
+        for each in fields(value):
+            if each.name not in OF_EITHER_SIGN:
+                _check_not_negative(getattr(value, each.name), f"{place}.{each.name}")
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_not_negative(item, f"{place}.{shown(key)}" if isinstance(key, str) else f"{place}[{shown(key)}]")
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _check_not_negative(item, place)
+    elif isinstance(value, int | float) and not value >= 0:
+        raise ValueError(f"{place}: must not be negative (found {value})")
 
 
 def _check_are_there(names: Iterable[str], there: Collection[str], place: str, what: str) -> None:

@@ -169,14 +169,10 @@ def parse_tree(content: bytes, path: str | Path) -> dict[str, Any]:
         )
     if header.format_version != FORMAT_VERSION:
         is_newer = header.format_version > FORMAT_VERSION
-        remedy = (
-            "Calibrate again, or install the gtsam-rwhec that wrote it"
-            if is_newer
-            else "Calibrate again to write a new file"
-        )
+        remedy = ", or install the gtsam-rwhec that wrote it" if is_newer else " to write a new file"
         raise ResultVersionError(
             f"{path} has version {header.format_version} of the result format (written by {shown(header.written_by)}); "
-            f"this gtsam-rwhec reads version {FORMAT_VERSION}. {remedy}."
+            f"this gtsam-rwhec reads version {FORMAT_VERSION}. Calibrate again{remedy}."
         )
     tree: dict[str, Any] = raw
     return tree
@@ -330,16 +326,12 @@ def result_json(
     try:
         judgement = judge(solution, refined, log, () if record is None else record.findings)
         wrong = contradicted_names(refined, log)
-        certified = _posed(to_json(solution, "$.certified"), solution, (targets, sensors), wrong)
-        for name in OF_CERTIFICATE:
-            certified.pop(name)
+        certified = _posed(solution, "$.certified", (targets, sensors), wrong, OF_CERTIFICATE)
         for residual in certified["residuals"]:
             residual.pop("number_of_measurements")
         parts: dict[str, Any] = {"certified": certified}
         if refined is not None:
-            fields_of = to_json(_refined_fields(refined), "$.refined")
-            parts["refined"] = _posed(fields_of, refined, (targets, sensors), wrong)
-            parts["refined"].pop("moved")
+            parts["refined"] = _posed(_refined_fields(refined), "$.refined", (targets, sensors), wrong, ("moved",))
         owner = parts["certified" if refined is None else "refined"]
         poses = {name: owner.pop(name) for name in POSED}
         if record is not None:
@@ -370,14 +362,19 @@ def _heading(judgement: Judgement) -> dict[str, Any]:
 
 
 def _posed(
-    tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: tuple[str, str], contradicted: Collection[str]
+    answer: Solution | RefinedPoses,
+    place: str,
+    carriers: tuple[str, str],
+    contradicted: Collection[str],
+    without: Collection[str],
 ) -> dict[str, Any]:
-    """Put the poses into a record's JSON, under the names that files have for them; targets' carrier first."""
+    """A record's JSON with its poses under the names that files have for them, without what stands elsewhere."""
     poses = {
         "targets": pose_rows(carriers[0], answer.X, contradicted),
         "sensors": pose_rows(carriers[1], answer.Y, contradicted),
     }
-    return {**poses, **{name: value for name, value in tree.items() if name not in ("X", "Y")}}
+    tree = to_json(answer, place)
+    return {**poses, **{name: value for name, value in tree.items() if name not in ("X", "Y", *without)}}
 
 
 def _refined_fields(refined: Refined) -> RefinedFields:

@@ -55,14 +55,14 @@ def judge(
         ]
         used = {count.sensor for count in log.outliers if count.used}
         found += [Finding(Ground.NO_ANSWER, shortage(log, name)) for name in log.detection.images if name not in used]
-        doubted = [size.target for size in log.sizes if size.is_doubted and not size.is_free]
+        stated = [size for size in log.sizes if not size.is_free]
+        doubted = ", ".join(size.target for size in stated if size.is_doubted)
         if doubted:
-            words = f"the stated size of {', '.join(doubted)} does not fit the motion"
-            found.append(Finding(Ground.SIZE_DOUBTED, words))
+            found.append(Finding(Ground.SIZE_DOUBTED, f"the stated size of {doubted} does not fit the motion"))
         found += [
             Finding(Ground.SIZE_UNCERTAIN, f"the stated size of {size.target} fits the motion badly")
-            for size in log.sizes
-            if size.is_uncertain and not size.is_free
+            for size in stated
+            if size.is_uncertain
         ]
     return Judgement.of(found, proof_of(refined))
 

@@ -112,8 +112,11 @@ def scene_of(
         cameras = {**cameras, **{name: one.camera for name, one in refined.intrinsics.items()}}
     shapes = {} if refined is None or refined.reprojection is None else refined.reprojection.boards
     seen = {pair: _seen(pair, one, calibration) for pair, one in used.items()}
+    many = len(targets) > WITH_MODULES
     boards = {
-        name: _board(what, _scale(calibration, name), shapes.get(name), is_one_of_many=len(targets) > WITH_MODULES)
+        name: drawn_points(what, _scale(calibration, name))
+        if isinstance(what, np.ndarray)
+        else drawn_board(what, _scale(calibration, name), shapes.get(name), is_one_of_many=many)
         for name, what in targets.items()
     }
     return SceneEvidence(
@@ -248,12 +251,6 @@ def rim_of(camera: Camera) -> Array:
     rays = np.column_stack([np.nan_to_num(x), np.ones(len(x))])
     unit: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return unit
-
-
-def _board(what: Target | Array, scale: float, shape: BoardShape | None, *, is_one_of_many: bool) -> DrawnBoard:
-    if isinstance(what, np.ndarray):
-        return drawn_points(what, scale)
-    return drawn_board(what, scale, shape, is_one_of_many=is_one_of_many)
 
 
 def _angle(vectors: Array) -> Array:

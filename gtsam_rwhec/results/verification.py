@@ -29,6 +29,7 @@ from gtsam_rwhec.results.changed_frames import (
 )
 from gtsam_rwhec.results.common_quantities import Movement, Quantities, quantities
 from gtsam_rwhec.results.near_answer import NearAnswer, near, stated_as
+from gtsam_rwhec.results.residual_evidence import pooled_residual
 from gtsam_rwhec.results.result_file import Result
 
 #: Why frames are not checked.
@@ -155,10 +156,9 @@ def checks_of(
 
 def _residual_m(result: Result, sensor: str) -> float | None:
     """The root mean square of a sensor's residuals in the old log, m."""
-    residuals = [residual for pair, residual in result.solution.residuals.items() if pair.sensor == sensor]
-    count = sum(one.number_of_measurements for one in residuals)
-    square = sum(one.number_of_measurements * one.translation_rms_m**2 for one in residuals)
-    return float(np.sqrt(square / count)) if count and square > 0.0 else None
+    of_sensor = (residual for pair, residual in result.solution.residuals.items() if pair.sensor == sensor)
+    rms_m = pooled_residual(of_sensor).translation_rms_m
+    return rms_m if rms_m > 0.0 else None
 
 
 def far_off(result: Result, old: RefinedPoses, problem: Problem) -> dict[str, SensorCheck]:
@@ -250,9 +250,13 @@ def verify(
         noise="estimate", time_offsets=tuple(time_offsets) or False, carrier_path=carrier_path if time_offsets else None
     )
     try:
-        found, common = _compared(
-            refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress, targets_may_move
-        )
+        found = near(refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress)
+        common = quantities(refined, found.refined, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
+        if targets_may_move:
+            common = common.only(lambda unknown: unknown.owner in refined.Y)
+        if not common.slots:
+            said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
+            raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
     except (UnderdeterminedError, CountError) as error:
         far = {} if targets_may_move else far_off(result, refined, stated)
         if not far:
@@ -272,25 +276,6 @@ def verify(
         targets_may_move=targets_may_move,
         remarks=tuple(_remarks(refined, problem, found, checks, targets_may_move=targets_may_move)),
     )
-
-
-def _compared(
-    old: RefinedPoses,
-    problem: Problem,
-    how: RefineOptions,
-    noise: NoiseOptions,
-    progress: Progress | None,
-    targets_may_move: bool,
-) -> tuple[NearAnswer, Quantities]:
-    """What the new measurements say near the old poses, and what of it can be compared."""
-    found = near(old, problem, how, noise, progress)
-    common = quantities(old, found.refined, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
-    if targets_may_move:
-        common = common.only(lambda unknown: unknown.owner in old.Y)
-    if not common.slots:
-        said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
-        raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
-    return found, common
 
 
 def in_words(common: Quantities) -> dict[str, str]:

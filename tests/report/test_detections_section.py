@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from refinement_problems import rig
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
@@ -22,14 +22,6 @@ from gtsam_rwhec.results.image_errors import SeenCamera, WorstImage
 
 NAME = "<b>cam</b>"
 PICTURE = b"\xff\xd8 a picture"
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The result file of a small rig."""
-    path: Path = tmp_path_factory.mktemp("seen") / "result.json"
-    rw.write_calibration(rw.calibrate(rig(1, 1).problem), path)
-    return path.read_bytes()
 
 
 def camera(cells: np.ndarray) -> SeenCamera:
@@ -71,14 +63,14 @@ def made_up() -> SeenEvidence:
     )  # fmt: skip
 
 
-def page_of(result: bytes, seen: SeenEvidence | None, *, images: bool = True) -> tuple[str, Section]:
+def page_of(shown: ShownResult, seen: SeenEvidence | None, *, images: bool = True) -> tuple[str, Section]:
     evidence = None if seen is None else rw.results.Evidence(seen=seen)
-    section = seen_section(ShownResult.of(result, evidence, images=images))
+    section = seen_section(replace(shown, evidence=evidence, images=images))
     return page_html(Page("A page", "good", (section,), "a test")), section
 
 
-def test_numbers_are_those_of_the_evidence_and_names_are_text(result: bytes) -> None:
-    page, _ = page_of(result, made_up())
+def test_numbers_are_those_of_the_evidence_and_names_are_text(shown: ShownResult) -> None:
+    page, _ = page_of(shown, made_up())
     files = {"evidence.json": json.loads(evidence_json(rw.results.Evidence(seen=made_up())))}
     assert len(numbers_of(page)) >= 10
     assert list(wrong_numbers(page, files)) == []
@@ -90,8 +82,8 @@ def test_numbers_are_those_of_the_evidence_and_names_are_text(result: bytes) -> 
     assert page.count(base64.b64encode(PICTURE).decode()) == 2
 
 
-def test_without_images_there_is_none_and_it_is_said(result: bytes) -> None:
-    page, _ = page_of(result, made_up(), images=False)
+def test_without_images_there_is_none_and_it_is_said(shown: ShownResult) -> None:
+    page, _ = page_of(shown, made_up(), images=False)
     assert base64.b64encode(PICTURE).decode() not in page
     assert page.count("The page was made without images.") == 2
     assert "farthest off" in page
@@ -103,26 +95,23 @@ def test_pictures_come_through_the_file(tmp_path: Path) -> None:
     assert read == made_up()
 
 
-def test_without_evidence_or_corners_it_is_said(result: bytes) -> None:
-    _, section = page_of(result, None)
+def test_without_evidence_or_corners_it_is_said(shown: ShownResult) -> None:
+    _, section = page_of(shown, None)
     assert section.missing
     few = made_up().model_copy(
         update={"span_s": None, "cameras": (), "worst": (), "sheet": None, "no_pictures": "there were none."}
     )
-    page, section = page_of(result, few)
+    page, section = page_of(shown, few)
     assert not section.missing
     assert "have no corners" in page
     assert "Not shown: the contact sheet. Why: there were none." in page
     assert "in which it was given" in page
 
 
-def test_a_problem_without_images_has_its_measurements_in_the_figure(result: bytes) -> None:
-    problem = rig(1, 1).problem
-    calibration = rw.calibrate(problem)
-    seen = rw.results.evidence_of(problem, calibration).seen
-    assert seen is not None
-    page, _ = page_of(result, seen)
-    assert "20" in page
+def test_a_problem_without_images_has_its_measurements_in_the_figure(shown: ShownResult) -> None:
+    assert shown.evidence is not None
+    page, _ = page_of(shown, shown.evidence.seen)
+    assert "80" in page
     assert "none was removed" in page
     assert 'id="figure-detections"' in page
 

@@ -21,7 +21,7 @@ from gtsam_rwhec.report.report_page import read_shown
 from gtsam_rwhec.report.scene_model import scene_of_rig
 from gtsam_rwhec.report.scene_section import scene_section
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.scene_evidence import drawn_board, rim_of, scene_of, standing_carrier
+from gtsam_rwhec.results.scene_evidence import SceneEvidence, drawn_board, rim_of, scene_of, standing_carrier
 from gtsam_rwhec.simulate import Motion
 
 CAMERA = Camera.of(640, 480, "radtan", [[500, 0, 320], [0, 510, 235], [0, 0, 1]], [-0.2, 0.05, 0, 0], "CAMERA")
@@ -29,18 +29,22 @@ FISHEYE = Camera.of(640, 480, "equidistant", [[280, 0, 320], [0, 280, 240], [0, 
 TAG = Tag("tag_0", "tag36h11", 3, 0.1)
 
 
-@pytest.fixture(scope="module")
-def shown() -> ShownResult:
+@pytest.fixture
+def shown(folder: Path, calibration: rw.Calibration) -> ShownResult:
     """A calibration of two cameras and two targets, one of them a tag, the other a board."""
-    problem = rig().problem
-    calibration = rw.calibrate(problem)
     board = Checkerboard("tag_1", 7, 5, 0.03)
     targets: dict[str, Any] = dict(zip(calibration.X, (TAG, board), strict=True))
     cameras = dict(zip(calibration.Y, (CAMERA, FISHEYE), strict=True))
-    rows = rw.results.measured_rows(problem, calibration)
+    rows = rw.results.measured_rows(rig().problem, calibration)
     scene = scene_of(calibration, rows, ("hand", "base"), cameras, targets)
-    evidence = rw.results.evidence_of(problem, calibration).model_copy(update={"scene": scene})
-    return ShownResult.of(rw.results.result_file.result_json(calibration), evidence)
+    evidence = rw.results.read_evidence(folder / "evidence.json").model_copy(update={"scene": scene})
+    return ShownResult.of((folder / "result.json").read_bytes(), evidence)
+
+
+def scene_evidence(shown: ShownResult) -> SceneEvidence:
+    assert shown.evidence is not None
+    assert shown.evidence.scene is not None
+    return shown.evidence.scene
 
 
 def drawing(section: Section) -> Drawing:
@@ -59,9 +63,7 @@ def places(trace: dict[str, Any]) -> np.ndarray:
 
 def test_frames_stand_where_the_json_has_them(shown: ShownResult) -> None:
     block = drawing(scene_section(shown))
-    assert shown.evidence is not None
-    assert shown.evidence.scene is not None
-    scene = shown.evidence.scene
+    scene = scene_evidence(shown)
     assert scene.standing == "targets"
     (targets,) = traces(block, "targets")
     assert np.abs(places(targets) - [row["translation_m"] for row in shown.tree["targets"]]).max() < 1e-9
@@ -83,9 +85,7 @@ def test_frames_stand_where_the_json_has_them(shown: ShownResult) -> None:
 
 
 def test_the_typical_pose_is_one_that_was_measured_and_the_path_has_all(shown: ShownResult) -> None:
-    assert shown.evidence is not None
-    assert shown.evidence.scene is not None
-    scene = shown.evidence.scene
+    scene = scene_evidence(shown)
     problem = rig().problem
     every = problem.measurements(*problem.pairs[0]).A  # of all pairs, which are seen at the same instants
     inverse = se3.inverse(every)[:, :3, 3]
@@ -95,12 +95,10 @@ def test_the_typical_pose_is_one_that_was_measured_and_the_path_has_all(shown: S
 
 
 def test_ellipsoids_have_the_axes_of_the_covariances(shown: ShownResult) -> None:
-    assert shown.evidence is not None
-    assert shown.evidence.scene is not None
     assert shown.result is not None
     refined = shown.result.refined
     assert refined is not None
-    scene = scene_of_rig(shown, shown.evidence.scene)
+    scene = scene_of_rig(shown, scene_evidence(shown))
     block = drawing(scene_section(shown))
     (mesh,) = (dict(trace) for trace in block.traces if trace["meta"] == "ellipsoids")
     assert mesh["name"].endswith(f"×{scene.times:,.0f}")

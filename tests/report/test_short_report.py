@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refinement_problems import rig
 from rich.console import Console
 from rich.text import Text
 
@@ -22,12 +21,6 @@ from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport, line
 from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, POSE_HEADINGS
 
 WIDTHS = (80, 120)
-
-
-@pytest.fixture(scope="module")
-def calibration() -> rw.Calibration:
-    """A calibration with nothing to say against it."""
-    return rw.calibrate(rig().problem)
 
 
 def console(stream: io.StringIO, width: int, *, terminal: bool = True) -> Console:

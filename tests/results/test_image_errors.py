@@ -1,26 +1,99 @@
-"""Errors of corners: those that stay in the refinement are those of its optimum."""
+"""Corners in cameras: the share of the image that has them, how far off they are, and the worst images."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from problems_of_corners import problem_of
 from refined_corners import two_cameras
 
+import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.corner_residuals import pixel_errors
 from gtsam_rwhec.fitting.reprojection_record import BoardShape, Reprojection
-from gtsam_rwhec.results.image_errors import CornerErrors, SeenView, board_of, errors_at_optimum
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.detection_evidence import seen_in_problem
+from gtsam_rwhec.results.evidence import evidence_json
+from gtsam_rwhec.results.image_errors import (
+    CornerErrors,
+    SeenView,
+    board_of,
+    cells_with_corners,
+    errors_at_optimum,
+    rated_views,
+    seen_cameras,
+    worst_views,
+)
+
+OFF_PX = 3.0
 
 
 def views_of(sensor: str) -> list[SeenView]:
+    """All images of a camera; number 7 was left out of the answer."""
     given, _, refined = two_cameras()
     view = given.observations.views["board", sensor]
     corners = board_of(refined, "board", given.observations.corners["board"])
-    inverse = np.linalg.inv(refined.Y[sensor].matrix())
-    X = refined.X["board"].matrix()
-    seen = enumerate(zip(view.A, view.pixels, strict=True))
-    return [SeenView.of(pixels, corners, inverse @ A, X, i) for i, (A, pixels) in seen]
+    inverse, X = np.linalg.inv(refined.Y[sensor].matrix()), refined.X["board"].matrix()
+    return [
+        SeenView.of(pixels, corners, inverse @ A, X, i, "board", is_used=i != 7)
+        for i, (A, pixels) in enumerate(zip(view.A, view.pixels, strict=True))
+    ]
+
+
+def test_cells_with_corners() -> None:
+    pixels = np.array([[0.0, 0.0], [799.0, 599.0], [799.0, 599.0], [np.nan, 2.0], [-3.0, 300.0]])
+    cells = cells_with_corners(pixels, (800, 600))
+    assert cells.shape == (6, 8)
+    assert (cells[0, 0], cells[5, 7], cells[3, 0], cells.sum()) == (1, 2, 1, 4)
+    assert cells_with_corners(pixels, (600, 800)).shape == (8, 6)
+
+
+def test_the_worst_images_are_those_that_are_far_off() -> None:
+    _, _, refined = two_cameras()
+    found = refined.reprojection
+    assert found is not None
+    cameras = {name: one.camera for name, one in refined.intrinsics.items()}
+    views = views_of("cam_0")
+    off = OFF_PX * np.where(np.arange(len(views[5].pixels))[:, None] % 2, 1.0, -1.0)
+    views[5] = views[5]._replace(pixels=views[5].pixels + off)
+    rated = rated_views({"cam_0": views}, cameras, found, lambda target, sensor: found.corner_px)
+    worst = worst_views(rated, most=3)
+    assert worst[0].view.stamp_ns == 5
+    assert worst[0].rms_px == pytest.approx(OFF_PX, rel=0.2)
+    assert worst[0].times_noise == pytest.approx(worst[0].rms_px / found.corner_px)
+    assert [one.view.stamp_ns for one in worst if not one.view.is_used] == [7]
+    (camera,) = seen_cameras(rated, cameras, found)
+    assert camera.images == len(rated) - 1
+    assert camera.at_optimum
+    assert camera.corners == sum(map(sum, camera.cells))
+    assert camera.share == np.mean(np.array(camera.cells) > 0)
+    kept = np.column_stack([camera.x, camera.y])
+    shown = np.concatenate([one.view.pixels for one in rated if one.view.is_used])
+    assert np.abs(kept[:, None] - shown).max(axis=2).min(axis=1).max() < 0.006
+
+
+def test_a_problem_with_corners_tells_where_they_are() -> None:
+    given, _, refined = two_cameras()
+    problem = problem_of(given.observations, scale="per_target")
+    rows = {}
+    for pair in problem.pairs:
+        raw = problem.measurements(*pair)
+        rows[pair] = rw.results.MeasuredRows(raw.A, raw.B, None, None, ("", "far off", *[""] * (len(raw.A) - 2)))
+    seen = seen_in_problem(problem, refined, rows)
+    assert [camera.sensor for camera in seen.cameras] == ["cam_0", "cam_1"]
+    assert refined.reprojection is not None
+    for camera in seen.cameras:
+        assert camera.images == len(rows[Pair("board", camera.sensor)].reasons) - 1
+        assert camera.rms_px == pytest.approx(refined.reprojection.sensors[camera.sensor].rms_px, rel=0.1)
+    assert (seen.used, seen.removed) == (sum(camera.images for camera in seen.cameras), 2)
+    assert {one.is_used for one in seen.worst} == {True, False}
+    assert seen.worst[0].picture is None
+    assert seen.no_pictures
+    read = json.loads(evidence_json(rw.results.Evidence(seen=seen)))["seen"]
+    assert read["cameras"][0]["corners"] == seen.cameras[0].corners
 
 
 def at_optimum(camera: Camera, view: SeenView, found: Reprojection) -> CornerErrors:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from refinement_problems import copied, refined
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
@@ -20,23 +20,16 @@ from gtsam_rwhec.simulate import Motion, Noise, general
 NOISE = Noise(sigma_m=0.005, kappa=0.5 / np.radians(0.5) ** 2)
 
 
-def refined_of(problem: rw.Problem, **options: Any) -> rw.Refined:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
-        return rw.refine(problem, rw.solve(problem), rw.RefineOptions(**options))
-
-
 def with_outliers() -> rw.Problem:
     """A quarter of one pair's measurements wrong; a shared scale."""
-    clean = general(2, 2, seed=5, noise=NOISE, scale="shared", number_of_measurements=30).problem
-    problem = rw.Problem(scale="shared")
-    for pair in clean.pairs:
-        raw = clean.measurements(*pair)
+
+    def wrong(pair: rw.Pair, raw: rw.Measurements) -> np.ndarray:
         B = raw.B.copy()
         if pair == ("target1", "sensor0"):
             B[::4] = B[::4] @ gtsam.Pose3.Expmap(np.full(6, 0.8)).matrix()
-        problem.add(*pair, raw.A, B, NOISE.sigma_m, NOISE.kappa)
-    return problem
+        return B
+
+    return copied(general(2, 2, seed=5, noise=NOISE, scale="shared", number_of_measurements=30).problem, B=wrong)
 
 
 def fixed() -> rw.Problem:
@@ -46,82 +39,72 @@ def fixed() -> rw.Problem:
 
 
 KINDS: dict[str, Callable[[], rw.Refined]] = {
-    "known scale": lambda: refined_of(general(2, 2, seed=5, noise=NOISE).problem),
-    "scales of targets": lambda: refined_of(
+    "known scale": lambda: refined(general(2, 2, seed=5, noise=NOISE).problem),
+    "scales of targets": lambda: refined(
         general(3, 2, seed=5, noise=NOISE, scale="per_target", known_sizes=["target0"]).problem, noise="estimate"
     ),
-    "outliers": lambda: refined_of(with_outliers(), noise="estimate", robust="gnc"),
-    "something free": lambda: refined_of(general(2, 2, seed=5, noise=NOISE, motion=Motion("planar")).problem),
-    "fixed frame": lambda: refined_of(fixed()),
-    "time offsets": lambda: refined_of(
+    "outliers": lambda: refined(with_outliers(), noise="estimate", robust="gnc"),
+    "something free": lambda: refined(general(2, 2, seed=5, noise=NOISE, motion=Motion("planar")).problem),
+    "fixed frame": lambda: refined(fixed()),
+    "time offsets": lambda: refined(
         general(1, 2, seed=5, noise=NOISE, motion=Motion(wobble_m=0.1)).problem, time_offsets=True
     ),
-    "motions": lambda: refined_of(general(0, 2, seed=5, odometry=20, odometry_noise=NOISE).problem),
+    "motions": lambda: refined(general(0, 2, seed=5, odometry=20, odometry_noise=NOISE).problem),
 }
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
-    refined = KINDS[kind]()
-    rw.write_refined(refined, tmp_path / "refined.json")
+    answer = KINDS[kind]()
+    rw.write_refined(answer, tmp_path / "refined.json")
     back = rw.read_refined(tmp_path / "refined.json")
-    for poses, others in ((refined.X, back.X), (refined.Y, back.Y)):
+    for poses, others in ((answer.X, back.X), (answer.Y, back.Y)):
         assert list(poses) == list(others)
         for name, pose in poses.items():
             np.testing.assert_array_equal(others[name].matrix(), pose.matrix())
-            np.testing.assert_allclose(back.covariance(name), refined.covariance(name), rtol=1e-12)
-    np.testing.assert_allclose(back.covariance(), refined.covariance(), rtol=1e-9, atol=1e-20)
-    np.testing.assert_array_equal(back.joint.finite, refined.joint.finite)
-    np.testing.assert_array_equal(back.joint.free, refined.joint.free)
-    for name in [
-        "scale",
-        "scale_mode",
-        "time_offsets_s",
-        "noise_source",
-        "noise",
-        "cost",
-        "initial_cost",
-        "iterations",
-        "inlier_counts",
-        "free_directions",
-        "names",
-        "degrees_of_freedom",
-    ]:
-        assert getattr(back, name) == getattr(refined, name), name
-    assert back.moved == movements(refined.solution, back.X, back.Y)  # from the certified poses in the file
-    if len(refined.Y) > 1:
+            np.testing.assert_allclose(back.covariance(name), answer.covariance(name), rtol=1e-12)
+    np.testing.assert_allclose(back.covariance(), answer.covariance(), rtol=1e-9, atol=1e-20)
+    np.testing.assert_array_equal(back.joint.finite, answer.joint.finite)
+    np.testing.assert_array_equal(back.joint.free, answer.joint.free)
+    for name in (
+        *("scale", "scale_mode", "time_offsets_s", "noise_source", "noise", "cost", "initial_cost", "iterations"),
+        *("inlier_counts", "free_directions", "names", "degrees_of_freedom"),
+    ):
+        assert getattr(back, name) == getattr(answer, name), name
+    assert back.moved == movements(answer.solution, back.X, back.Y)  # from the certified poses in the file
+    if len(answer.Y) > 1:
         pose, covariance = back.relative("sensor0", "sensor1")
-        assert pose.equals(refined.relative("sensor0", "sensor1")[0], 1e-15)
-        np.testing.assert_allclose(covariance, refined.relative("sensor0", "sensor1")[1], rtol=1e-9, atol=1e-20)
-    assert back.contains("sensor0", refined.Y["sensor0"])
+        assert pose.equals(answer.relative("sensor0", "sensor1")[0], 1e-15)
+        np.testing.assert_allclose(covariance, answer.relative("sensor0", "sensor1")[1], rtol=1e-9, atol=1e-20)
+    assert back.contains("sensor0", answer.Y["sensor0"])
 
 
 def test_the_certified_solution_is_in_the_same_file(tmp_path: Path) -> None:
-    refined = KINDS["outliers"]()
-    rw.write_refined(refined, tmp_path / "refined.json")
-    rw.write_solution(refined.solution, tmp_path / "solution.json")
+    answer = KINDS["outliers"]()
+    rw.write_refined(answer, tmp_path / "refined.json")
+    rw.write_solution(answer.solution, tmp_path / "solution.json")
     back = rw.read_solution(tmp_path / "refined.json")
     rw.write_solution(back, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "solution.json").read_bytes()
     raw = json.loads((tmp_path / "refined.json").read_bytes())
-    assert [pose["child"] for pose in raw["certified"]["sensors"]] == list(refined.solution.Y)
+    assert [pose["child"] for pose in raw["certified"]["sensors"]] == list(answer.solution.Y)
     assert raw["sensors"] != raw["certified"]["sensors"]  # at the top are the poses to use, the refined ones
     assert not {"sensors", "targets"} & raw["refined"].keys()
-    assert refined.inlier_counts["target1", "sensor0"] == (22, 30)
+    assert answer.inlier_counts["target1", "sensor0"] == (22, 30)
 
 
 def test_infinite_is_null(tmp_path: Path) -> None:
-    refined = KINDS["something free"]()
-    rw.write_refined(refined, tmp_path / "refined.json")
+    answer = KINDS["something free"]()
+    rw.write_refined(answer, tmp_path / "refined.json")
     text = (tmp_path / "refined.json").read_text(encoding="utf-8")
     assert "Infinity" not in text
     assert "NaN" not in text
     for name, frame in json.loads(text)["refined"]["frames"].items():
-        degrees, millimetres = refined.standard_deviations(name)
+        degrees, millimetres = answer.standard_deviations(name)
         for written, known in (
             (frame["standard_deviations_deg"], degrees),
             (frame["standard_deviations_mm"], millimetres),
-            (np.array(frame["covariance"], dtype=object).ravel(), refined.covariance(name).ravel()),
+            (np.array(frame["covariance"], dtype=object).ravel(), answer.covariance(name).ravel()),
         ):
             assert [value is None for value in written] == np.isinf(known).tolist()
         assert None in frame["standard_deviations_mm"]
@@ -140,8 +123,6 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
         (lambda raw: raw["refined"]["joint"]["finite"][3].pop(), "$.refined.joint.finite: rows of different lengths"),
         (lambda raw: raw["refined"]["joint"]["unit"].__setitem__(3, 0.0), "$.refined.joint.unit[3]"),
         (lambda raw: raw["refined"]["joint"]["free"].pop(), "slots have 24 rows"),
-        (lambda raw: raw["refined"]["joint"]["slots"].update(moon=[0, 6]), "have no value: moon"),
-        (lambda raw: raw["refined"]["frames"].popitem(), "$.refined.frames: must have"),
         (lambda raw: raw["sensors"][0].pop("translation_m"), "$.sensors[0].translation_m"),
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
         (lambda raw: raw["refined"]["noise"][1].update(degrees_of_freedom=[1.0]), "degrees_of_freedom"),
@@ -182,8 +163,3 @@ def test_a_missing_offset_is_refused(tmp_path: Path) -> None:
         raw["refined"]["joint"]["slots"].pop("time_offset:sensor1")
 
     assert_refused("time offsets", damage, "that have no rows: time_offset:sensor1", tmp_path / "refined.json")
-
-
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="cannot be written"):
-        rw.write_refined(KINDS["known scale"](), tmp_path / "nowhere" / "refined.json")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refinement_problems import copied
 from rwhec_factors.se3 import expmap
 from two_logs import X, Y, calibrated, log_of
 
@@ -82,14 +83,8 @@ def test_what_the_new_log_leaves_free_is_not_tested(old: rw.Calibration) -> None
 
 
 def test_gross_errors_do_not_count(old: rw.Calibration) -> None:
-    log = log_of(1)
-    problem = rw.Problem()
     wrong = expmap(np.random.default_rng(0).normal(0.0, 0.3, (3, 6)))
-    for pair in log.pairs:
-        one = log.measurements(*pair)
-        B = one.B.copy()
-        B[:3] = B[:3] @ wrong
-        problem.add(*pair, one.A, B, one.sigma, one.kappa, stamps_ns=one.stamps_ns)
+    problem = copied(log_of(1), B=lambda pair, one: np.concatenate([one.B[:3] @ wrong, one.B[3:]]))
     assert old.refined is not None
     for mask in without_gross_errors(old.refined, problem).values():
         assert not mask[:3].any()
@@ -102,10 +97,7 @@ def test_gross_errors_do_not_count(old: rw.Calibration) -> None:
 def test_a_camera_that_was_turned_round_is_named(old: rw.Calibration) -> None:
     """So far off that from the old poses on its residuals look as if nothing were determined."""
     round_about = expmap(np.array([[2.5, 0.0, 0.0, 0.0, 3.0, 0.0]]))[0]
-    log, turned = log_of(1), rw.Problem()
-    for pair in log.pairs:
-        one = log.measurements(*pair)
-        turned.add(*pair, one.A, round_about @ one.B if pair.sensor == "left" else one.B, stamps_ns=one.stamps_ns)
+    turned = copied(log_of(1), B=lambda pair, one: round_about @ one.B if pair.sensor == "left" else one.B)
     found = verified(old, turned)
     assert found.test is not None
     assert found.test.changed == ("left",)

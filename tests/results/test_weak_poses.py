@@ -10,7 +10,7 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.report.determined_section import determines_section
-from gtsam_rwhec.report.report_blocks import Listing
+from gtsam_rwhec.report.report_blocks import Listing, plain_text
 from gtsam_rwhec.report.report_page import read_shown
 from gtsam_rwhec.results.linear_model import measured_rows
 from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WeakDirection, weak_directions
@@ -73,7 +73,7 @@ def test_the_report_says_the_weak_direction_and_the_turn(tmp_path: Path) -> None
     rw.write_calibration(calibration, tmp_path / "result.json")
     rw.results.write_evidence(rw.results.evidence_of(of, calibration), tmp_path / "evidence.json")
     said = [
-        "".join(piece if isinstance(piece, str) else piece.text for piece in item)
+        plain_text(item)
         for block in determines_section(read_shown(tmp_path)).blocks
         if isinstance(block, Listing)
         for item in block.items
