@@ -41,8 +41,6 @@ STACKED_BYTES = 1 << 16
 MOST_SHAPES = 64
 #: To compare this many bytes of messages takes as long as to walk over one part.
 BYTES_FOR_A_PART = 1 << 11
-#: Up to this many pieces of the messages are compared one by one, and more of them together.
-FEW_PIECES = 32
 
 
 @dataclass(frozen=True)
@@ -72,19 +70,8 @@ class Shape:
 
     def same_as_first(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which of the messages (N, length) have the first one's strings and counts; (N,)."""
-        pieces: list[list[int]] = []
-        for start, end in self.fixed:
-            if pieces and pieces[-1][1] == start:
-                pieces[-1][1] = end
-            else:
-                pieces.append([start, end])
-        if len(pieces) > FEW_PIECES:
-            columns = np.concatenate([np.arange(start, end) for start, end in pieces])
-            return np.asarray((rows[:, columns] == rows[0, columns]).all(axis=1))
-        same = np.ones(len(rows), dtype=bool)
-        for start, end in pieces:
-            same &= (rows[:, start:end] == rows[0, start:end]).all(axis=1)
-        return same
+        columns = np.concatenate([np.arange(start, end) for start, end in self.fixed])
+        return np.asarray((rows[:, columns] == rows[0, columns]).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -126,17 +113,13 @@ def find(tree: Any, path: str) -> Any:
     return tree
 
 
-def _take_nothing(count: int) -> None:
-    """What parts cost where nobody counts them."""
-
-
 class MessageType:
     """A ROS 2 message type, made from the log's definition. An unreadable or incomplete one raises a MessageError.
 
     `take` is told how many parts were read, and raises an error when they are too many.
     """
 
-    def __init__(self, name: str, text: str, take: Callable[[int], None] = _take_nothing) -> None:
+    def __init__(self, name: str, text: str, take: Callable[[int], None] = lambda count: None) -> None:
         self._root = _short(name)
         self._take = take
         self._fields = {
