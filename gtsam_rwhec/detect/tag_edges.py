@@ -229,7 +229,8 @@ def refine_corners(
     """
     if len(corners_px) == 0:
         return RefinedCorners(corners_px.copy(), np.zeros(0))
-    stack, corners, blur = np.stack(images), corners_px, np.zeros(0)
+    stack, corners = np.stack(images), corners_px
+    blur: Array = np.zeros(0)
     for _ in range(ROUNDS):
         corners, blur = _by_areas(stack, image_of, corners, camera, modules)
     state = _Edges(corners, np.repeat(np.clip(np.nan_to_num(blur, nan=1.0), 0.5, 3.0)[:, None], 4, axis=1), None)
