@@ -70,14 +70,22 @@ def fitted_to_planes(
     try:
         start = cv2.initCameraMatrix2D(points, pixels, size) if K is None else np.array(K, dtype=np.float64)
         with one_opencv_thread():
-            rms, found, D, turns, t = cv2.calibrateCamera(
-                points, pixels, size, start, np.zeros(5), flags=fixed[distortion] | cv2.CALIB_USE_INTRINSIC_GUESS
+            return _planes_fitted(
+                *cv2.calibrateCamera(
+                    points, pixels, size, start, np.zeros(5), flags=fixed[distortion] | cv2.CALIB_USE_INTRINSIC_GUESS
+                )
             )
     except cv2.error:
         return None
+
+
+def _planes_fitted(rms: float, K: Array, D: Array, turns: Sequence[Array], t: Sequence[Array]) -> PlanesFitted:
+    with extra_named():
+        import cv2
+
     R = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
     T = se3.pose(R, np.reshape(t, (len(R), 3)))
-    return PlanesFitted(float(rms), np.asarray(found, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4], T)
+    return PlanesFitted(float(rms), np.asarray(K, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4], T)
 
 
 def fisheye_fitted_to_planes(
@@ -98,12 +106,11 @@ def fisheye_fitted_to_planes(
         start = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
         try:
             with one_opencv_thread():
-                rms, K, D, turns, t = cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags)
+                return _planes_fitted(
+                    *cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags)
+                )
         except cv2.error:  # the start sees a corner behind it, or the views do not say f
             continue
-        R = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
-        T = se3.pose(R, np.reshape(t, (len(R), 3)))
-        return PlanesFitted(float(rms), np.asarray(K, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4], T)
     return None
 
 
