@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from rwhec_factors import se3
@@ -79,7 +79,7 @@ def fitted_to_planes(
         return None
 
 
-def _planes_fitted(rms: float, K: Array, D: Array, turns: Sequence[Array], t: Sequence[Array]) -> PlanesFitted:
+def _planes_fitted(rms: float, K: Any, D: Any, turns: Sequence[Any], t: Any) -> PlanesFitted:
     with extra_named():
         import cv2
 

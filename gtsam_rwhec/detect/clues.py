@@ -70,7 +70,8 @@ def _edges(gray: Gray, by_px: tuple[float, float]) -> tuple[Array, Array, Array]
         [cv2.Sobel(values, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
         for values in (smooth, cv2.GaussianBlur(smooth, (0, 0), by_px[1]))
     )
-    first, second = np.asarray(cv2.magnitude(x, y)), np.asarray(cv2.magnitude(x_again, y_again))
+    first = np.asarray(cv2.magnitude(x, y), dtype=np.float32)
+    second = np.asarray(cv2.magnitude(x_again, y_again), dtype=np.float32)
     peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
     return first[peak], first[peak] / np.maximum(second[peak], 1e-6), np.arctan2(y[peak], x[peak]) % np.pi
 
