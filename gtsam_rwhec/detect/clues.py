@@ -90,16 +90,6 @@ def _blur_px(ratios: Array, by_px: tuple[float, float]) -> float:
     return float(np.sqrt(max(by_px[1] ** 2 / (ratio**2 - 1.0) - by_px[0] ** 2, 0.0)))
 
 
-def saturated_share(gray: Gray) -> float:
-    """The share of the pixels that are saturated."""
-    return float((gray >= SATURATED).mean())
-
-
-def brightest_value(gray: Gray) -> float:
-    """The gray value that 99.7 % of the pixels are below."""
-    return float(np.percentile(gray[::2, ::2], BRIGHTEST))
-
-
 def brightened(gray: Gray) -> Gray:
     """The image with its gray values stretched from black to white, after a little blur against its noise."""
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
@@ -204,7 +194,7 @@ def _too_small(gray: Gray, target: Target, camera: Camera, options: DetectionOpt
 
 
 def _too_dark(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
-    value = brightest_value(gray)
+    value = float(np.percentile(gray[::2, ::2], BRIGHTEST))
     if value < TOO_DARK and read(brightened(gray), camera, target, options) is not None:
         yield Clue(About.DARK, figure=value)
 
@@ -229,8 +219,9 @@ def _no_margin(gray: Gray, target: Target, *_: object) -> Iterator[Clue]:
 
 
 def _too_bright(gray: Gray, *_: object) -> Iterator[Clue]:
-    if saturated_share(gray) >= TOO_BRIGHT:
-        yield Clue(About.BRIGHT, figure=saturated_share(gray))
+    saturated_share = float((gray >= SATURATED).mean())
+    if saturated_share >= TOO_BRIGHT:
+        yield Clue(About.BRIGHT, figure=saturated_share)
 
 
 def read(gray: Gray, camera: Camera, target: Target, options: DetectionOptions) -> Detection | None:
