@@ -83,7 +83,7 @@ MESSAGES: dict[str, tuple[Callable[[], bytes], str]] = {
         "a list of 5242880 string; at most 100000",
     ),
     "string[] that lies": (
-        lambda: cdr(POSE_STAMPED, struct.pack("<I", 2**32 - 1), odd("string[] s")), "a list of 4294967295 string; at most",
+        lambda: cdr(POSE_STAMPED, struct.pack("<I", 2**32 - 1), odd("string[] s")), "a list of 4294967295 string; at",
     ),
     "string of 4 GB": (lambda: cdr(POSE_STAMPED, b"\xff" * 4, odd("string s")), "ends after 8 bytes"),
     "empty messages": (
