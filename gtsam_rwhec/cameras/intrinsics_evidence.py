@@ -17,6 +17,7 @@ from rwhec_factors import se3
 from scipy.special import fdtrc
 
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.target_poses import stacked
 from gtsam_rwhec.cameras.unknown_intrinsics import fitted_to_planes, linearised, poses_eliminated
 from gtsam_rwhec.geometry.poses import Array
 
@@ -102,12 +103,7 @@ def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsE
     views = [views[i] for i in different([view.T for view in views])]
     if len(views) < LEAST_VIEWS:
         return None
-    most = max(len(view.corners_px) for view in views)
-    p, u = np.zeros((len(views), most, 3)), np.zeros((len(views), most, 2))
-    known = np.zeros((len(views), most), dtype=bool)
-    for i, view in enumerate(views):
-        n = len(view.corners_px)
-        p[i, :n], u[i, :n], known[i, :n] = view.corners_m, view.corners_px, True
+    p, u, known = stacked([view.corners_m for view in views], [view.corners_px for view in views])
     T = np.array([view.T for view in views])
     stated = _fitted(camera, T, p, u, known, free=0.0)
     if stated is None:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from gtsam_rwhec.cameras.camera import MODELS, Camera
+from gtsam_rwhec.cameras.camera import MODELS, NAMES, Camera
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_storage, read_text, read_yaml, shown
 from gtsam_rwhec.geometry.poses import Array
@@ -349,8 +349,6 @@ _MODELS = {
     "FULL_OPENCV": ("radtan", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
     "OPENCV_FISHEYE": ("equidistant", "fx fy cx cy k1 k2 k3 k4"),
 }
-#: OpenCV's order of the coefficients.
-_ORDER = {"pinhole": "", "radtan": "k1 k2 p1 p2 k3 k4 k5 k6", "equidistant": "k1 k2 k3 k4"}
 #: COLMAP has the middle of the upper left pixel at (0.5, 0.5), `Camera` at (0, 0).
 PIXEL_CENTRE = 0.5
 _LINE = re.compile(r"\d+[\s,]+[A-Z][A-Z_]+[\s,]+\d+[\s,]+\d+[\s,]")
@@ -413,5 +411,5 @@ def _camera(fields: list[str], where: str) -> Camera:
     of = dict(zip(names.split(), numbers, strict=True))
     fx, fy = of.get("fx", of.get("f", 0.0)), of.get("fy", of.get("f", 0.0))
     K = [[fx, 0.0, of["cx"] - PIXEL_CENTRE], [0.0, fy, of["cy"] - PIXEL_CENTRE], [0.0, 0.0, 1.0]]
-    D = [of.get(name, 0.0) for name in _ORDER[model].split()]
+    D = [of.get(name, 0.0) for name in NAMES.get(model, "").split()]
     return Camera.of(int(fields[2]), int(fields[3]), model, K, D, where)

@@ -54,13 +54,9 @@ def plane_poses(
     corner_px : float
         Standard deviation of a corner along each axis, pixels.
     """
-    N, most = len(corners_m), max((len(points) for points in corners_m), default=0)
-    p, u, known = np.zeros((N, most, 3)), np.zeros((N, most, 2)), np.zeros((N, most), dtype=bool)
-    for i, (points, pixels) in enumerate(zip(corners_m, corners_px, strict=True)):
-        n = len(points)
-        p[i, :n], u[i, :n], known[i, :n] = points, pixels, True
+    p, u, known = stacked(corners_m, corners_px)
     x = camera.undistort(np.where(known[..., None], u, camera.K[:2, 2]))
-    start = np.array([_starts(p[i, k], x[i, k]) for i, k in enumerate(known)]).reshape(N, 2, 4, 4)
+    start = np.array([_starts(p[i, k], x[i, k]) for i, k in enumerate(known)]).reshape(-1, 2, 4, 4)
     T, squared, covariance, errors = _refined(camera, start, p, u, known, corner_px)
     order = np.argsort(np.where(np.isfinite(squared), squared, np.inf), axis=1)
     T, covariance = (np.take_along_axis(x, order[:, :, None, None], axis=1) for x in (T, covariance))
@@ -69,6 +65,16 @@ def plane_poses(
     errors[~known] = np.nan
     count = np.maximum(known.sum(axis=1), 1)[:, None]
     return PlanePoses(T, squared, np.sqrt(squared / count), covariance, errors)
+
+
+def stacked(corners_m: Sequence[Array], corners_px: Sequence[Array]) -> tuple[Array, Array, np.ndarray]:
+    """Corners (N, n, 3), pixels (N, n, 2), and which of them there are (N, n), of N views with up to n corners each."""
+    N, most = len(corners_m), max((len(points) for points in corners_m), default=0)
+    p, u, known = np.zeros((N, most, 3)), np.zeros((N, most, 2)), np.zeros((N, most), dtype=bool)
+    for i, (points, pixels) in enumerate(zip(corners_m, corners_px, strict=True)):
+        n = len(points)
+        p[i, :n], u[i, :n], known[i, :n] = points, pixels, True
+    return p, u, known
 
 
 def _starts(points: Array, x: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import to_rotations
 
 #: Each family has this number of tags.
 FAMILIES: dict[str, int] = {
@@ -121,13 +122,8 @@ class BundleTag:
 
     def corners(self) -> Array:
         """(4, 3), metres, in the bundle's frame."""
-        q = np.array(self.wxyz) / np.linalg.norm(self.wxyz)
-        v = q[1:]
-        points = square(self.size_m)
-        # p + 2 w (v x p) + 2 v x (v x p)
-        cross = np.cross(v, points)
-        turned: Array = points + 2.0 * q[0] * cross + 2.0 * np.cross(v, cross) + np.array(self.t_m)
-        return turned
+        R = to_rotations(np.array([*self.wxyz[1:], self.wxyz[0]]))
+        return np.asarray(square(self.size_m) @ R.T + np.array(self.t_m))
 
 
 @dataclass(frozen=True)

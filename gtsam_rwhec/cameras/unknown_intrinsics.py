@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
+from gtsam_rwhec.cameras.target_poses import stacked
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.geometry.poses import Array
@@ -69,14 +70,22 @@ def fitted_to_planes(
     try:
         start = cv2.initCameraMatrix2D(points, pixels, size) if K is None else np.array(K, dtype=np.float64)
         with one_opencv_thread():
-            rms, found, D, turns, t = cv2.calibrateCamera(
-                points, pixels, size, start, np.zeros(5), flags=fixed[distortion] | cv2.CALIB_USE_INTRINSIC_GUESS
+            return _planes_fitted(
+                *cv2.calibrateCamera(
+                    points, pixels, size, start, np.zeros(5), flags=fixed[distortion] | cv2.CALIB_USE_INTRINSIC_GUESS
+                )
             )
     except cv2.error:
         return None
+
+
+def _planes_fitted(rms: float, K: Any, D: Any, turns: Sequence[Any], t: Any) -> PlanesFitted:
+    with extra_named():
+        import cv2
+
     R = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
     T = se3.pose(R, np.reshape(t, (len(R), 3)))
-    return PlanesFitted(float(rms), np.asarray(found, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4], T)
+    return PlanesFitted(float(rms), np.asarray(K, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4], T)
 
 
 def fisheye_fitted_to_planes(
@@ -97,12 +106,11 @@ def fisheye_fitted_to_planes(
         start = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
         try:
             with one_opencv_thread():
-                rms, K, D, turns, t = cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags)
+                return _planes_fitted(
+                    *cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags)
+                )
         except cv2.error:  # the start sees a corner behind it, or the views do not say f
             continue
-        R = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
-        T = se3.pose(R, np.reshape(t, (len(R), 3)))
-        return PlanesFitted(float(rms), np.asarray(K, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4], T)
     return None
 
 
@@ -128,6 +136,8 @@ def _fisheye_flag(name: str) -> int:
     return int(getattr(cv2.fisheye if hasattr(cv2.fisheye, name) else cv2, name))
 
 
+#: Corners (n, 3) of flat targets, metres, and where they were seen (n, 2), pixels.
+Views: TypeAlias = Sequence[tuple[Array, Array]]
 #: The lens models that can be estimated; "any" is whichever fits.
 Lens = Literal["any", "pinhole", "radtan", "equidistant", "unified"]
 #: Views with fewer corners, and cameras with fewer views, give no intrinsics.
@@ -224,7 +234,7 @@ def estimated_intrinsics(
     return EstimatedIntrinsics(camera, sigma, rms_px, len(views), corners)
 
 
-def different_views(views: Sequence[tuple[Array, Array]], most: int = ENOUGH) -> list[tuple[Array, Array]]:
+def different_views(views: Views, most: int = ENOUGH) -> list[tuple[Array, Array]]:
     """At most ``most`` views, in their order, chosen as different from each other as possible.
 
     Views differ by the place of a board's outline in the image: many views come from a camera that stood still.
@@ -268,7 +278,7 @@ def _outline(points: Array, pixels: Array) -> Array:
     return np.asarray(cv2.perspectiveTransform(rectangle, H), dtype=float).ravel()
 
 
-def _best(views: Sequence[tuple[Array, Array]], size: tuple[int, int], lens: Lens) -> _Fit | None:
+def _best(views: Views, size: tuple[int, int], lens: Lens) -> _Fit | None:
     """The fit with the lens model that Schwarz's criterion selects."""
     corners = sum(len(p) for p, _ in views)
 
@@ -293,37 +303,30 @@ def _is_usual(fit: _Fit, corners: int) -> bool:
     return bool(reach < WIDE_DEG and fit.squares.sum() < corners * BADLY_PX**2)
 
 
-def _usual(
-    views: Sequence[tuple[Array, Array]], size: tuple[int, int], tried: Sequence[tuple[Distortion, int]]
-) -> Iterator[_Fit]:
+def _usual(views: Views, size: tuple[int, int], tried: Sequence[tuple[Distortion, int]]) -> Iterator[_Fit]:
     """Pinholes with these kinds of distortion."""
     points, pixels = [p for p, _ in views], [u for _, u in views]
     for distortion, number in tried:
         fitted = fitted_to_planes(points, pixels, size, distortion)
         if fitted is not None:
-            model = "radtan" if number else "pinhole"
-            yield from _checked(views, size, model, fitted.K, fitted.D[:number], fitted.T, 4 + number)
+            yield from _checked(views, size, "radtan" if number else "pinhole", fitted, number)
 
 
-def _fisheye(views: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> Iterator[_Fit]:
+def _fisheye(views: Views, size: tuple[int, int]) -> Iterator[_Fit]:
     """Fisheyes, with the later of the four coefficients zero or free."""
     points, pixels = [p for p, _ in views], [u for _, u in views]
     for number in FISHEYE:
         fitted = fisheye_fitted_to_planes(points, pixels, size, number)
         if fitted is not None:
-            yield from _checked(views, size, "equidistant", fitted.K, fitted.D, fitted.T, 4 + number)
+            yield from _checked(views, size, "equidistant", fitted, number)
 
 
-def _checked(
-    views: Sequence[tuple[Array, Array]],
-    size: tuple[int, int],
-    model: str,
-    K: Array,
-    D: Array,
-    T: Array,
-    parameters: int,
-) -> Iterator[_Fit]:
-    """The fit, if a camera can have these intrinsics and its lens does not fold back in the image."""
+def _checked(views: Views, size: tuple[int, int], model: str, fitted: PlanesFitted, number: int) -> Iterator[_Fit]:
+    """The fit, if a camera can have these intrinsics and its lens does not fold back in the image.
+
+    The first ``number`` coefficients were free; the others are zero, and a pinhole has none.
+    """
+    K, T, D = fitted.K, fitted.T, fitted.D if model == "equidistant" else fitted.D[:number]
     upright = [[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]]
     if not np.isfinite(T).all():
         return
@@ -337,14 +340,14 @@ def _checked(
     looked_at = np.concatenate([u for _, u in views] + [border] * (model != "equidistant"))
     if not np.isfinite(camera.undistort(looked_at)).all():
         return
-    p, u, known = _stacked(views)
+    p, u, known = stacked(*zip(*views, strict=True))
     r, _, _ = linearised(camera, T, p, u, known, 4)
     squares = np.einsum("vi,vi->v", r, r)
     if np.isfinite(squares).all():
-        yield _Fit(camera, T, squares, parameters)
+        yield _Fit(camera, T, squares, 4 + number)
 
 
-def _as_unified(camera: Camera, views: Sequence[tuple[Array, Array]]) -> Camera:
+def _as_unified(camera: Camera, views: Views) -> Camera:
     """A fisheye's curve as f (m + k1 m^3 + k2 m^5), m = tan(theta / 2), which is the unified model with xi = 1."""
     seen = camera.undistort(np.concatenate([u for _, u in views]))
     furthest = np.arctan(np.nanmax(np.linalg.norm(seen, axis=1)))
@@ -355,19 +358,9 @@ def _as_unified(camera: Camera, views: Sequence[tuple[Array, Array]]) -> Camera:
     return replace(camera, model="unified", K=K, D=np.array([1.0, *(np.array(k) / f), 0.0, 0.0]))
 
 
-def _stacked(views: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, np.ndarray]:
-    """Corners (V, n, 3), pixels (V, n, 2), and which of them are seen (V, n)."""
-    most = max(len(p) for p, _ in views)
-    points, pixels = np.zeros((len(views), most, 3)), np.zeros((len(views), most, 2))
-    known = np.zeros((len(views), most), dtype=bool)
-    for i, (p, u) in enumerate(views):
-        points[i, : len(p), : p.shape[1]], pixels[i, : len(u)], known[i, : len(p)] = p, u, True
-    return points, pixels, known
-
-
-def _sigma(fit: _Fit, views: Sequence[tuple[Array, Array]]) -> Array:
+def _sigma(fit: _Fit, views: Views) -> Array:
     """Standard deviations (4,) of fx, fy, cx and cy, with poses and coefficients free; infinite if undetermined."""
-    p, u, known = _stacked(views)
+    p, u, known = stacked(*zip(*views, strict=True))
     q = min(fit.parameters, 4 + len(fit.camera.D))
     _, J, K = linearised(fit.camera, fit.T, p, u, known, q)
     freedom = 2 * int(known.sum()) - 6 * len(views) - fit.parameters

@@ -166,21 +166,20 @@ def layout_that_fits(board: Charuco | AprilGrid | TagGrid, ids: np.ndarray, flat
 
 
 def _charucos(board: Charuco, ids: np.ndarray) -> Iterator[_Layout]:
-    tried: list[tuple[dict[str, int], str]] = [
-        ({"columns": board.rows, "rows": board.columns}, f"write squares: [{board.rows}, {board.columns}]")
-    ]
+    # columns, rows, first_id, and what to write
+    tried = [(board.rows, board.columns, board.first_id, f"write squares: [{board.rows}, {board.columns}]")]
     count = board.columns * board.rows // 2
     for first in range(board.first_id - int(ids.min()), board.first_id + count):
         if first != board.first_id and first <= ids.min() and ids.max() < first + count:
-            tried.append(({"first_id": first}, f"write first_id: {first}"))
+            tried.append((board.columns, board.rows, first, f"write first_id: {first}"))
     for columns in range(2, MOST_COLUMNS):
         needed = int(np.ceil(2 * (ids.max() - board.first_id + 1) / columns))
         rows = max(needed, board.columns * board.rows // columns, 2)
         words = f"count the squares: the markers fit {columns} columns, as in squares: [{columns}, {rows}]"
-        tried.append(({"columns": columns, "rows": rows}, words))
-    for changes, words in tried:
+        tried.append((columns, rows, board.first_id, words))
+    for columns, rows, first, words in tried:
         try:
-            candidate = replace(board, **changes)
+            candidate = replace(board, columns=columns, rows=rows, first_id=first)
         except TargetError:  # its family has too few markers
             continue
         for is_legacy in (False, True):

@@ -70,7 +70,8 @@ def _edges(gray: Gray, by_px: tuple[float, float]) -> tuple[Array, Array, Array]
         [cv2.Sobel(values, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
         for values in (smooth, cv2.GaussianBlur(smooth, (0, 0), by_px[1]))
     )
-    first, second = np.asarray(cv2.magnitude(x, y)), np.asarray(cv2.magnitude(x_again, y_again))
+    first = np.asarray(cv2.magnitude(x, y), dtype=np.float32)
+    second = np.asarray(cv2.magnitude(x_again, y_again), dtype=np.float32)
     peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
     return first[peak], first[peak] / np.maximum(second[peak], 1e-6), np.arctan2(y[peak], x[peak]) % np.pi
 
@@ -87,16 +88,6 @@ def _blur_px(ratios: Array, by_px: tuple[float, float]) -> float:
     """The blur of edges that more blur lowers so; what the gradients were first smoothed by is taken off again."""
     ratio = max(float(np.median(ratios)), 1.01)
     return float(np.sqrt(max(by_px[1] ** 2 / (ratio**2 - 1.0) - by_px[0] ** 2, 0.0)))
-
-
-def saturated_share(gray: Gray) -> float:
-    """The share of the pixels that are saturated."""
-    return float((gray >= SATURATED).mean())
-
-
-def brightest_value(gray: Gray) -> float:
-    """The gray value that 99.7 % of the pixels are below."""
-    return float(np.percentile(gray[::2, ::2], BRIGHTEST))
 
 
 def brightened(gray: Gray) -> Gray:
@@ -203,7 +194,7 @@ def _too_small(gray: Gray, target: Target, camera: Camera, options: DetectionOpt
 
 
 def _too_dark(gray: Gray, target: Target, camera: Camera, options: DetectionOptions) -> Iterator[Clue]:
-    value = brightest_value(gray)
+    value = float(np.percentile(gray[::2, ::2], BRIGHTEST))
     if value < TOO_DARK and read(brightened(gray), camera, target, options) is not None:
         yield Clue(About.DARK, figure=value)
 
@@ -228,8 +219,9 @@ def _no_margin(gray: Gray, target: Target, *_: object) -> Iterator[Clue]:
 
 
 def _too_bright(gray: Gray, *_: object) -> Iterator[Clue]:
-    if saturated_share(gray) >= TOO_BRIGHT:
-        yield Clue(About.BRIGHT, figure=saturated_share(gray))
+    saturated_share = float((gray >= SATURATED).mean())
+    if saturated_share >= TOO_BRIGHT:
+        yield Clue(About.BRIGHT, figure=saturated_share)
 
 
 def read(gray: Gray, camera: Camera, target: Target, options: DetectionOptions) -> Detection | None:

@@ -122,35 +122,22 @@ def jpeg_scans(data: bytes) -> int:
     return data.count(b"\xff\xda") if data.startswith(JPEG) else 0
 
 
-def is_whole_png(data: bytes) -> bool:
-    """Whether the chunks of a PNG, IEND among them, lie inside the file: OpenCV allocates what a chunk states."""
-    at = len(PNG)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        kind = data[at + 4 : at + 8]
-        at += 12 + length
-        if kind == b"IEND":
-            return bool(at <= len(data))
-    return False
-
-
-def with_pixels_only(data: bytes) -> bytes:
+def png_of_pixels(data: bytes) -> bytes | None:
     """A PNG without its text, profiles and further frames, which libpng would decompress at any cost.
 
     It ends with its first IEND: OpenCV reads on behind it where no pixels came before, and allocates what it finds
-    there as a length. A file that is not a PNG, or that has nothing to leave out, comes back as it is.
+    there as a length. None if a chunk, IEND among them, is not whole in the file: OpenCV allocates what a chunk states.
     """
-    if not data.startswith(PNG):
-        return data
     kept, at, kind = [data[: len(PNG)]], len(PNG), b""
-    while kind != b"IEND" and at + 8 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        end, kind = at + 12 + length, data[at + 4 : at + 8]
-        if kind in _PIXEL_CHUNKS or end > len(data):
+    while kind != b"IEND":
+        length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        end = at + 12 + length
+        if end > len(data):
+            return None
+        if kind in _PIXEL_CHUNKS:
             kept.append(data[at:end])
         at = end
-    pixels = b"".join(kept)
-    return pixels if len(pixels) < len(data) else data
+    return b"".join(kept)
 
 
 Gray = NDArray[np.uint8]
@@ -236,11 +223,12 @@ def _compressed(image: ImageRecord, where: str, wanted: Size | None, flags: int 
             f"{len(image.data)} bytes"
         )
     _check_size(where, size, wanted)
-    if image.data.startswith(PNG) and not is_whole_png(image.data):  # libpng would print a line for each
+    pixels = png_of_pixels(image.data) if image.data.startswith(PNG) else image.data
+    if pixels is None:  # libpng would print a line for each
         raise ImageError(f"{where}: {len(image.data)} bytes of a PNG file that is cut short")
     if jpeg_scans(image.data) > SCANS:
         raise ImageError(f"{where}: a JPEG of {jpeg_scans(image.data)} scans, more than the {SCANS} that are decoded")
-    buffer = np.frombuffer(with_pixels_only(image.data), dtype=np.uint8)
+    buffer = np.frombuffer(pixels, dtype=np.uint8)
     try:
         gray = cv2.imdecode(buffer, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # OpenCV 4 and 5 raise for some broken images and return None for others

@@ -179,17 +179,13 @@ def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> li
     decoded = [_decoded(image, camera) for image in batch]
     whole = [(image, gray) for image, gray in zip(batch, decoded, strict=True) if not isinstance(gray, str)]
     found = iter(_detected(detectors[topic], whole))
+    results = [gray if isinstance(gray, str) else next(found) for gray in decoded]
     return [
-        _with_result(image, gray if isinstance(gray, str) else next(found))
-        for image, gray in zip(batch, decoded, strict=True)
+        DetectedImage(image.topic, image.stamp_ns, None, result, image.logged_ns)
+        if isinstance(result, str)
+        else DetectedImage(image.topic, image.stamp_ns, result, "", image.logged_ns)
+        for image, result in zip(batch, results, strict=True)
     ]
-
-
-def _with_result(image: ImageRecord, result: ImageDetections | str) -> DetectedImage:
-    """An image with its detections or its fault."""
-    if isinstance(result, str):
-        return DetectedImage(image.topic, image.stamp_ns, None, result, logged_ns=image.logged_ns)
-    return DetectedImage(image.topic, image.stamp_ns, result, logged_ns=image.logged_ns)
 
 
 def _detected(detector: Detector, images: list[tuple[ImageRecord, Gray]]) -> list[ImageDetections | str]:

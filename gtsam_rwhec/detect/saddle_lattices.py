@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.geometry.poses import Array
@@ -115,13 +117,8 @@ def _groups(places: Array) -> list[np.ndarray]:
     apart = np.linalg.norm(places[:, None] - places, axis=2)
     third = np.sort(apart, axis=1)[:, 3]
     linked = apart <= NEAR * np.minimum(third[:, None], third)
-    group = np.arange(len(places))
-    while True:  # each takes the smallest number of its neighbours, until nothing changes
-        smallest = np.where(linked, group, len(places)).min(axis=1)
-        smallest = smallest[smallest]
-        if np.array_equal(smallest, group):
-            return [np.flatnonzero(group == number) for number in np.unique(group)]
-        group = smallest
+    count, group = connected_components(csr_array(linked), directed=False)
+    return [np.flatnonzero(group == number) for number in range(count)]
 
 
 #: A first neighbour is at most this far beside an edge's direction (radians), and among this number of nearest saddles.

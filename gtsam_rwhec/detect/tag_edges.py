@@ -3,9 +3,9 @@
 Blur rounds the right angle in a corner detector's window: all four corners move inwards by tenths of a pixel, and the
 tag looks smaller and further away. A straight edge stays where it is under any symmetric blur. Therefore each side is
 found in profiles across it, a line is fitted to each side in undistorted coordinates, and the lines meet in the
-corners. A model of the edge's neighbours, which blur into it, gives the place (`fit_profiles`): the code's cell, one
-module of black border, one module of paper, and what is beyond. Last, the border's inner edges tell by how much all
-edges moved towards black or white, by gamma or by ink.
+corners. The area under each profile gives a first place of the edge; then a model of the edge's neighbours, which blur
+into it, gives the place (`fit_profiles`): the code's cell, one module of black border, one module of paper, and what is
+beyond. Last, the border's inner edges tell by how much all edges moved towards black or white, by gamma or by ink.
 """
 
 from __future__ import annotations
@@ -162,18 +162,24 @@ PART = (0.12, 0.88)
 LEAST = 6
 #: A profile has this number of samples across an edge.
 SAMPLES = 13
-#: Profiles reach this far inwards (modules), because the model contains the code.
-INWARDS = 1.1
-#: Profiles reach this far outwards (modules), because the model contains the paper's end.
-OUTWARDS = 0.9
-#: Profiles reach at most this many standard deviations of the blur, and `MORE_PX` further.
+#: A first profile reaches this far inwards (modules): a white cell, one module away, must not blur into it.
+INWARDS = 0.55
+#: A first profile reaches this far outwards (modules), because the paper may end there.
+OUTWARDS = 0.7
+#: A first profile never reaches further than this (pixels).
+REACH_PX = 5.0
+#: The model's profiles reach this far inwards (modules), because the model contains the code.
+MODEL_INWARDS = 1.1
+#: The model's profiles reach this far outwards (modules), because the model contains the paper's end.
+MODEL_OUTWARDS = 0.9
+#: The model's profiles reach at most this many standard deviations of the blur, and `MORE_PX` further.
 BLURS = 3.5
-#: Profiles reach at most this many pixels beyond `BLURS`.
+#: The model's profiles reach at most this many pixels beyond `BLURS`.
 MORE_PX = 1.5
-#: The edges are refined in this number of rounds, from a blur of this share of a module, but of at most so many pixels.
-ROUNDS, FIRST_BLUR, FIRST_BLUR_PX = 6, 0.2, 0.9
-#: A corner that moves further than this (pixels) is another.
-MOST_MOVED_PX = 5.0
+#: The edges are refined by areas in this number of rounds.
+ROUNDS = 2
+#: The edges are then refined by the model in this number of rounds.
+MODEL_ROUNDS = 3
 #: The blur is at least this (pixels): a pixel itself blurs so much.
 LEAST_BLUR_PX = 0.35
 #: The blur is at most this (modules): beyond it no code can be read.
@@ -223,16 +229,17 @@ def refine_corners(
     """
     if len(corners_px) == 0:
         return RefinedCorners(corners_px.copy(), np.zeros(0))
-    stack = np.stack(images)
-    blur_px = np.clip(FIRST_BLUR * np.sqrt(area(corners_px)) / modules, LEAST_BLUR_PX, FIRST_BLUR_PX)
-    state = _Edges(corners_px, np.repeat(blur_px[:, None], 4, axis=1), None)
+    stack, corners = np.stack(images), corners_px
+    blur: Array = np.zeros(0)
     for _ in range(ROUNDS):
+        corners, blur = _by_areas(stack, image_of, corners, camera, modules)
+    state = _Edges(corners, np.repeat(np.clip(np.nan_to_num(blur, nan=1.0), 0.5, 3.0)[:, None], 4, axis=1), None)
+    for _ in range(MODEL_ROUNDS):
         state = _by_model(stack, image_of, state, camera, modules)
-    corners = _moved_outwards(state, _grown(stack, image_of, state, camera, modules), camera)
-    with np.errstate(invalid="ignore"):
-        found = np.asarray(np.linalg.norm(corners - corners_px, axis=2).max(axis=1) < MOST_MOVED_PX)
+    grown = _grown(stack, image_of, state, camera, modules)
     return RefinedCorners(
-        np.where(found[:, None, None], corners, np.nan), np.where(found, state.blur_px.max(axis=1), np.nan)
+        _moved_outwards(state, grown, camera),
+        np.where(np.isfinite(state.corners_px[:, 0, 0]), state.blur_px.max(axis=1), np.nan),
     )
 
 
@@ -243,6 +250,57 @@ class _Edges:
     corners_px: Array
     blur_px: Array
     step: Array | None
+
+
+def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera, modules: int) -> tuple[Array, Array]:
+    start, end = corners, np.roll(corners, -1, axis=1)  # side k: corner k to k + 1
+    along = end - start
+    length = np.linalg.norm(along, axis=2, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = along / length
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    middle = corners.mean(axis=1, keepdims=True)
+    outward = np.sign(np.einsum("nki,nki->nk", normal, 0.5 * (start + end) - middle))
+    normal *= outward[..., None]
+    share = np.linspace(*PART, PROFILES)
+    # A slanted tag is narrower than its sides are long, so its width is its area over its longest side.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        module = area(corners) / length[..., 0].max(axis=1) / modules  # (N,)
+    inwards, outwards = np.minimum(INWARDS * module, REACH_PX), np.minimum(OUTWARDS * module, REACH_PX)
+    reach = (inwards + outwards)[:, None, None]
+    u = np.linspace(0.0, 1.0, SAMPLES)
+    d = u * reach[..., 0] - inwards[:, None]
+    foot = start[:, :, None] + share[:, None] * length[:, :, None] * along[:, :, None]  # (N, 4, P, 2)
+    # (N, 4, P, S, 2): from the dark border outwards
+    points = foot[:, :, :, None] + d[:, None, None, :, None] * normal[:, :, None, None]
+    profile = sampled(stack, image_of, points)
+    dark, light = profile[..., 0], profile[..., -2:].mean(axis=-1)
+    contrast = light - dark  # (N, 4, P)
+    # Black is equal along a side, and a single sample is noisy: take the median. The white side stays as it is: its
+    # gray value varies with the light along the side.
+    black = np.median(dark, axis=2, keepdims=True)[..., None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rise = (profile - black) / (light[..., None] - black)
+        # The area under the rise gives the place of a step with the same plateaus, under any symmetric blur. The unit
+        # is the reach, from its inner end.
+        place = 1.0 - np.trapezoid(rise, u, axis=-1)
+        # The rise is the blur's distribution function: the second moment of its differences is the blur's variance.
+        centres = 0.5 * (u[1:] + u[:-1])
+        mass = np.diff(rise, axis=-1)
+        variance = (mass * (centres - place[..., None]) ** 2).sum(axis=-1)
+    half = 0.5 * np.median(np.maximum(contrast, 0.0), axis=(1, 2), keepdims=True)
+    with np.errstate(invalid="ignore"):
+        good = (contrast > np.maximum(half, LEAST_GRAY)) & (place > 0.1) & (place < 0.9)
+    off = np.where(good, place, 0.0) * reach - inwards[:, None, None]
+    edge = foot + off[..., None] * normal[:, :, None]
+    refined = _corners(camera, edge, good)
+    # A corner that moves further than the profiles reach is not measured.
+    moved = np.linalg.norm(refined - corners, axis=-1).max(axis=1)
+    refined = np.where((moved[:, None, None] < reach + 0.5), refined, np.nan)
+    middle_one = median(np.where(good, variance, np.inf).reshape(len(corners), -1), good.sum(axis=(1, 2)))
+    with np.errstate(invalid="ignore"):
+        blur = np.sqrt(np.maximum(middle_one, 0.0)) * reach[:, 0, 0]
+    return refined, blur
 
 
 def _corners(camera: Camera, edge: Array, good: np.ndarray) -> Array:
@@ -285,7 +343,7 @@ def _grown(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, mod
     # From the border into the code, along the cells: across the edges of a slanted tag lie other cells.
     foot, _, module, along = _line(camera, _sides(camera, edges.corners_px), share, 1.0 / modules, 0.0)
     blur = np.repeat(edges.blur_px[..., None], len(share), axis=2)
-    reach = np.minimum(OUTWARDS * module, BLURS * blur + MORE_PX)[..., None]
+    reach = np.minimum(MODEL_OUTWARDS * module, BLURS * blur + MORE_PX)[..., None]
     places = reach * np.linspace(-1.0, 1.0, SAMPLES)
     values = sampled(stack, image_of, foot[..., None, :] + places[..., None] * along[..., None, :])
     assert edges.step is not None, "it follows the model"
@@ -314,7 +372,9 @@ def _by_model(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, 
     share = np.linspace(*PART, PROFILES)
     foot, normal, module, _ = _line(camera, _sides(camera, edges.corners_px), share, 0.0, 1.0 / modules)
     blur = np.repeat(edges.blur_px[..., None], PROFILES, axis=2)
-    inwards, outwards = (np.minimum(reach * module, BLURS * blur + MORE_PX)[..., None] for reach in (INWARDS, OUTWARDS))
+    inwards, outwards = (
+        np.minimum(reach * module, BLURS * blur + MORE_PX)[..., None] for reach in (MODEL_INWARDS, MODEL_OUTWARDS)
+    )
     places = -inwards + (inwards + outwards) * np.linspace(0.0, 1.0, SAMPLES)  # (N, 4, P, S)
     values = sampled(stack, image_of, foot[..., None, :] + places[..., None] * normal[..., None, :])
     rough = np.median(values[..., -3] - values[..., 2], axis=(1, 2)) if edges.step is None else edges.step

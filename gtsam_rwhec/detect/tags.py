@@ -38,11 +38,6 @@ def modules(family: str, border_bits: int = 1) -> int:
     return int(dictionary(family).markerSize) + 2 * border_bits
 
 
-def tag_detector(family: str, border_bits: int = 1) -> cv2.aruco.ArucoDetector:
-    """A detector of a family's tags. Two threads must not use one detector at once."""
-    return cv2.aruco.ArucoDetector(dictionary(family), _parameters(border_bits))
-
-
 def detector_of(
     ids: Mapping[str, Sequence[int]], border_bits: int = 1, *, larger_side_px: int = 640
 ) -> cv2.aruco.ArucoDetector:
@@ -205,7 +200,7 @@ def tags_in_image(gray: Gray, families: Iterable[str] = BY_TRUST) -> list[SeenTa
 
 
 def _of_family(gray: Gray, family: str, border_bits: int) -> list[SeenTag]:
-    corners, ids, _ = tag_detector(family, border_bits).detectMarkers(gray)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary(family), _parameters(border_bits)).detectMarkers(gray)
     if ids is None:
         return []
     quads = np.reshape(corners, (-1, 4, 2)).astype(np.float32)

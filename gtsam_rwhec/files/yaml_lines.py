@@ -265,20 +265,30 @@ def parse_storage(text: str, where: str, most_values: int = MOST_VALUES) -> Yaml
     return parse_yaml(re.sub(r"\A%YAML:", "%YAML ", text), where, tags=_TAGS, most_values=most_values)
 
 
+@dataclass
+class _Element:
+    """An element of XML; the elements in it by their names, or by their numbers in a list."""
+
+    name: str
+    line: int
+    is_matrix: bool
+    texts: list[str] = field(default_factory=list)
+    inside: dict[str | int, _Element] = field(default_factory=dict)
+
+
 class _Xml:
-    """Reads the elements of one file in their order. Declarations of types and entities are refused."""
+    """Reads the elements of one file. Declarations of types and entities are refused."""
 
     def __init__(self, where: str, most_values: int) -> None:
         self.where, self.most_values = where, most_values
         self.lines: dict[KeyPath, int] = {}
-        #: For each open element: its path, whether it is a matrix, its text, and what is in it.
-        self.open: list[tuple[KeyPath, bool, list[str], dict[str, Any] | list[Any] | None]] = []
-        self.root: Any = None
+        self.file = _Element("", 1, False)
+        self.open = [self.file]
         self.count = 0
         self.parser = expat.ParserCreate()
         self.parser.StartElementHandler = self._begin
-        self.parser.EndElementHandler = self._end
-        self.parser.CharacterDataHandler = self._text
+        self.parser.EndElementHandler = lambda _: self.open.pop()
+        self.parser.CharacterDataHandler = lambda text: self.open[-1].texts.append(text)
         self.parser.StartDoctypeDeclHandler = self._declared
 
     def parsed(self, text: str) -> YamlFile:
@@ -288,67 +298,50 @@ class _Xml:
             raise FileFormatError(f"{self.where}, line {error.lineno}: not XML: {error}") from error
         except ValueError as error:  # an encoding that its declaration does not name
             raise FileFormatError(f"{self.where}: not XML: {error}") from error
-        if not isinstance(self.root, dict):
-            self._refuse(f"<{_ROOT}> is empty")
-        return YamlFile(self.where, self.root, self.lines)
+        data = self._value(self.file.inside[_ROOT], (), False)
+        if not isinstance(data, dict):
+            self._refuse(self.parser.CurrentLineNumber, f"<{_ROOT}> is empty")
+        return YamlFile(self.where, data, self.lines)
 
     def _begin(self, name: str, attributes: dict[str, str]) -> None:
-        self.count += 1
-        if self.count > self.most_values or len(self.open) > DEEPEST:
-            self._refuse(
-                f"more than {self.most_values} values, or nested more deeply than {DEEPEST}; is it the right file?"
-            )
         line = self.parser.CurrentLineNumber
-        if not self.open:
-            if name != _ROOT:
-                self._refuse(f"<{name}> in place of <{_ROOT}>, with which OpenCV's files begin")
-            path: KeyPath = ()
-        else:
-            above, is_matrix, texts, inside = self.open[-1]
-            if inside is None:
-                inside = [] if name == _ITEM else {}
-                self.open[-1] = above, is_matrix, texts, inside
-            if isinstance(inside, list) != (name == _ITEM) or (isinstance(inside, dict) and name in inside):
-                self._refuse(f"<{name}> is there twice, or between items of a list")
-            path = (*above, len(inside) if isinstance(inside, list) else name)
-        self.lines.setdefault(path, line)
-        self.open.append((path, attributes.get("type_id", "").startswith("opencv-"), [], None))
+        self._take(line, 1)
+        if len(self.open) > DEEPEST + 1:
+            self._refuse(line, f"nested more deeply than {DEEPEST}; is it the right file?")
+        above = self.open[-1]
+        if above is self.file and name != _ROOT:
+            self._refuse(line, f"<{name}> in place of <{_ROOT}>, with which OpenCV's files begin")
+        key = len(above.inside) if name == _ITEM else name
+        if key in above.inside or (above.inside and (0 in above.inside) != (name == _ITEM)):
+            self._refuse(line, f"<{name}> is there twice, or between items of a list")
+        above.inside[key] = _Element(name, line, attributes.get("type_id", "").startswith("opencv-"))
+        self.open.append(above.inside[key])
 
-    def _text(self, text: str) -> None:
-        if self.open:
-            self.open[-1][2].append(text)
-
-    def _end(self, _: str) -> None:
-        path, _is_matrix, texts, inside = self.open.pop()
-        value: Any = tuple(inside) if isinstance(inside, list) else inside
-        in_matrix = bool(self.open) and self.open[-1][1]
-        if inside is None:
-            value = self._value("".join(texts).strip(), in_matrix and path[-1] == "data")
-        if not self.open:
-            self.root = value
-            return
-        above = self.open[-1][3]
-        if isinstance(above, list):
-            above.append(value)
-        elif above is not None:
-            above[str(path[-1])] = value
-
-    def _value(self, text: str, is_list: bool) -> Any:
-        """A string, a number, or numbers separated by blanks, as OpenCV writes lists."""
+    def _value(self, element: _Element, path: KeyPath, in_matrix: bool) -> Any:
+        """A list, a mapping, a string, a number, or numbers separated by blanks, as OpenCV writes lists."""
+        self.lines[path] = element.line
+        values: dict[Any, Any] = {
+            key: self._value(part, (*path, key), element.is_matrix) for key, part in element.inside.items()
+        }
+        if values:
+            return tuple(values.values()) if 0 in values else values
+        text, is_list = "".join(element.texts).strip(), in_matrix and element.name == "data"
         if text.startswith('"') and text.endswith('"') and len(text) > 1 and not is_list:
             return text[1:-1]
         words = text.split()
-        self.count += len(words)
+        self._take(element.line, len(words))
+        scalars = tuple(scalar(word) for word in words)
+        if is_list or (len(scalars) > 1 and all(isinstance(each, (int, float)) for each in scalars)):
+            return scalars
+        return scalars[0] if len(scalars) == 1 else text or None
+
+    def _take(self, line: int, count: int) -> None:
+        self.count += count
         if self.count > self.most_values:
-            self._refuse(f"more than {self.most_values} values; is it the right file?")
-        values = tuple(scalar(word) for word in words)
-        are_numbers = all(isinstance(value, (int, float)) for value in values)
-        if is_list or (len(values) > 1 and are_numbers):
-            return values
-        return values[0] if len(values) == 1 else text or None
+            self._refuse(line, f"more than {self.most_values} values; is it the right file?")
 
     def _declared(self, *_: Any) -> None:
-        self._refuse("a DOCTYPE, which OpenCV's files do not have")
+        self._refuse(self.parser.CurrentLineNumber, "a DOCTYPE, which OpenCV's files do not have")
 
-    def _refuse(self, words: str) -> NoReturn:
-        raise FileFormatError(f"{self.where}, line {self.parser.CurrentLineNumber}: {words}.")
+    def _refuse(self, line: int, words: str) -> NoReturn:
+        raise FileFormatError(f"{self.where}, line {line}: {words}.")

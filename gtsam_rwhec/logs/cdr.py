@@ -41,8 +41,6 @@ STACKED_BYTES = 1 << 16
 MOST_SHAPES = 64
 #: To compare this many bytes of messages takes as long as to walk over one part.
 BYTES_FOR_A_PART = 1 << 11
-#: Up to this many pieces of the messages are compared one by one, and more of them together.
-FEW_PIECES = 32
 
 
 @dataclass(frozen=True)
@@ -72,19 +70,8 @@ class Shape:
 
     def same_as_first(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which of the messages (N, length) have the first one's strings and counts; (N,)."""
-        pieces: list[list[int]] = []
-        for start, end in self.fixed:
-            if pieces and pieces[-1][1] == start:
-                pieces[-1][1] = end
-            else:
-                pieces.append([start, end])
-        if len(pieces) > FEW_PIECES:
-            columns = np.concatenate([np.arange(start, end) for start, end in pieces])
-            return np.asarray((rows[:, columns] == rows[0, columns]).all(axis=1))
-        same = np.ones(len(rows), dtype=bool)
-        for start, end in pieces:
-            same &= (rows[:, start:end] == rows[0, start:end]).all(axis=1)
-        return same
+        columns = np.concatenate([np.arange(start, end) for start, end in self.fixed])
+        return np.asarray((rows[:, columns] == rows[0, columns]).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -126,17 +113,13 @@ def find(tree: Any, path: str) -> Any:
     return tree
 
 
-def _take_nothing(count: int) -> None:
-    """What parts cost where nobody counts them."""
-
-
 class MessageType:
     """A ROS 2 message type, made from the log's definition. An unreadable or incomplete one raises a MessageError.
 
     `take` is told how many parts were read, and raises an error when they are too many.
     """
 
-    def __init__(self, name: str, text: str, take: Callable[[int], None] = _take_nothing) -> None:
+    def __init__(self, name: str, text: str, take: Callable[[int], None] = lambda count: None) -> None:
         self._root = _short(name)
         self._take = take
         self._fields = {
@@ -154,7 +137,6 @@ class MessageType:
         self._fields[current] = _parse(current, lines)
         if not self._fields[self._root]:
             raise MessageError(f"schema {name}: the log has no definition of its fields")
-        self._least: dict[str, int] = {}
 
     def batches(self, messages: Sequence[bytes | memoryview]) -> Iterator[tuple[list[int], Batch | MessageError]]:
         """Group messages by shape; yield their places in `messages` with their batch, or with the error."""
@@ -199,43 +181,22 @@ class MessageType:
 
         A MessageError says that the message ends too early, is not CDR, or has a string that is not UTF-8.
         """
-        walk = _Walk(self._fields, self._least_bytes, message)
+        walk = _Walk(self._fields, message)
         try:
             return walk.walk(self._root)
         finally:
             self._take(PARTS_OF_A_WALK * walk.parts)
 
-    def _least_bytes(self, type_: str, depth: int = 0) -> int:
-        """The fewest bytes that one value of a type takes; at least one, also where it has no bytes."""
-        if type_ in _SIZES:
-            return int(_SIZES[type_][1])
-        if type_ == "string":
-            return 4
-        if type_ not in self._least:
-            self._least[type_] = 1  # until it is known: a type may contain itself
-            if depth <= LEVELS:
-                each = (
-                    (1 if field.count is None else field.count) * self._least_bytes(field.type, depth + 1)
-                    if field.count != -1
-                    else 4
-                    for field in self._fields.get(type_, ())
-                )
-                self._least[type_] = max(1, sum(each))
-        return self._least[type_]
-
 
 class _Walk:
     """One pass over one message."""
 
-    def __init__(
-        self, fields: dict[str, tuple[Field, ...]], least_bytes: Callable[[str], int], message: bytes | memoryview
-    ) -> None:
+    def __init__(self, fields: dict[str, tuple[Field, ...]], message: bytes | memoryview) -> None:
         # The first four bytes name the encoding: 0 and 1 are CDR (big and little endian), 6 and 7 are XCDR2, which
         # aligns to 4 bytes at most. Alignment counts from the byte after them.
         if len(message) < 4 or message[0] != 0 or message[1] not in (0, 1, 6, 7):
             raise MessageError(f"not CDR: begins with the bytes {bytes(message[:4]).hex(' ')}")
         self._fields = fields
-        self._least_bytes = least_bytes
         self._message = message
         self._endian = "<" if message[1] & 1 else ">"
         self._widest = 4 if message[1] >= 6 else 8
@@ -262,8 +223,11 @@ class _Walk:
         count = self._length() if field.count == -1 else field.count
         if field.type in _SIZES:
             return self._numbers(_SIZES[field.type], count)
-        if count is not None:
-            self._check_list(field, count)
+        if count is not None and count > PARTS_OF_A_MESSAGE - self.parts:
+            raise MessageError(
+                f"field {field.name[:80]}: a list of {count} {field.type[:80]}; at most {PARTS_OF_A_MESSAGE} numbers, "
+                "strings, lists and messages are read in one message"
+            )
         if field.type == "string":
             return self._string() if count is None else [self._string() for _ in range(count)]
         if count is None:
@@ -274,20 +238,6 @@ class _Walk:
         self.parts += 1
         if self.parts > PARTS_OF_A_MESSAGE:
             raise MessageError(f"has more than {PARTS_OF_A_MESSAGE} numbers, strings, lists and messages")
-
-    def _check_list(self, field: Field, count: int) -> None:
-        """Refuse a list that what is left of the message cannot hold, before anything is made for its entries."""
-        left, least = len(self._message) - self._at, self._least_bytes(field.type)
-        if count * least > left:
-            raise MessageError(
-                f"field {field.name[:80]}: a list of {count} {field.type[:80]} needs {count * least} bytes or more, "
-                f"and {left} bytes are left"
-            )
-        if count > PARTS_OF_A_MESSAGE - self.parts:
-            raise MessageError(
-                f"field {field.name[:80]}: a list of {count} {field.type[:80]}; at most {PARTS_OF_A_MESSAGE} numbers, "
-                "strings, lists and messages are read in one message"
-            )
 
     def _numbers(self, code: str, count: int | None) -> Numbers:
         self._count()

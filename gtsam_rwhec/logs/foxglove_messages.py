@@ -118,7 +118,10 @@ class Access:
 
     def vector(self, message: Any, name: str, most: int = 1000) -> Array:
         """A list of numbers, (n,)."""
-        return _vector(self.get(message, name), name, most)
+        values = self.get(message, name)
+        if len(values) > most:
+            raise ValueError(f"{name} has {len(values)} numbers, and at most {most} are read")
+        return np.array([float(value) for value in values], dtype=np.float64)
 
 
 JSON = Access(operator.getitem, "sec", "nsec", lambda text: base64.b64decode(text, validate=True))
@@ -199,12 +202,6 @@ def parse_json(message: bytes | memoryview, take: Callable[[int], None]) -> Any:
     return value
 
 
-def _vector(values: Any, name: str, most: int = 1000) -> Array:
-    if len(values) > most:
-        raise ValueError(f"{name} has {len(values)} numbers, and at most {most} are read")
-    return np.array([float(value) for value in values], dtype=np.float64)
-
-
 def _frame_transform(message: Any, access: Access) -> list[Row]:
     numbers = access.pose(message, "translation", "rotation")
     parent, child = access.frame(message, "parent_frame_id"), access.frame(message, "child_frame_id")
@@ -270,8 +267,8 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
         if "covariance" in given:
             covariance = access.vector(tag, "covariance").reshape(6, 6)
         if "corners_px" in given:
-            corners = _vector([c[axis] for c in tag["corners_px"] for axis in "xy"], "corners_px", MOST_NUMBERS)
-            corners = corners.reshape(-1, 2)
+            both = {"corners_px": [corner[axis] for corner in tag["corners_px"] for axis in "xy"]}
+            corners = access.vector(both, "corners_px", MOST_NUMBERS).reshape(-1, 2)
         for field, value in {"covariance": covariance, "corners_px": corners, **arrays}.items():
             if value is not None and not np.isfinite(value).all():
                 return f"{field} is not finite: {reprlib.repr(np.asarray(value).tolist())}"

@@ -269,8 +269,8 @@ def _of_one_kind(folder: Path, files: list[Path]) -> list[Path]:
     ending, _ = Counter(file.suffix.lower() for file in files).most_common(1)[0]
     others = [file.name for file in files if file.suffix.lower() != ending]
     if others:
-        names = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
-        words = f"{folder}: poses are read from the {len(files) - len(others)} files {ending}, and not from {names}"
+        count = len(files) - len(others)
+        words = f"{folder}: poses are read from the {count} files {ending}, and not from {_some(others)}"
         warnings.warn(words, LogWarning, stacklevel=4)
     return [file for file in files if file.suffix.lower() == ending]
 

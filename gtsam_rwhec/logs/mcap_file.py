@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -220,11 +220,10 @@ def read_index(read: Read, path: Path, size: int, spending: Spending, *, with_ch
 
 def _has_right_counts(summary: Summary, spending: Spending) -> bool:
     statistics = summary.statistics
-    if statistics is None:
-        return False
-    counts = statistics.channel_message_counts
+    counts = {} if statistics is None else statistics.channel_message_counts
     return (
-        statistics.chunk_count == len(summary.chunk_indexes)
+        statistics is not None
+        and statistics.chunk_count == len(summary.chunk_indexes)
         and set(counts) <= set(summary.channels)
         and bool(summary.chunk_indexes or not statistics.message_count)
         and sum(counts.values()) <= spending.budget.parts
@@ -258,7 +257,6 @@ class McapFile:
         self.metadata_places: list[MetadataIndex] = []
         self.attachment_places: list[AttachmentIndex] = []
         self.losses: list[str] = []
-        self.is_indexed = False
         self._stream = self._opened()  # read from for as long as the object lives
         self.size = os.fstat(self._stream.fileno()).st_size
         self.spending = Spending(path, self.size)
@@ -268,16 +266,7 @@ class McapFile:
         except LogError:
             self.close()
             raise
-
-    @property
-    def schemas(self) -> dict[int, Schema]:
-        """By identifier."""
-        return self._descriptions.schemas
-
-    @property
-    def channels(self) -> dict[int, Channel]:
-        """By identifier."""
-        return self._descriptions.channels
+        self.schemas, self.channels = self._descriptions.schemas, self._descriptions.channels  # by identifier
 
     def close(self) -> None:
         """Close the file."""
@@ -285,36 +274,40 @@ class McapFile:
 
     def open(self, block: Block) -> Messages:
         """Read, check and decompress a block. A wrong compression, size or checksum raises a LogError."""
-        if block.is_chunk:
-            return self._split(self._chunk_data(block, f"{self.path}, chunk at byte {block.offset}"), block.offset)
-        return self._split(self._read(block.offset, block.length), block.offset)
+        data = self._chunk_data(block) if block.is_chunk else self._read(block.offset, block.length)
+        return self._split(data, block.offset)
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records by name; the last record of a name counts. Damaged ones are left out."""
         found: dict[str, dict[str, str]] = {}
-        with self._opened() as stream:  # opened anew: metadata may be asked for after the log is closed
-            for place in self.metadata_places:
-                try:
-                    record = parsed(Metadata.read, self._record(place, Opcode.METADATA, stream), RECORD.size)
-                except FAULTS:
-                    continue  # as for a damaged chunk, the rest counts; who needs what is not there says so
-                self.spending.take_parts(len(record.metadata))
-                found[record.name] = record.metadata
+        for record in self._found(Metadata.read, Opcode.METADATA, self.metadata_places):
+            self.spending.take_parts(len(record.metadata))
+            found[record.name] = record.metadata
         return found
 
     def attachment(self, name: str) -> bytes | None:
         """The content that is attached under a name, or None if there is none; the last one counts."""
+        places = [place for place in self.attachment_places if place.name in ("", name)]
         data = None
-        with self._opened() as stream:
-            for place in self.attachment_places:
-                if place.name not in ("", name):
-                    continue
+        for record in self._found(Attachment.read, Opcode.ATTACHMENT, places):
+            data = record.data if record.name == name else data
+        return data
+
+    def _found(
+        self,
+        read: Callable[[ReadDataStream], _Parsed],
+        opcode: int,
+        places: Sequence[MetadataIndex] | Sequence[AttachmentIndex],
+    ) -> Iterator[_Parsed]:
+        """The records at some places; damaged ones are left out, as who needs what is not there says so."""
+        with self._opened() as stream:  # opened anew: they may be asked for after the log is closed
+            for place in places:
+                record = self._read(place.offset, place.length, stream)
                 try:
-                    attached = parsed(Attachment.read, self._record(place, Opcode.ATTACHMENT, stream), RECORD.size)
+                    if record[:1] == bytes([opcode]):
+                        yield parsed(read, record, RECORD.size)
                 except FAULTS:
                     continue
-                data = attached.data if attached.name == name else data
-        return data
 
     def _opened(self) -> BinaryIO:
         try:
@@ -329,13 +322,6 @@ class McapFile:
             return stream.read(max(0, min(length, self.size - offset)))
         except OSError as error:
             raise LogError(f"{self.path}, byte {offset}: {error.strerror}") from error
-
-    def _record(self, place: MetadataIndex | AttachmentIndex, opcode: int, stream: BinaryIO) -> bytes:
-        """The bytes of a record; a ValueError if another is there."""
-        record = self._read(place.offset, place.length, stream)
-        if record[:1] != bytes([opcode]):
-            raise ValueError(f"no such record at byte {place.offset}")
-        return record
 
     def _find_blocks(self) -> None:
         first = self._read(0, len(MAGIC))
@@ -362,7 +348,7 @@ class McapFile:
             ]  # fmt: skip
             self._descriptions = index.descriptions
             self.metadata_places, self.attachment_places = summary.metadata_indexes, summary.attachment_indexes
-            self.spans, self.is_indexed = index.spans, True
+            self.spans = index.spans
             return
         self.spending.begin_pass()
         chunks = [at for opcode, at, _ in self._records() if opcode == Opcode.CHUNK]
@@ -443,9 +429,9 @@ class McapFile:
         self.blocks.append(replace(block, start_ns=int(log_time.min()), end_ns=int(log_time.max())))
         return len(log_time)
 
-    def _chunk_data(self, block: Block, where: str) -> bytes:
+    def _chunk_data(self, block: Block) -> bytes:
         """The records in a chunk; of one that is cut, as many as there are. Nothing is opened beyond what is stated."""
-        spending = self.spending
+        where, spending = f"{self.path}, chunk at byte {block.offset}", self.spending
         size = self._stated_size(block.offset)
         if size > spending.budget.chunk or block.length > spending.budget.chunk + MIB:
             raise LogError(

@@ -159,9 +159,7 @@ def _role(word: str) -> str:
 def _by_columns(
     path: str, columns: dict[str, int], header: Sequence[str], lines: list[Line], stated: PoseStatement
 ) -> list[PoseRow]:
-    named = next((columns[name] for name in _NAMES if name in columns), None)
-    if named is None:
-        named = next((columns[name] for name in _STAMPS if name in columns), None)
+    named = next((columns[name] for name in _NAMES + _STAMPS if name in columns), None)
     if named is None:
         named = next((i for i, word in enumerate(header) if "stamp" in word.lower() or "time" in word.lower()), None)
     parted = None if any(name in columns for name in _NAMES) else _seconds_and_nanoseconds(header)

@@ -29,19 +29,9 @@ _VECTORS = ("rvec", "rotvec", "rotationvector")
 #: Six or seven numbers under these keys are a position with a rotation; elsewhere they may be joints.
 _LISTED = re.compile(r"^(?!.*joint).*(pose|tcp|flange|tool|gripper|effector|hand|transform|base|eef)", re.IGNORECASE)
 _NAME = (
-    "image",
-    "imagepath",
-    "imagefile",
-    "imagename",
-    "filepath",
-    "file",
-    "filename",
-    "img",
-    "timestamp",
-    "stamp",
-    "time",
+    "image", "imagepath", "imagefile", "imagename", "filepath", "file", "filename", "img", "timestamp", "stamp", "time",
     "name",
-)
+)  # fmt: skip
 #: These keys hold poses, and are no names of images.
 _HOLDERS = frozenset({
     "data", "poses", "pose", "frames", "transform", "transforms", "matrix", "samples", "robot", "tf", "entries",
@@ -52,6 +42,11 @@ MOST_VALUES = 200_000
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 #: How many numbers a position has with a rotation in a list, and what the rotation is.
 _OF_LISTS: tuple[tuple[int, Kind], ...] = ((7, "quaternion_of_any_order"), (6, "angles"))
+#: The numbers of a rotation by these keys.
+_NAMED_ROTATIONS: tuple[tuple[tuple[str, ...], Kind], ...] = (
+    (("qx", "qy", "qz", "qw"), "quaternion"), (("x", "y", "z", "w"), "quaternion"),
+    (("rx", "ry", "rz"), "angles"), (("roll", "pitch", "yaw"), "angles"),
+)  # fmt: skip
 #: Keys of rotations and of positions that belong together where the rest of both is the same.
 _APART = (("R", "t"), ("r", "t"), ("rvec", "tvec"), ("rvecs", "tvecs"), ("rot", "trans"), ("R", "T"))
 #: Keys of poses of a target, which are not the carriers' poses.
@@ -176,21 +171,14 @@ class PoseTree:
             return None
         turned = next((fields[key] for key in _ROTATION if key in fields), node)
         by_name = _fields(turned)
-        for keys in ("qx", "qy", "qz", "qw"), ("x", "y", "z", "w"):
+        for keys, kind in _NAMED_ROTATIONS:
             if all(_is_number(by_name.get(key)) for key in keys):
-                return PoseRow(name, place, "quaternion", (*position, *(float(by_name[key]) for key in keys)))
-        for axes in ("rx", "ry", "rz"), ("roll", "pitch", "yaw"):
-            if all(_is_number(by_name.get(key)) for key in axes):
-                return PoseRow(name, place, "angles", (*position, *(float(by_name[key]) for key in axes)), True)
-        if (numbers := _flat(turned, 4)) is not None:
-            return PoseRow(name, place, "quaternion_of_any_order", (*position, *numbers))
-        if turned is not node and (numbers := _flat(turned, 3)) is not None:
-            is_vector = any(key in fields for key in _VECTORS)
-            return PoseRow(name, place, "rotation_vector" if is_vector else "angles", (*position, *numbers))
-        if (numbers := _flat(turned, 9)) is not None:
-            rows = [(*numbers[3 * r : 3 * r + 3], position[r]) for r in range(3)]
-            return PoseRow(name, place, "matrix", (*sum(rows, ()), *_LAST_ROW))
-        return None
+                numbers = (*position, *(float(by_name[key]) for key in keys))
+                return PoseRow(name, place, kind, numbers, kind == "angles")
+        joined = _joined(turned, position) if turned is not node else None
+        if joined is not None and joined[0] == "rotation_vector" and not any(key in fields for key in _VECTORS):
+            joined = "angles", joined[1]
+        return None if joined is None else PoseRow(name, place, *joined)
 
 
 def pairs_of_keys(node: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -211,11 +199,9 @@ def _joined(turned: Any, moved: Any) -> tuple[Kind, tuple[float, ...]] | None:
     if (numbers := _flat(turned, 9)) is not None:
         rows = [(*numbers[3 * r : 3 * r + 3], position[r]) for r in range(3)]
         return "matrix", (*sum(rows, ()), *_LAST_ROW)
-    if (numbers := _flat(turned, 4)) is not None:
-        return "quaternion_of_any_order", (*position, *numbers)
-    if (numbers := _flat(turned, 3)) is not None:
-        return "rotation_vector", (*position, *numbers)
-    return None
+    kinds: tuple[tuple[int, Kind], ...] = ((4, "quaternion_of_any_order"), (3, "rotation_vector"))
+    found = ((kind, numbers) for count, kind in kinds if (numbers := _flat(turned, count)) is not None)
+    return next(((kind, (*position, *numbers)) for kind, numbers in found), None)
 
 
 def _items(node: Any) -> tuple[Any, ...]:

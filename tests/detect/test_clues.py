@@ -11,20 +11,7 @@ from rendered import BARREL, FISHEYE, Print, pose, printed, render, tag_modules
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
-from gtsam_rwhec.detect.clues import (
-    About,
-    Clue,
-    brightened,
-    brightest_value,
-    clues,
-    edge_blur_px,
-    folded,
-    motion_blur_px,
-    read,
-    resized,
-    saturated_share,
-    tags_seen,
-)
+from gtsam_rwhec.detect.clues import About, Clue, clues, edge_blur_px, motion_blur_px, read, resized, tags_seen
 from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.detect.images import Gray
 
@@ -134,22 +121,6 @@ def test_the_blur_of_an_edge(blur_px: float) -> None:
 def test_images_without_edges_have_no_blur() -> None:
     assert np.isnan(edge_blur_px(np.full((240, 320), 90, np.uint8)))
     assert edge_blur_px(step(0.0)) < 0.8
-
-
-def test_brightness() -> None:
-    dark = (step(1.0, 0.0) // 20).astype(np.uint8)  # 2 to 10
-    assert brightest_value(dark) <= 10
-    assert np.ptp(brightened(dark).astype(int)) > 240
-    assert saturated_share(np.full((10, 10), 255, np.uint8)) == 1.0
-    assert saturated_share(dark) == 0.0
-
-
-def test_what_is_nearly_black_is_told_from_black() -> None:
-    image = np.full((60, 60), 10, np.uint8)
-    image[20:40, 20:40] = 20
-    apart = folded(image, 20.0)
-    assert apart[30, 30] < 8
-    assert apart[5, 5] in (79, 80)  # darker is light
 
 
 @pytest.mark.parametrize("camera", [BARREL, FISHEYE])

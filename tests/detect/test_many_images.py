@@ -82,13 +82,6 @@ def test_the_same_on_any_number_of_cores_and_in_any_order(images: list[ImageReco
     assert_same(one, by_image(detect_in_images(iter(images[::-1]), MAKERS)))
 
 
-def test_each_topic_comes_in_order(images: list[ImageRecord]) -> None:
-    looked = list(detect_in_images(images, MAKERS, workers=2))
-    for topic in CAMERAS:
-        stamps = [one.stamp_ns for one in looked if one.topic == topic]
-        assert stamps == sorted(stamps)
-
-
 class FailsOnDark(Detector):
     """Fails as NumPy and OpenCV do, on each image that begins with a black pixel."""
 
@@ -128,21 +121,26 @@ def test_faults_are_reported_and_the_other_images_are_used(images: list[ImageRec
         assert [d.target for d in one.found.detections] == ["tag"]
 
 
-def test_images_are_read_only_when_they_are_needed(images: list[ImageRecord]) -> None:
+def test_images_are_read_only_when_they_are_needed() -> None:
     empty = png(np.zeros((240, 320), np.uint8))
     read, furthest = 0, 0
 
-    def log() -> Iterator[ImageRecord]:
+    def log(count: int, *topics: str) -> Iterator[ImageRecord]:
         nonlocal read
-        for k in range(12 * BATCH):
+        for k in range(count):
             read += 1
-            yield record("/left" if k % 2 else "/right", k, empty)
+            yield record(topics[k % len(topics)], k, empty)
 
-    for done, _ in enumerate(detect_in_images(log(), MAKERS, workers=1)):
+    for done, _ in enumerate(detect_in_images(log(12 * BATCH, "/left", "/right"), MAKERS, workers=1)):
         furthest = max(furthest, read - done)
     assert read == 12 * BATCH
     # Two workers' batches wait or are looked at, and one of each topic is being filled.
     assert furthest <= 6 * BATCH
+    read = 0
+    looked = detect_in_images(log(1000, "/left"), MAKERS, workers=1)
+    next(looked)
+    looked.close()
+    assert read <= 4 * BATCH
 
 
 def test_processes_detect_what_threads_detect(images: list[ImageRecord]) -> None:
@@ -189,22 +187,6 @@ def test_a_script_needs_no_main_guard(tmp_path: Path, images: list[ImageRecord])
     assert (done.stdout, done.stderr) == ("begins\n40\n", "")
 
 
-def test_stopping_early_reads_no_further() -> None:
-    empty = png(np.zeros((240, 320), np.uint8))
-    read = 0
-
-    def log() -> Iterator[ImageRecord]:
-        nonlocal read
-        for k in range(1000):
-            read += 1
-            yield record("/left", k, empty)
-
-    looked = detect_in_images(log(), MAKERS, workers=1)
-    next(looked)
-    looked.close()
-    assert read <= 4 * BATCH
-
-
 def test_an_error_while_reading_reaches_the_caller() -> None:
     def log() -> Iterator[ImageRecord]:
         yield record("/left", 0, b"")
@@ -214,12 +196,16 @@ def test_an_error_while_reading_reaches_the_caller() -> None:
         list(detect_in_images(log(), MAKERS, workers=1))
 
 
-def test_progress(images: list[ImageRecord]) -> None:
+def test_progress_and_order(images: list[ImageRecord]) -> None:
     told: list[int] = []
-    list(detect_in_images(images, MAKERS, workers=2, progress=told.append))
+    looked = list(detect_in_images(images, MAKERS, workers=2, progress=told.append))
     assert told == sorted(set(told))
     assert told[-1] == len(images)
     assert len(told) >= 3
+    for topic in CAMERAS:
+        stamps = [one.stamp_ns for one in looked if one.topic == topic]
+        assert stamps == sorted(stamps)
+    assert list(detect_in_images([], MAKERS)) == []
 
 
 def test_opencv_gets_its_threads_and_log_level_back(images: list[ImageRecord]) -> None:
@@ -228,10 +214,6 @@ def test_opencv_gets_its_threads_and_log_level_back(images: list[ImageRecord]) -
     next(looked)
     looked.close()
     assert (cv2.getNumThreads(), cv2.utils.logging.getLogLevel()) == before
-
-
-def test_no_images_give_no_detections() -> None:
-    assert list(detect_in_images([], MAKERS)) == []
 
 
 def test_opencv_prints_nothing_about_broken_images(
@@ -258,10 +240,8 @@ def test_measured_corner_noise() -> None:
     assert measured_corner_px(squared, corners) == pytest.approx(0.3, rel=0.15)
 
 
-def test_measured_corner_noise_of_single_tags() -> None:
-    generator = np.random.default_rng(1)
+@pytest.mark.parametrize(("corners", "rel"), [(4, 0.1), (24, 0.02)])
+def test_measured_corner_noise_of_one_kind_of_target(corners: int, rel: float) -> None:
     for seed in range(3):
-        squared = 0.2**2 * np.random.default_rng(seed).chisquare(2, 400)
-        assert measured_corner_px(squared, np.full(400, 4)) == pytest.approx(0.2, rel=0.1)
-    squared = 0.2**2 * generator.chisquare(42, 400)
-    assert measured_corner_px(squared, np.full(400, 24)) == pytest.approx(0.2, rel=0.02)
+        squared = 0.2**2 * np.random.default_rng(seed).chisquare(2 * corners - 6, 400)
+        assert measured_corner_px(squared, np.full(400, corners)) == pytest.approx(0.2, rel=rel)
