@@ -31,7 +31,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations, of_vectors, right, to_rotations
-from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
+from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart, unit_quaternions
 from gtsam_rwhec.methods.linear_systems import Stack, agreement, paired_quaternions
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties
 from gtsam_rwhec.problem.problem import Problem
@@ -104,7 +104,7 @@ def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:
     """The local minimum of z'Qz near p (n, 4) and t (n, 3): p, t and the cost."""
     start = np.concatenate([q, t], axis=1).ravel()
     found = descend_on_chart(Q, pose_chart, start, DESCENT_STEPS).reshape(-1, 7)
-    q, t = found[:, :4] / np.linalg.norm(found[:, :4], axis=1, keepdims=True), found[:, 4:]
+    (q, _), t = unit_quaternions(found[:, :4]), found[:, 4:]
     z = vector_of(q, t)
     return q, t, float(z @ Q @ z)
 
@@ -112,9 +112,7 @@ def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:
 def pose_chart(p: Array) -> tuple[Array, Array]:
     """z (8 n,) of 7 numbers a frame, a quaternion of any length and t in metres, and its derivatives (8 n, 7 n)."""
     frames = p.reshape(-1, 7)
-    length = np.linalg.norm(frames[:, :4], axis=1, keepdims=True)
-    q, t = frames[:, :4] / length, frames[:, 4:]
-    by_quaternion = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
+    (q, by_quaternion), t = unit_quaternions(frames[:, :4]), frames[:, 4:]
     n, at = len(frames), np.arange(len(frames))
     derivatives = np.zeros((n, 8, n, 7))
     derivatives[at, :4, at, :4] = by_quaternion

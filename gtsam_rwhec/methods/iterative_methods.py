@@ -21,7 +21,7 @@ from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotation
 from gtsam_rwhec.methods.certified import SOURCE
 from gtsam_rwhec.methods.closed_forms import DORNAIKA_SOURCE, start_of
 from gtsam_rwhec.methods.global_rotations import UnitForm
-from gtsam_rwhec.methods.levenberg_marquardt import Chart, descend_on_chart
+from gtsam_rwhec.methods.levenberg_marquardt import Chart, descend_on_chart, unit_quaternions
 from gtsam_rwhec.methods.linear_systems import Stack, plain_form, poses_of
 from gtsam_rwhec.methods.method import (
     UNWEIGHTED,
@@ -390,10 +390,8 @@ def from_rotation_vectors(p: Array) -> tuple[Array, Array]:
 
 def from_quaternions(p: Array) -> tuple[Array, Array]:
     """Rotations of quaternions (n, 4), scalar last, divided by their lengths."""
-    length = np.linalg.norm(p, axis=1)[:, None]
-    q = p / length
+    q, tangent = unit_quaternions(p)
     by_q = 2.0 * np.einsum("nd,cdik->ncik", q, ROTATION)
-    tangent = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
     derivative = np.einsum("ncik,ncm->nkim", by_q, tangent).reshape(len(p), 9, 4)
     return to_rotations(q), derivative
 

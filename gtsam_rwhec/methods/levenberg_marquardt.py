@@ -86,6 +86,13 @@ def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: in
     return np.asarray(found.x)
 
 
+def unit_quaternions(p: Array) -> tuple[Array, Array]:
+    """Quaternions (n, 4) divided by their lengths, and their derivatives (n, 4, 4) by the numbers given."""
+    length = np.linalg.norm(p, axis=1, keepdims=True)
+    q = p / length
+    return q, (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
+
+
 def root(form: Array) -> Array:
     """L with L'L a positive semidefinite form. Eigenvalues that are rounding error are set to zero.
 

@@ -30,8 +30,9 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, one_transform, to_pose3
 from gtsam_rwhec.methods.certified import quiet_solution
 from gtsam_rwhec.methods.closed_forms import start_of
-from gtsam_rwhec.methods.corner_methods import Corners, Minimum, cost_at, evangelista_minimum, rp1_minimum
+from gtsam_rwhec.methods.corner_methods import Corners, cost_at, evangelista_minimum, rp1_minimum
 from gtsam_rwhec.methods.iterative_methods import TABB_SOURCE, Parameterisation
+from gtsam_rwhec.methods.levenberg_marquardt import Descent
 from gtsam_rwhec.methods.method import (
     Method,
     MethodOptions,
@@ -49,7 +50,7 @@ OURS = "refine_corners"
 #: The published methods.
 NAMES = ("evangelista2023", "tabb2017_rp1")
 #: A descent from a start (n, 4, 4); the number is its most steps.
-Descend = Callable[[Corners, Array, int], Minimum]
+Descend = Callable[[Corners, Array, int], Descent[Array]]
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def _deviations(carrier: CarrierNoise | None) -> tuple[float, float] | None:
 
 
 def _ours(observations: Observations, carrier: CarrierNoise | None) -> Descend:
-    def descent(corners: Corners, start: Array, max_iterations: int) -> Minimum:
+    def descent(corners: Corners, start: Array, max_iterations: int) -> Descent[Array]:
         n = len(corners.targets)
         told = CornerOptions(
             stated="exact", carrier_noise=carrier or "exact", outliers=False, max_iterations=max_iterations
@@ -229,7 +230,7 @@ def _ours(observations: Observations, carrier: CarrierNoise | None) -> Descend:
         cost = corners.cost(frames)
         if deviations is not None:
             cost = cost_at(corners, frames, refined.point.A, deviations)
-        return Minimum(frames, cost, refined.iterations, refined.last_step < 0.1)
+        return Descent(frames, cost, refined.iterations, refined.last_step < 0.1)
 
     return descent
 
@@ -247,8 +248,8 @@ def _answer(
     begun = time.perf_counter()
     found = descent(corners, start, options.max_iterations)
     seconds = time.perf_counter() - begun
-    poses = [to_pose3(frame[:3, :3], frame[:3, 3]) for frame in found.frames]
-    cost, n = corners.cost(found.frames), len(corners.targets)
+    poses = [to_pose3(frame[:3, :3], frame[:3, 3]) for frame in found.point]
+    cost, n = corners.cost(found.point), len(corners.targets)
     return ReprojectionAnswer(
         name,
         dict(zip(corners.targets, poses[:n], strict=True)),
