@@ -18,6 +18,7 @@ import numpy as np
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid
 from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
+from gtsam_rwhec.detect.board_evidence import FoundBoard
 from gtsam_rwhec.detect.checkerboards import find_checkerboard
 from gtsam_rwhec.detect.circle_grids import MOST_BLOBS, Ellipses, blobs_in, find_circle_grid, grown_lattices
 from gtsam_rwhec.detect.images import Gray
@@ -97,10 +98,30 @@ def _larger_first(first: int, second: int) -> tuple[int, int]:
 
 def _with_checkerboard(images: Sequence[Gray], columns: int, rows: int) -> BoardSeen:
     board = Checkerboard("board", columns, rows, 1.0)
+    return _passing(images, board, lambda gray: find_checkerboard(gray, board))
+
+
+def _with_circles(images: Sequence[Gray], columns: int, rows: int, *, asymmetric: bool) -> BoardSeen:
+    """The grid as it is in most images: without a larger dot, or with one."""
+    dots = (False,) if asymmetric else (False, CORNERS[0])
+    boards = [CircleGrid("grid", columns, rows, 1.0, larger_dot=dot, asymmetric=asymmetric) for dot in dots]
+    tried = [_passing(images, board, partial(_circles_in, board)) for board in boards]
+    return max(tried, key=lambda seen: len(seen.images))
+
+
+def _circles_in(board: CircleGrid, gray: Gray) -> FoundBoard | None:
+    # No usual robot camera distorts a small grid much, so a pinhole camera is enough for this test.
+    height, width = gray.shape
+    return find_circle_grid(gray, board, usual_lens((width, height)).camera)
+
+
+def _passing(
+    images: Sequence[Gray], board: Checkerboard | CircleGrid, find: Callable[[Gray], FoundBoard | None]
+) -> BoardSeen:
     good = []
     for i, gray in enumerate(images):
         try:
-            seen = find_checkerboard(gray, board)
+            seen = find(gray)
         except cv2.error:  # one image's failure costs one image, as in detection
             continue
         if seen is not None and seen.rejection is None:
@@ -108,34 +129,6 @@ def _with_checkerboard(images: Sequence[Gray], columns: int, rows: int) -> Board
     return BoardSeen(
         board, tuple(i for i, _ in good), tuple(s.corners_px for _, s in good), tuple(s.indices for _, s in good)
     )
-
-
-def _with_circles(images: Sequence[Gray], columns: int, rows: int, *, asymmetric: bool) -> BoardSeen:
-    """The grid as it is in most images: without a larger dot, or with one."""
-    best: BoardSeen | None = None
-    for dot in (False,) if asymmetric else (False, True):
-        corner = CORNERS[0] if dot else False
-        board = CircleGrid("grid", columns, rows, 1.0, larger_dot=corner, asymmetric=asymmetric)
-        good = []
-        for i, gray in enumerate(images):
-            height, width = gray.shape
-            # No usual robot camera distorts a small grid much, so a pinhole camera is enough for this test.
-            camera = Camera.of(width, height, "pinhole", _any_K(width, height), (), "a first guess")
-            seen = find_circle_grid(gray, board, camera)
-            if seen is not None and seen.rejection is None:
-                good.append((i, seen))
-        tried = BoardSeen(
-            board, tuple(i for i, _ in good), tuple(s.corners_px for _, s in good), tuple(s.indices for _, s in good)
-        )
-        if best is None or len(tried.images) > len(best.images):
-            best = tried
-    assert best is not None
-    return best
-
-
-def _any_K(width: int, height: int) -> Array:
-    """Intrinsics of a lens that sees about 60 degrees across."""
-    return np.array([[0.9 * width, 0.0, 0.5 * width], [0.0, 0.9 * width, 0.5 * height], [0.0, 0.0, 1.0]])
 
 
 def lattice_size(blobs: Ellipses, shape: Shape) -> tuple[int, int] | None:
@@ -211,6 +204,12 @@ def guessed_intrinsics(size: tuple[int, int], boards: Iterable[BoardSeen]) -> Gu
                 f"px, to {rounded(fitted.rms_px, 2)} px). If the camera was calibrated, a file is better",
                 fitted.camera,
             )
+    return usual_lens(size)
+
+
+def usual_lens(size: tuple[int, int]) -> GuessedIntrinsics:
+    """Intrinsics of a lens that sees about 60 degrees across, for images of this size (width, height)."""
+    width, height = size
     K = (round(USUAL * width, 1), round(USUAL * width, 1), 0.5 * (width - 1), 0.5 * (height - 1))
     section = Intrinsics(K=K, size=size)
     return GuessedIntrinsics(

@@ -20,7 +20,7 @@ from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_tex
 from gtsam_rwhec.rig import odometry_sections, sections, target_sections
 from gtsam_rwhec.rig.odometry_sections import GivenSection
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
-from gtsam_rwhec.rig.section_types import in_yaml, keys_of, unit_of
+from gtsam_rwhec.rig.section_types import in_yaml, is_text, keys_of, unit_of
 from gtsam_rwhec.rig.sections import ESTIMATE, Intrinsics
 from gtsam_rwhec.rig.target_sections import with_kalibr_targets
 
@@ -316,6 +316,15 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
             line = text
         lines.append(line)
     return "\n".join(lines) + "\n"
+
+
+def first_rig_text(kind: str, source: str, rig: RigFile, remarks: Mapping[KeyPath, str], more: str = "") -> str:
+    """The text of a rig file that was made from a log or a folder (`kind`) of this name; `more` ends its head."""
+    head = (
+        f"# A first rig file, made from the {kind} {source if is_text(source) else repr(source)}.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets: the sizes here are guesses.\n"
+    )
+    return head + more + rig_text(rig, remarks)
 
 
 def _sections(rig: RigFile) -> Iterator[tuple[str, Any]]:

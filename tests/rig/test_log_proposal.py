@@ -250,7 +250,7 @@ def test_topics_that_are_left_out(scene: Scene) -> None:
 def test_no_tags_leave_an_example(scene: Scene) -> None:
     rig, text, notes = scene.moving("base", "hand").images("/cam/image", "cam", BLANK).first()
     assert list(rig.targets) == ["tag_0"]
-    assert "TODO an example: no tags were seen" in text
+    assert "TODO an example: no targets were seen" in text
     assert any("no tags in 2 images" in note for note in notes)
 
 
