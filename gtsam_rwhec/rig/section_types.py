@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
@@ -56,13 +56,38 @@ def unit_of(key: str, field: FieldInfo | None = None) -> str:
     return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
 
 
+#: Every YAML reader reads these strings as strings without quotes.
+_PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)$)[/]?[A-Za-z][A-Za-z0-9_/.]*", re.IGNORECASE)
+
+
 def in_yaml(value: Any) -> str:
-    """A value as YAML in one line, for pages and messages."""
+    """A value as YAML in one line; what a section does not have is left out."""
+    if isinstance(value, BaseModel):
+        value = {key: item for key, item in value if item is not None}
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {in_yaml(item)}" for key, item in value.items()) + "}" if value else "..."
+        return "{" + ", ".join(f"{key}: {in_yaml(item)}" for key, item in value.items()) + "}"
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(in_yaml, value)) + "]"
-    return value if isinstance(value, str) else json.dumps(value)
+    if isinstance(value, float):
+        return number(value)
+    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value, ensure_ascii=False)
+
+
+def number(value: float) -> str:
+    """The fewest digits (at most 17) that are read as the same double, always with a decimal point.
+
+    Without the point, YAML 1.1 takes 1e-05 for text and 1 for an integer.
+    """
+    text = repr(float(value) + 0.0)  # + 0.0: no -0.0
+    mantissa, e, exponent = text.partition("e")
+    return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The sections that a field's value, or an item of it, may be."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in models_in(part)]
 
 
 def is_name(text: str) -> bool:

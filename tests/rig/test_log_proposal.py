@@ -251,7 +251,7 @@ def test_no_tags_leave_an_example(scene: Scene) -> None:
     rig, text, notes = scene.moving("base", "hand").images("/cam/image", "cam", BLANK).first()
     assert list(rig.targets) == ["tag_0"]
     assert "TODO an example: no targets were seen" in text
-    assert any("no tags in 2 images" in note for note in notes)
+    assert any("no target in 2 images" in note for note in notes)
 
 
 def test_frames_that_a_rig_file_cannot_name(scene: Scene) -> None:
