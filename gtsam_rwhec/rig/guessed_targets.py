@@ -174,60 +174,48 @@ def _of_family(family: str, ids: dict[int, int], looked_at: int, views: Sequence
     is_aruco = family.startswith("aruco")
     if len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
         layout = layout_of(("charuco", "tag_grid") if is_aruco else ("tag_grid",), order, views)
+        if layout is None and is_aruco:
+            layout = Layout("charuco", *_squares(order[-1] - order[0] + 1), MARKER_M / SQUARE_M)
         if layout is not None:
-            yield _of_layout(family, order[0], layout)
+            yield _of_layout(family, order, layout)
             return
-    if is_aruco and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
-        columns, rows = _squares(order[-1] - order[0] + 1)
-        board = CharucoTarget(
-            type="charuco", family=family, squares=(columns, rows), square_m=SQUARE_M, marker_m=MARKER_M,
-            first_id=order[0],
-        )  # fmt: skip
-        remark = f"TODO count the squares, measure: a guess from markers {_listed(order)}"
-        yield Guess(f"board_{family.removeprefix('aruco_')}", board, remark)
-        return
     for i in order:
         tag = TagTarget(type="tag", family=family, id=i, size_m=TAG_M)
         yield Guess(f"{family}_{i}", tag, f"{TODO}; seen in {ids[i]} of {looked_at} images")
 
 
-def _of_layout(family: str, first: int, layout: Layout) -> Guess:
-    """A board with the columns and rows found in the images."""
-    counts = layout.columns, layout.rows
-    fits = (
-        f"the tags lie so in {layout.images} images, to {rounded(layout.off, 2)} of a tag's side; other columns and "
-        "rows do not fit"
-    )
+def _of_layout(family: str, ids: list[int], layout: Layout) -> Guess:
+    """A board with the columns and rows found in the images, or with guessed ones."""
+    counts, gap, first = (layout.columns, layout.rows), 1.0 / layout.share - 1.0, ids[0]
     if layout.kind == "charuco":
         marker_m = float(f"{SQUARE_M * layout.share:.3g}")
         section: TargetSection = CharucoTarget(
             type="charuco", family=family, squares=counts, square_m=SQUARE_M, marker_m=marker_m, first_id=first
         )
-        return Guess(f"board_{family.removeprefix('aruco_')}", section, f"{TODO} a square and a marker; {fits}")
-    gap = 1.0 / layout.share - 1.0
-    if layout.kind == "aprilgrid":
+        name, lengths = f"board_{family.removeprefix('aruco_')}", "a square and a marker"
+    elif layout.kind == "aprilgrid":
         section = AprilGridTarget(
             type="aprilgrid", family=family, tags=counts, tag_m=TAG_M, spacing=round(gap, 3), first_id=first
         )
-        return Guess(f"grid_{family}", section, f"{TODO} a tag, and the gap over it (spacing); {fits}")
-    section = TagGridTarget(
-        type="tag_grid", family=family, tags=counts, tag_m=TAG_M, gap_m=float(f"{TAG_M * gap:.3g}"), first_id=first
-    )
-    return Guess(f"grid_{family}", section, f"{TODO} a tag and the gap; {fits}")
+        name, lengths = f"grid_{family}", "a tag, and the gap over it (spacing)"
+    else:
+        section = TagGridTarget(
+            type="tag_grid", family=family, tags=counts, tag_m=TAG_M, gap_m=float(f"{TAG_M * gap:.3g}"), first_id=first
+        )
+        name, lengths = f"grid_{family}", "a tag and the gap"
+    if not layout.images:
+        return Guess(name, section, f"TODO count them, measure {lengths}: a guess from the ids {_listed(ids)}")
+    fits = f"the tags lie so in {layout.images} images, to {rounded(layout.off, 2)} of a tag's side"
+    return Guess(name, section, f"{TODO} {lengths}; {fits}; other columns and rows do not fit")
 
 
 def _aprilgrid(family: str, ids: list[int], views: Sequence[Sequence[SeenTag]]) -> Guess:
     layout = layout_of(("aprilgrid",), ids, views)
-    if layout is not None:
-        return _of_layout(family, ids[0], layout)
-    first, last = ids[0], ids[-1]
-    side = math.isqrt(last - first + 1)
-    columns = side if side * side == last - first + 1 else side + 1
-    rows = math.ceil((last - first + 1) / columns)
-    section = AprilGridTarget(
-        type="aprilgrid", family=family, tags=(columns, rows), tag_m=TAG_M, spacing=SPACING, first_id=first
-    )
-    return Guess(f"grid_{family}", section, f"TODO count the tags, measure: a guess from tags {_listed(ids)}")
+    if layout is None:
+        count = ids[-1] - ids[0] + 1
+        columns = math.ceil(math.sqrt(count))
+        layout = Layout("aprilgrid", columns, math.ceil(count / columns), 1.0 / (1.0 + SPACING))
+    return _of_layout(family, ids, layout)
 
 
 def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Iterator[Guess]:
@@ -284,8 +272,8 @@ class Layout:
     rows: int
     share: float  #: A tag's side over the step from one to the next; of a ChArUco board over a square's side
     #: Root mean square error of the tags' centres, over a tag's side; the median over images
-    off: float
-    images: int  #: The images that were compared
+    off: float = math.nan
+    images: int = 0  #: The images that were compared; none if the layout is a guess
 
 
 def layout_of(kinds: Iterable[Kind], ids: Sequence[int], views: Iterable[Sequence[SeenTag]]) -> Layout | None:

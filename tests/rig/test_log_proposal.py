@@ -305,7 +305,7 @@ def test_markers_in_a_row_are_a_board(family: str, ids: range, columns: int, row
     assert isinstance(board, CharucoTarget)
     assert (*board.squares, board.family, board.first_id) == (columns, rows, named, ids[0])
     assert board.target("board").ids == tuple(ids)
-    assert "TODO count the squares, measure" in guess.remark
+    assert "TODO count them, measure" in guess.remark
     assert remarks == []
 
 
