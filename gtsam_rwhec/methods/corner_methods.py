@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from rwhec_factors import se3
@@ -16,6 +18,7 @@ from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
 from gtsam_rwhec.methods.levenberg_marquardt import Descent, Linearised, descend
 
+Pose = TypeVar("Pose")
 #: Boards have their stated shape.
 FLAT = np.zeros(SHAPE)
 
@@ -43,6 +46,11 @@ class Corners:
     def number(self) -> int:
         """The number of corners that were seen."""
         return sum(int(stack.known.sum()) for stack in self.stacks)
+
+    def named(self, frames: Sequence[Pose]) -> tuple[dict[str, Pose], dict[str, Pose]]:
+        """X and Y by name."""
+        n = len(self.targets)
+        return dict(zip(self.targets, frames[:n], strict=True)), dict(zip(self.sensors, frames[n:], strict=True))
 
     def frames_of(self, stack: Stack) -> tuple[int, int]:
         """The numbers of a stack's target and sensor."""

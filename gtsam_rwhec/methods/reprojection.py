@@ -218,12 +218,10 @@ def _deviations(carrier: CarrierNoise | None) -> tuple[float, float] | None:
 
 def _ours(observations: Observations, carrier: CarrierNoise | None) -> Descend:
     def descent(corners: Corners, start: Array, max_iterations: int) -> Descent[Array]:
-        n = len(corners.targets)
         told = CornerOptions(
             stated="exact", carrier_noise=carrier or "exact", outliers=False, max_iterations=max_iterations
         )
-        X, Y = dict(zip(corners.targets, start[:n], strict=True)), dict(zip(corners.sensors, start[n:], strict=True))
-        refined = refine_corners(observations, X, Y, told)
+        refined = refine_corners(observations, *corners.named([*start]), told)
         poses = [*(refined.X[name] for name in corners.targets), *(refined.Y[name] for name in corners.sensors)]
         frames = np.array([pose.matrix() for pose in poses])
         deviations = _deviations(carrier)
@@ -249,11 +247,10 @@ def _answer(
     found = descent(corners, start, options.max_iterations)
     seconds = time.perf_counter() - begun
     poses = [to_pose3(frame[:3, :3], frame[:3, 3]) for frame in found.point]
-    cost, n = corners.cost(found.point), len(corners.targets)
+    cost = corners.cost(found.point)
     return ReprojectionAnswer(
         name,
-        dict(zip(corners.targets, poses[:n], strict=True)),
-        dict(zip(corners.sensors, poses[n:], strict=True)),
+        *corners.named(poses),
         found.cost,
         cost,
         float(corners.corner_px * np.sqrt(2.0 * cost / corners.number)),

@@ -156,6 +156,8 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
         model = _section(path, file.data)
         keys = f" with {', '.join(keys_of(model))}" if model else " with type and sizes"
         return f"{shown(given)}; give a section{keys}"
+    if kind == "greater_than":
+        return f"{given:g} must be above {context['gt']:g}"
     if kind in _KINDS:
         return f"{shown(given)}; {_KINDS[kind]}"
     return str(context.get("error", fault["msg"]))

@@ -38,14 +38,19 @@ class InSchema:
         return handler(core) | self.keywords
 
 
-class OrText:
-    """In the JSON Schema: text may stand in place of a section, and is described by these words."""
+class Or:
+    """In the JSON Schema: a value of this schema may stand in place of a section."""
 
-    def __init__(self, words: str) -> None:
-        self.words = words
+    def __init__(self, **schema: Any) -> None:
+        self.schema = schema
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"anyOf": [{"type": "string", "minLength": 1, "description": self.words}, handler(core)]}
+        return {"anyOf": [self.schema, handler(core)]}
+
+
+def or_text(words: str) -> Or:
+    """Text may stand in place of a section, and is described by these words."""
+    return Or(type="string", minLength=1, description=words)
 
 
 def unit_of(key: str, field: FieldInfo | None = None) -> str:
@@ -117,12 +122,6 @@ def _text(text: str) -> str:
     return text
 
 
-def _positive(number: float) -> float:
-    if not number > 0.0:
-        raise ValueError(f"{number:g} must be above 0")
-    return number
-
-
 def _length(number: float) -> float:
     if not number > 0.0:
         raise ValueError(f"{number:g} is not a length; give metres, above 0")
@@ -162,7 +161,7 @@ Name: TypeAlias = Annotated[str, AfterValidator(_name), InSchema(pattern=f"^{NAM
 Text: TypeAlias = Annotated[str, AfterValidator(_text), InSchema(minLength=1, maxLength=LONGEST_TEXT)]
 FramePair: TypeAlias = Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")]
 EulerAxes: TypeAlias = Annotated[str, AfterValidator(_axes), InSchema(pattern="^(rotation_vector|[xyz]{3}|[XYZ]{3})$")]
-Positive: TypeAlias = Annotated[float, AfterValidator(_positive), InSchema(exclusiveMinimum=0)]
+Positive: TypeAlias = Annotated[float, Field(gt=0)]
 Length: TypeAlias = Annotated[float, AfterValidator(_length), InSchema(exclusiveMinimum=0, exclusiveMaximum=LARGEST_M)]
 TimeOffset: TypeAlias = Annotated[float | Literal["estimate"], BeforeValidator(_offset)]
 

@@ -21,7 +21,6 @@ from gtsam_rwhec.rig.section_types import (
     EulerAxes,
     FramePair,
     Name,
-    OrText,
     Positive,
     Section,
     Text,
@@ -30,6 +29,7 @@ from gtsam_rwhec.rig.section_types import (
     needed,
     one_of,
     optional,
+    or_text,
 )
 
 #: REP 103: a link's x is forward, y left, z up; an optical frame's z is forward, x right, y down. T_link_optical's R.
@@ -155,7 +155,7 @@ def _as_section(given: Any) -> Any:
 
 #: A section, or text alone: a file, or the word estimate.
 IntrinsicsOrText: TypeAlias = Annotated[
-    Intrinsics, BeforeValidator(_as_section), OrText("a file of intrinsics, or the word estimate")
+    Intrinsics, BeforeValidator(_as_section), or_text("a file of intrinsics, or the word estimate")
 ]
 
 
@@ -305,7 +305,7 @@ class Sensor(Section):
         unit="s",
     )
     frame: Name | None = optional("its frame in the results; without it the sensor's name", "cam_left_optical")
-    link: Annotated[Link, BeforeValidator(_frame_or_section), OrText("the name of the frame")] | None = optional(
+    link: Annotated[Link, BeforeValidator(_frame_or_section), or_text("the name of the frame")] | None = optional(
         "the frame of a camera's body; it takes the optical frame's place in the files for ROS", "camera_link"
     )
 
