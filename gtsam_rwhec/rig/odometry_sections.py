@@ -85,11 +85,7 @@ class OdometrySource(Section):
     @model_validator(mode="after")
     def _is_one(self) -> OdometrySource:
         given = self._given("topic", "tf", "file")
-        if len(given) != 1:
-            raise ValueError(
-                f"{' and '.join(given) or 'nothing'} given; give one of topic (of Odometry or PoseStamped), "
-                "tf: [start, sensor] and file (TUM)"
-            )
+        self._need_one(given, "topic (of Odometry or PoseStamped), tf: [start, sensor] and file (TUM)")
         return self
 
     @property

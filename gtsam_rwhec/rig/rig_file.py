@@ -141,9 +141,6 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
         return f"is missing{'' if field is None else _about(str(path[-1]), field)}"
     if kind == "extra_forbidden":
         model = _section(path[:-1], file.data)
-        counted = getattr(model, "counted", "")
-        if counted and path[-1] in ("columns", "rows"):
-            return f"not a key any more; {_counts_before(file.data['targets'][path[1]], counted)}"
         return suggestion(str(path[-1]), list(keys_of(model)) if model else [])
     if kind == "literal_error":
         section = " or a section" if path == ("noise",) else ""
@@ -168,14 +165,6 @@ def _about(key: str, field: FieldInfo) -> str:
     unit = unit_of(key, field)
     example = f", such as {key}: {in_yaml(field.examples[0])}" if field.examples else ""
     return f": {field.description}{f', {unit}' if unit else ''}{example}" if field.description else ""
-
-
-def _counts_before(target: dict[str, Any], counted: str) -> str:
-    """The keys that replace columns and rows of old rig files."""
-    across, down = (target.get(key) for key in ("columns", "rows"))
-    if isinstance(across, int) and isinstance(down, int):
-        return f"columns: {across}, rows: {down} is now {counted}: [{across}, {down}]"
-    return f"columns and rows are now {counted}: [across, down]"
 
 
 def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:

@@ -175,6 +175,11 @@ class Section(BaseModel):
         """The keys among `names` that the section has."""
         return [name for name in names if getattr(self, name) is not None]
 
+    def _need_one(self, given: list[str], words: str) -> None:
+        """Raise unless one key is given; `words` say of which."""
+        if len(given) != 1:
+            raise ValueError(f"{' and '.join(given) or 'nothing'} given; give one of {words}")
+
 
 def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...] = ()) -> ConfigDict:
     """For the JSON Schema of a section: exactly one of these keys, or sets of keys, must be there.

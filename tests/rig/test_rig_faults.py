@@ -22,7 +22,7 @@ FAULTS = [
     ("[base, hand]", "base", 5, "carriers.poses.tf: 'base'; give two frames, [parent, child]"),
     ("[base, hand]", "[base, /hand]", 5, "'/hand' cannot be a frame's name: a name has first a letter,"),
     ("{tf: [base, hand]}", "{topic: /pose}", 5, "carriers.poses: name the frames of the poses of /pose: parent:"),
-    ("{tf: [base, hand]}", "{}", 5, "carriers.poses: give one of tf: [parent, child], topic: ... (with parent and"),
+    ("{tf: [base, hand]}", "{}", 5, "carriers.poses: nothing given; give one of tf: [parent, child], topic: ..."),
     ("{tf: [base, hand]}", "{tf: [base, hand], child: hand}", 5, "tf names both frames already; leave parent"),
     ("{tf: [base, hand]}", "/pose", 5, "carriers.poses: '/pose'; give a section with tf, topic, parent, child"),
     ("targets: base", "targets: hand", 4, "carriers.targets: 'hand' also carries the sensors; name two different"),
