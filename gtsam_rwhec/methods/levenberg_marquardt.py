@@ -79,10 +79,15 @@ def descend(
 def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: int) -> Array:
     """Parameters (k,) of a local minimum of x(p)' Q x(p), for a form Q (m, m), m >= k, from ``start`` (k,)."""
     L = root(form)
-    found = least_squares(
-        lambda p: L @ chart(p)[0], start, lambda p: L @ chart(p)[1], method="lm", ftol=STOP, xtol=STOP, gtol=STOP,
-        max_nfev=max_iterations,
-    )  # fmt: skip
+
+    def residual(p: Array) -> Array:
+        return L @ chart(p)[0]
+
+    def jacobian(p: Array) -> Array:
+        return L @ chart(p)[1]
+
+    tolerances = {"ftol": STOP, "xtol": STOP, "gtol": STOP}
+    found = least_squares(residual, start, jacobian, method="lm", max_nfev=max_iterations, **tolerances)
     return np.asarray(found.x)
 
 
