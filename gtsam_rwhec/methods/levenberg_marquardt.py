@@ -86,8 +86,9 @@ def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: in
     def jacobian(p: Array) -> Array:
         return L @ chart(p)[1]
 
-    tolerances = {"ftol": STOP, "xtol": STOP, "gtol": STOP}
-    found = least_squares(residual, start, jacobian, method="lm", max_nfev=max_iterations, **tolerances)
+    found = least_squares(
+        residual, start, jacobian, method="lm", ftol=STOP, xtol=STOP, gtol=STOP, max_nfev=max_iterations
+    )
     return np.asarray(found.x)
 
 

@@ -40,7 +40,7 @@ from gtsam_rwhec.methods.method import (
     Poses,
     Properties,
     Takes,
-    check_options,
+    checked_options,
     checked_start,
 )
 from gtsam_rwhec.problem.problem import Problem
@@ -136,8 +136,7 @@ def run(
         When the closed form finds that the motions do not determine the poses.
     """
     check_arguments(observations, None)
-    check_options(options)
-    options = options or MethodOptions()
+    options = checked_options(options)
     descent = _descent(name, parameterisation, carrier)
     X, Y, starts_from = _start(observations, options)
     return _answer(name, descent, Corners.of(observations), X, Y, options, starts_from)
@@ -168,8 +167,7 @@ def compare(
         When there is no start, as ``rw.solve`` does.
     """
     check_arguments(observations, None)
-    check_options(options)
-    options = options or MethodOptions()
+    options = checked_options(options)
     names = tuple(methods)
     descents = {name: _ours(observations, carrier) if name == OURS else _descent(name, "axis-angle", carrier)
                 for name in names}  # fmt: skip
@@ -188,9 +186,8 @@ def compare(
     return ReprojectionTable(tuple(rows))
 
 
-def certified_start(observations: Observations, options: MethodOptions | None = None) -> tuple[Poses, Poses]:
+def certified_start(observations: Observations, options: MethodOptions) -> tuple[Poses, Poses]:
     """X and Y of the certified solution, which also chooses between the two candidate poses of each image."""
-    options = options or MethodOptions()
     solution = solved_with_chosen_poses(
         observations, lambda problem: quiet_solution(problem, options), lambda answer: (answer.X, answer.Y)
     )

@@ -172,7 +172,10 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
     model: type[BaseModel] | None = RigFile
     models: list[type[BaseModel]] = [RigFile]
     for key in path:
-        data = data[key] if isinstance(data, (dict, tuple, list)) else None
+        try:
+            data = data[key]
+        except (TypeError, LookupError):
+            data = None
         field = keys_of(model).get(str(key)) if model else None
         if field is not None:  # else the key is the name or the number of an item
             models = models_in(field.annotation)
