@@ -398,7 +398,4 @@ def _rotations_of_vec(vectors: Array) -> Array:
             "two different axes"
         )
     R: Array = U @ Wt
-    for rotation, ((a, b, c), (d, e, f), (g, h, i)) in zip(R, R.tolist(), strict=True):
-        if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0.0:
-            rotation *= -1.0
-    return R
+    return R * np.sign(np.linalg.det(R))[:, None, None]
