@@ -54,13 +54,11 @@ class LomOptions:
     max_iterations: int = 1000  #: 1000, as in Section 8; from a start near the answer ten suffice
 
     def __post_init__(self) -> None:
-        if isinstance(self.weights, tuple):
-            if len(self.weights) != 2 or not all(np.isfinite(s) and s > 0.0 for s in self.weights):
-                raise OptionError(f"LomOptions.weights={self.weights!r}; give (sigma_R rad, sigma_t m), both positive")
-        elif self.weights not in ("paper", "matched"):
-            raise OptionError(
-                f"LomOptions.weights={self.weights!r} is not 'paper', 'matched' or (sigma_R rad, sigma_t m)"
-            )
+        w = self.weights
+        is_pair = isinstance(w, tuple) and len(w) == 2 and all(np.isfinite(s) and s > 0.0 for s in w)
+        if not is_pair and w not in ("paper", "matched"):
+            words = "is not 'paper', 'matched' or (sigma_R rad, sigma_t m), both positive"
+            raise OptionError(f"LomOptions.weights={w!r} {words}")
         if self.max_iterations < 1:
             raise OptionError(f"LomOptions.max_iterations={self.max_iterations!r}; give a positive number")
 

@@ -397,5 +397,6 @@ def _rotations_of_vec(vectors: Array) -> Array:
             "the largest singular pair of the sum of R_B (x) R_A is not a pair of rotations; add poses that turn about "
             "two different axes"
         )
-    R: Array = U @ Wt
-    return R * np.sign(np.linalg.det(R))[:, None, None]
+    R = U @ Wt
+    rotations: Array = R * np.sign(np.linalg.det(R))[:, None, None]
+    return rotations
