@@ -137,14 +137,11 @@ def _download(session: requests.Session, url: str, file: RemoteFile) -> bytes:
     try:
         response = session.get(url, timeout=TIMEOUT_S)
         status, reason, content = response.status_code, response.reason, response.content
-    except requests.Timeout as error:
-        raise FetchError(f"{url}: no answer in time. Call again. {KEPT}") from error
-    except requests.ConnectionError as error:
-        raise FetchError(
-            f"{url}: no connection. Is there a network, or a proxy to set (HTTPS_PROXY)? Call again later. {KEPT}"
-        ) from error
     except requests.RequestException as error:
-        raise FetchError(f"{url} cannot be downloaded: {error}.") from error
+        raise FetchError(
+            f"{url} cannot be downloaded: {error}. Is there a network, or a proxy to set (HTTPS_PROXY)? Call again "
+            f"later. {KEPT}"
+        ) from error
     if status == requests.codes.not_found:
         raise FetchError(
             f"{url}: not found (404). Has the repository moved its files? Give the new folder as base_url."

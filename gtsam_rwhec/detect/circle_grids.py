@@ -103,18 +103,23 @@ def grids(blobs: Ellipses, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
     """
     if not (1.0 - MOST_MISSING) * board.columns * board.rows <= len(blobs.places) <= MOST_BLOBS:
         return
-    taken = np.zeros(len(blobs.places), dtype=bool)
-    for seed, first, second in _seeds(blobs):
-        if taken[seed]:
-            continue
-        members, cells = _grown(blobs, seed, first, second)
-        taken[members] = True
+    for members, cells in grown_lattices(blobs):
         for which in _placed(members, cells, board):
             there = which >= 0
             yield (
                 np.where(there[..., None], blobs.places[which], np.nan),
                 np.where(there, np.sqrt(blobs.areas[which]), np.nan),
             )
+
+
+def grown_lattices(blobs: Ellipses) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Lattices of blobs, those whose seeds fit best first: which blobs (m,), and their cells (m, 2)."""
+    taken = np.zeros(len(blobs.places), dtype=bool)
+    for seed, first, second in _seeds(blobs):
+        if not taken[seed]:
+            members, cells = _grown(blobs, seed, first, second)
+            taken[members] = True
+            yield members, cells
 
 
 def _seeds(blobs: Ellipses) -> Iterator[tuple[int, Array, Array]]:
@@ -396,6 +401,14 @@ def find_circle_grid(gray: Gray, board: CircleGrid, camera: Camera) -> FoundBoar
 
 def _candidates(gray: Gray, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
     """Grids of blobs (rows, columns, 2), with the blobs' radii (rows, columns), pixels; nan where one is missing."""
+    for blobs, halved in blobs_in(gray):
+        for grid, radii in grids(blobs, board):
+            # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
+            yield (2.0 * grid + 0.5, 2.0 * radii) if halved else (grid, radii)
+
+
+def blobs_in(gray: Gray) -> Iterator[tuple[Ellipses, bool]]:
+    """Dark blobs, then light ones, more and more of them; and whether they are in pixels of half the image's size."""
     for halved in (True, False) if max(gray.shape) > LARGE_PX else (False,):
         picture = gray
         if halved:
@@ -406,10 +419,7 @@ def _candidates(gray: Gray, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
         for around in AROUND_PX[:1] if large else AROUND_PX:
             dark = dark.with_more(ellipses(picture, around, light=False))
             light = light.with_more(ellipses(picture, around, light=True))
-            for blobs in (dark, light):
-                for grid, radii in grids(blobs, board):
-                    # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
-                    yield (2.0 * grid + 0.5, 2.0 * radii) if halved else (grid, radii)
+            yield from ((blobs, halved) for blobs in (dark, light))
 
 
 def _tested(gray: Gray, board: CircleGrid, grid: Array, radii_px: Array, camera: Camera) -> FoundBoard:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, WeightsWarning
 from gtsam_rwhec.geometry.poses import Array
@@ -75,10 +76,7 @@ def certified_motions(request: Request) -> Outcome[Array]:
     problem = Problem(scale="known" if known else "shared", keep_measurements=False)
     name = "h" if known else "c"  # whose pose the problem is about
     problem.add_motion(name, *((C, H) if known else (H, C)), sigma, kappa)
-    with warnings.catch_warnings():  # the answer holds both facts: free directions and bound
-        warnings.simplefilter("ignore", NotUniqueWarning)
-        warnings.simplefilter("ignore", NotCertifiedWarning)
-        solution = solve(problem)
+    solution = quiet_solution(problem, MethodOptions())
     Y, scale = solution.Y[name], solution.scale
     if isinstance(scale, dict):
         scale = scale[name]
@@ -123,7 +121,7 @@ def certified_poses(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Arr
     OpenCV's calls have no unit either: the solver's unit of length is the spread of the given translations.
     """
     unit = float(np.sqrt(t_A.var(axis=0).sum() + t_B.var(axis=0).sum())) or 1.0
-    A, B = _transforms(R_A, t_A / unit), _transforms(R_B, t_B / unit)
+    A, B = pose(R_A, t_A / unit), pose(R_B, t_B / unit)
     residual = _solved(A, B).residuals[Pair("target", "camera")]
     sigma = max(residual.translation_rms_m, LEAST_RESIDUAL) / np.sqrt(3.0)
     sigma_rad = max(residual.rotation_rms_rad, LEAST_RESIDUAL) / np.sqrt(3.0)
@@ -138,9 +136,3 @@ def _solved(A: Array, B: Array, sigma: float | None = None, kappa: float | None 
     problem = Problem(keep_measurements=False)
     problem.add("target", "camera", A, B, sigma, kappa)
     return solve(problem)
-
-
-def _transforms(R: Array, t: Array) -> Array:
-    T = np.zeros((len(R), 4, 4))
-    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R, t, 1.0
-    return T

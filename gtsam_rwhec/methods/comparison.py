@@ -35,8 +35,8 @@ from gtsam_rwhec.methods.method import (
     MethodOptions,
     Outcome,
     Takes,
-    check_options,
     check_problem,
+    checked_options,
     refusal,
 )
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
@@ -257,12 +257,11 @@ def compare(
     """
     if methods is not None and (isinstance(methods, str) or not np.iterable(methods)):
         raise OptionError(f"methods={brief(methods)}; give a list of names: ['shah2013']")
-    check_options(options)
+    options = checked_options(options)
     check_progress(progress)
     names = [*METHODS, *PAIR_SOLVERS] if methods is None else list(methods)
     of_motions = {name: PAIR_SOLVERS[name] for name in names if isinstance(name, str) and name in PAIR_SOLVERS}
     chosen = dict.fromkeys(method_of(name) for name in names if not (isinstance(name, str) and name in PAIR_SOLVERS))
-    options = options or MethodOptions()
     check_problem(CERTIFIED, problem)
     if progress is not None:
         progress("certified")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from rwhec_factors import se3
@@ -14,8 +16,9 @@ from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods.iterative_methods import CHARTS, Parameterisation
-from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
+from gtsam_rwhec.methods.levenberg_marquardt import Descent, Linearised, descend
 
+Pose = TypeVar("Pose")
 #: Boards have their stated shape.
 FLAT = np.zeros(SHAPE)
 
@@ -44,6 +47,11 @@ class Corners:
         """The number of corners that were seen."""
         return sum(int(stack.known.sum()) for stack in self.stacks)
 
+    def named(self, frames: Sequence[Pose]) -> tuple[dict[str, Pose], dict[str, Pose]]:
+        """X and Y by name."""
+        n = len(self.targets)
+        return dict(zip(self.targets, frames[:n], strict=True)), dict(zip(self.sensors, frames[n:], strict=True))
+
     def frames_of(self, stack: Stack) -> tuple[int, int]:
         """The numbers of a stack's target and sensor."""
         return self.targets.index(stack.target), len(self.targets) + self.sensors.index(stack.sensor)
@@ -61,16 +69,6 @@ class Corners:
             error = pixel_errors(stack, frames[i], frames[j], self.A, stack.camera.parameters, FLAT)
             total += 0.5 * float((error**2).sum()) / self.corner_px**2
         return total
-
-
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """The end of a method's descent: the frames (n, 4, 4), its own cost there, its steps, and whether it converged."""
-
-    frames: Array
-    cost: float
-    iterations: int
-    converged: bool
 
 
 #: Deviations (rad, m) of a robot's pose for each pixel of a corner's, where information matrices are the identity.
@@ -109,7 +107,7 @@ class Bordered(Linearised):
 
 def evangelista_minimum(
     corners: Corners, start: Array, max_iterations: int, carrier: tuple[float, float] | None = None
-) -> Minimum:
+) -> Descent[Array]:
     """A local minimum of half of Evangelista's cost, from frames (n, 4, 4).
 
     The graph extends that of Koide and Menegatti (RA-L 2019). Its vertices are all X and Y, and the target's pose B_i
@@ -123,7 +121,7 @@ def evangelista_minimum(
     deviations = carrier or (IDENTITY[0] * corners.corner_px, IDENTITY[1] * corners.corner_px)
     begin = _graph_at(corners, start, corners.A)
     found = descend(lambda graph: graph_model(corners, graph, deviations), _moved, begin, max_iterations)
-    return Minimum(found.point.frames, found.cost, found.iterations, found.converged)
+    return Descent(found.point.frames, found.cost, found.iterations, found.converged)
 
 
 def cost_at(corners: Corners, frames: Array, A: Array, deviations: tuple[float, float]) -> float:
@@ -211,7 +209,7 @@ def weights_of(corners: Corners) -> dict[str, float]:
 
 def rp1_minimum(
     corners: Corners, start: Array, max_iterations: int, parameterisation: Parameterisation = "axis-angle"
-) -> Minimum:
+) -> Descent[Array]:
     """A local minimum of half of rp1 over corner_px^2, from frames (n, 4, 4); OptionError for an unknown chart.
 
     rp1 = sum_c w_c sum_images sum_corners |u(Y_c^-1 A X p) - u|^2, with w_c = fewest images of a camera / camera c's,
@@ -228,8 +226,7 @@ def rp1_minimum(
         p,
         max_iterations,
     )
-    frames, _ = frames_of(found.point, parameterisation)
-    return Minimum(frames, found.cost, found.iterations, found.converged)
+    return replace(found, point=frames_of(found.point, parameterisation)[0])
 
 
 def frames_of(p: Array, parameterisation: Parameterisation) -> tuple[Array, Array]:

@@ -223,15 +223,14 @@ BISECTIONS = 60
 
 @dataclass(frozen=True)
 class Curve:
-    """p(lambda, mu) in x = mu / ``mu_scale`` and y = (lambda - lambda_0) / ``lambda_scale``.
+    """p(lambda, mu) in x = mu / ``mu_scale`` and y = (lambda - lambda_0) / gap.
 
-    Entry [m, n] of the coefficients (5, 9) belongs to y^m x^n; 25 are not zero: n <= 8 - 2 m. The scales are mu of
-    eq. 14 for the relaxation's q, and the gap of eq. 22.
+    Entry [m, n] of the coefficients (5, 9) belongs to y^m x^n; 25 are not zero: n <= 8 - 2 m. ``mu_scale`` is mu
+    of eq. 14 for the relaxation's q, and the gap is that of eq. 22.
     """
 
     coefficients: Array
     mu_scale: float
-    lambda_scale: float
 
     def in_x(self, y: float) -> Array:
         """Coefficients (9,) of the polynomial in x at one y, x^0 first, scaled so that the largest is one."""
@@ -254,7 +253,7 @@ def curve(relaxed: RelaxedCost) -> Curve | None:
     entries[:, :, 0, 2] = -(mu**2) * relaxed.Z2
     entries[range(4), range(4), 1, 0] = -gap
     entries /= np.abs(entries).max(axis=(1, 2, 3))[:, None, None, None]
-    return Curve(_determinant(entries.reshape(4, 4, 18)), mu, gap)
+    return Curve(_determinant(entries.reshape(4, 4, 18)), mu)
 
 
 def _determinant(entries: Array) -> Array:

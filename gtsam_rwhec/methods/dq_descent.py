@@ -28,7 +28,7 @@ from gtsam_rwhec.methods.dual_quaternion_cost import (
     to_transform,
 )
 from gtsam_rwhec.methods.hand_eye_request import Request, free_directions, free_of_rotations_alone
-from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
+from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart, unit_quaternions
 from gtsam_rwhec.methods.method import Outcome
 from gtsam_rwhec.methods.motions import Motions, squared_residuals
 
@@ -162,10 +162,9 @@ def _descend(form: Array, lift: Lift, start: Array, unit: float) -> Array:
     """Minimise y' form y over poses from a start (4, 4), translations in units of ``unit`` metres."""
 
     def chart(x: Array) -> tuple[Array, Array]:
-        length = float(np.linalg.norm(x[:4]))
-        q = x[:4] / length
+        (q,), (slope,) = unit_quaternions(x[None, :4])
         y, by_q, by_t = lift(q, unit * x[4:])
-        return y, np.hstack([by_q @ (np.eye(4) - np.outer(q, q)) / length, unit * by_t])
+        return y, np.hstack([by_q @ slope, unit * by_t])
 
     (q,), _ = from_transforms(start[None])
     x = descend_on_chart(form, chart, np.concatenate([q, start[:3, 3] / unit]), STEPS)

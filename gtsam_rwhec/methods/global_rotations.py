@@ -259,7 +259,7 @@ RANK_ONE = 1e-5
 
 
 @dataclass(frozen=True)
-class CertifiedRotations:
+class GlobalMinimum:
     """Rotations (n, 3, 3) of the lowest cost, a lower bound on every answer's cost, and how tight the relaxation is.
 
     ``eigenvalue_ratio`` is the relaxation's second eigenvalue over its first.
@@ -275,6 +275,16 @@ class CertifiedRotations:
         """Cost minus bound, relative to the cost; it says nothing of exact data, whose cost is rounding error."""
         return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
 
+    def outcome(self, form: UnitForm, is_optimal: bool, note: str) -> Outcome[Poses]:
+        """The method's answer."""
+        return replace(
+            form.outcome(self.R, notes=(note,)),
+            cost=self.cost,
+            cost_name=COST,
+            lower_bound=self.lower_bound,
+            is_optimal=is_optimal,
+        )
+
 
 def wise2020(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """Solve for one X and one Y, or one sensor's motions; known or shared scale."""
@@ -284,16 +294,10 @@ def wise2020(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     proof = "the relaxation is tight"
     if not is_tight:
         proof = f"the relaxation is not tight (eigenvalues' ratio {found.eigenvalue_ratio:.1e}): nothing is proven"
-    return replace(
-        form.outcome(found.R, notes=(f"{proof}; relative gap {found.gap:.1e}",)),
-        cost=found.cost,
-        cost_name=COST,
-        lower_bound=found.lower_bound,
-        is_optimal=is_tight,
-    )
+    return found.outcome(form, is_tight, f"{proof}; relative gap {found.gap:.1e}")
 
 
-def certified_rotations(form: UnitForm) -> CertifiedRotations:
+def certified_rotations(form: UnitForm) -> GlobalMinimum:
     """Solve the relaxation by Clarabel, descend from its rotations, and take the best of three lower bounds."""
     reduced = form.reduced
     Q = reduced.Q
@@ -309,7 +313,7 @@ def certified_rotations(form: UnitForm) -> CertifiedRotations:
     ]
     bounds.append(_relaxation_bound(Q, relaxation))
     values = np.linalg.eigvalsh(relaxation.X)
-    return CertifiedRotations(best.R, best.cost, max(bounds), float(max(values[-2], 0.0) / values[-1]))
+    return GlobalMinimum(best.R, best.cost, max(bounds), float(max(values[-2], 0.0) / values[-1]))
 
 
 def _relaxation_bound(Q: Array, relaxation: Relaxation) -> float:
@@ -343,50 +347,34 @@ TIGHT = 1e-5
 ROUNDING = 1e-8
 
 
-@dataclass(frozen=True)
-class PolynomialMinimum:
-    """Rotations (n, 3, 3), their cost, the relaxation's lower bound, and whether the bound proves the answer."""
-
-    R: Array
-    cost: float
-    lower_bound: float
-    is_tight: bool
-
-
 def heller2014(
     problem: Problem, options: MethodOptions, parameterisation: Parameterisation = "quaternion"
 ) -> Outcome[Poses]:
     """Solve for one X and one Y, or one sensor's motions, of known scale."""
     form = UnitForm.of(problem)
-    found = global_minimum(form, parameterisation)
+    found, is_tight = global_minimum(form, parameterisation)
     note = (
-        f"the relaxation of {RELAXATIONS[parameterisation]} is {'tight' if found.is_tight else 'not tight'}: cost "
+        f"the relaxation of {RELAXATIONS[parameterisation]} is {'tight' if is_tight else 'not tight'}: cost "
         f"{found.cost:.6g}, bound {found.cost - found.lower_bound:.1e} below it"
     )
-    if not found.is_tight:
-        note += "; the next order was not tried"
-    return replace(
-        form.outcome(found.R, notes=(note,)),
-        cost=found.cost,
-        cost_name=COST,
-        lower_bound=found.lower_bound,
-        is_optimal=found.is_tight,
-    )
+    return found.outcome(form, is_tight, note if is_tight else f"{note}; the next order was not tried")
 
 
-def global_minimum(form: UnitForm, parameterisation: Parameterisation = "quaternion") -> PolynomialMinimum:
-    """Solve the relaxation, descend from its answer, and bound the cost; OptionError for another parameterisation."""
+def global_minimum(form: UnitForm, parameterisation: Parameterisation = "quaternion") -> tuple[GlobalMinimum, bool]:
+    """Solve the relaxation and descend from its answer; the minimum, and whether the bound proves it.
+
+    OptionError for another parameterisation.
+    """
+    if parameterisation not in RELAXATIONS:
+        raise OptionError(f"heller2014: parameterisation={parameterisation!r} is not 'quaternion' or 'matrix'")
     if parameterisation == "matrix":
-        certified = certified_rotations(form)
-        R, cost, lower = certified.R, certified.cost, certified.lower_bound
-    elif parameterisation == "quaternion":
+        found = certified_rotations(form)
+    else:
         relaxed = solve_moments(form.reduced.Q)
         best = min((descend(form.reduced, start, STEPS) for start in relaxed.starts), key=lambda end: end.cost)
-        R, cost, lower = best.R, best.cost, min(relaxed.lower_bound, best.cost)
-    else:
-        raise OptionError(f"heller2014: parameterisation={parameterisation!r} is not 'quaternion' or 'matrix'")
-    is_tight = bool(cost - lower <= max(TIGHT * cost, ROUNDING * form.reduced.magnitude))
-    return PolynomialMinimum(R, cost, lower, is_tight)
+        found = GlobalMinimum(best.R, best.cost, min(relaxed.lower_bound, best.cost), relaxed.eigenvalue_ratio)
+    limit = max(TIGHT * found.cost, ROUNDING * form.reduced.magnitude)
+    return found, bool(found.cost - found.lower_bound <= limit)
 
 
 _SOURCE = (

@@ -27,15 +27,14 @@ from gtsam_rwhec.methods.dq_approximations import (
 )
 from gtsam_rwhec.methods.dq_descent import chvecopt, daniilidis, dqnlopt, dqnlopt_random, quatvecopt
 from gtsam_rwhec.methods.dqopt import dqopt, estimate_alpha
-from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms, motion_moments
+from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
 from gtsam_rwhec.methods.hand_eye_request import DualQuaternionPrior, Request, ScaleMode
 from gtsam_rwhec.methods.method import Estimate, Method, Outcome, Proof, Properties, Takes
 from gtsam_rwhec.methods.motions import (
     check_alpha,
     check_covariances,
-    check_one_kind,
     check_weights,
-    covariance_cost,
+    cost_of,
     motions_of,
     squared_mahalanobis,
     squared_residuals,
@@ -178,10 +177,7 @@ def solve_hand_eye(
         number = estimate_alpha(motions, w, prior)
     else:
         raise OptionError("alpha='estimate' and covariances are both given; covariances take alpha's place")
-    if information is None:
-        cost = motion_moments(motions.rows, w).cost(number)
-    else:
-        cost = covariance_cost(motions, information)
+    cost = cost_of(motions, number, w, information)
     if prior is not None:
         cost = prior.added_to(cost)
     request = Request(motions, cost, number, w, information, prior, scale, rng)
@@ -231,7 +227,6 @@ def _check_options(
 ) -> None:
     if not is_one_of(scale, get_args(ScaleMode)):
         raise OptionError(f"scale={brief(scale)} is not known; choose 'known' or 'unknown'")
-    check_one_kind(weights, covariances)
     if prior is not None and not isinstance(prior, DualQuaternionPrior):
         raise PriorError(f"the prior is a {type(prior).__name__}; give a gtsam_rwhec.methods.DualQuaternionPrior")
     for given, needed in (

@@ -31,7 +31,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations, of_vectors, right, to_rotations
-from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
+from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart, unit_quaternions
 from gtsam_rwhec.methods.linear_systems import Stack, agreement, paired_quaternions
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Outcome, Poses, Properties
 from gtsam_rwhec.problem.problem import Problem
@@ -46,22 +46,13 @@ TOLERANCE = 1e-10
 STEPS, DESCENT_STEPS = 200, 1000
 
 
-@dataclass(frozen=True)
-class Relaxed:
-    """The relaxation's answer: the nearest p (n, 4) and t (n, 3), metres, and the solver's lower bound."""
-
-    q: Array
-    t: Array
-    lower_bound: float
-
-
-def relaxed(Q: Array, frames: int) -> Relaxed:
-    """Solve the relaxation of Q (8 n, 8 n) and round its answer.
+def relaxed(Q: Array, frames: int) -> tuple[Array, Array, float]:
+    """Solve the relaxation of Q (8 n, 8 n): the nearest p (n, 4) and t (n, 3), metres, and the solver's lower bound.
 
     Beyond ``MOST_FRAMES`` the smallest eigenvector replaces the answer, and the lower bound is 0.
     """
     if frames > MOST_FRAMES:
-        return Relaxed(*rounded(_smallest_eigenvector(Q), frames), 0.0)
+        return *rounded(_smallest_eigenvector(Q), frames), 0.0
     size = 8 * frames
     scale = float(np.abs(Q).max()) or 1.0
     frame, entry = np.repeat(np.arange(frames), 4), np.tile(np.arange(4), frames)
@@ -72,8 +63,7 @@ def relaxed(Q: Array, frames: int) -> Relaxed:
     A = scipy.sparse.csc_matrix((values, (rows, columns)), (size * (size + 1) // 2, 2 * frames))
     cost, cones = np.tile([-1.0, 0.0], frames), [clarabel.PSDTriangleConeT(size)]
     multipliers, z, _ = solve_conic(cost, A, stacked(Q / scale), cones, TOLERANCE, STEPS)
-    q, t = rounded(np.linalg.eigh(unstacked(z, size))[1][:, -1], frames)
-    return Relaxed(q, t, scale * float(multipliers[::2].sum()))
+    return *rounded(np.linalg.eigh(unstacked(z, size))[1][:, -1], frames), scale * float(multipliers[::2].sum())
 
 
 def _smallest_eigenvector(Q: Array) -> Array:
@@ -104,7 +94,7 @@ def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:
     """The local minimum of z'Qz near p (n, 4) and t (n, 3): p, t and the cost."""
     start = np.concatenate([q, t], axis=1).ravel()
     found = descend_on_chart(Q, pose_chart, start, DESCENT_STEPS).reshape(-1, 7)
-    q, t = found[:, :4] / np.linalg.norm(found[:, :4], axis=1, keepdims=True), found[:, 4:]
+    (q, _), t = unit_quaternions(found[:, :4]), found[:, 4:]
     z = vector_of(q, t)
     return q, t, float(z @ Q @ z)
 
@@ -112,9 +102,7 @@ def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:
 def pose_chart(p: Array) -> tuple[Array, Array]:
     """z (8 n,) of 7 numbers a frame, a quaternion of any length and t in metres, and its derivatives (8 n, 7 n)."""
     frames = p.reshape(-1, 7)
-    length = np.linalg.norm(frames[:, :4], axis=1, keepdims=True)
-    q, t = frames[:, :4] / length, frames[:, 4:]
-    by_quaternion = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
+    (q, by_quaternion), t = unit_quaternions(frames[:, :4]), frames[:, 4:]
     n, at = len(frames), np.arange(len(frames))
     derivatives = np.zeros((n, 8, n, 7))
     derivatives[at, :4, at, :4] = by_quaternion
@@ -217,8 +205,8 @@ def solve_dual_quaternions(
     for _ in range(ROUNDS if signs == "aligned" else 1):
         sign = fitting
         Q = form_of(stack, rows_X, sign[:, None, None] * rows_Y)
-        found = relaxed(Q, len(Q) // 8)
-        q, t, cost = polished(Q, found.q, found.t)
+        q, t, bound = relaxed(Q, len(Q) // 8)
+        q, t, cost = polished(Q, q, t)
         products = agreement(q_A, q[stack.target], q[stack.sensor], q_B)
         # The common sign of a pair belongs to its frames.
         whole = np.sign(stack.sums(sign * products))[np.repeat(np.arange(len(stack.pairs)), stack.counts)]
@@ -232,7 +220,7 @@ def solve_dual_quaternions(
         to_rotations(q),
         t,
         max(cost, 0.0),
-        _bound(Q, q, t, cost, found),
+        _bound(Q, q, t, cost, bound),
         sign * reference,
         contradicted,
         float(np.abs(products).min()),
@@ -293,12 +281,12 @@ def _multiplication(q: Array, t: Array, side: Callable[[Array], Array]) -> Array
     return result
 
 
-def _bound(Q: Array, q: Array, t: Array, cost: float, found: Relaxed) -> float:
+def _bound(Q: Array, q: Array, t: Array, cost: float, bound: float) -> float:
     """The bound of the multipliers at the answer; if they prove nothing, the solver's, exact to its tolerance."""
     value, smallest = multipliers_of(Q, q, t)
     if smallest >= -1e-13 * len(Q) * float(np.abs(Q).max()):
         return min(value, cost)
-    return min(found.lower_bound, cost)
+    return min(bound, cost)
 
 
 HORN = Method(

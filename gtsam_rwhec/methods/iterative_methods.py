@@ -21,7 +21,7 @@ from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotation
 from gtsam_rwhec.methods.certified import SOURCE
 from gtsam_rwhec.methods.closed_forms import DORNAIKA_SOURCE, start_of
 from gtsam_rwhec.methods.global_rotations import UnitForm
-from gtsam_rwhec.methods.levenberg_marquardt import Chart, descend_on_chart
+from gtsam_rwhec.methods.levenberg_marquardt import Chart, descend_on_chart, unit_quaternions
 from gtsam_rwhec.methods.linear_systems import Stack, plain_form, poses_of
 from gtsam_rwhec.methods.method import (
     UNWEIGHTED,
@@ -54,13 +54,11 @@ class LomOptions:
     max_iterations: int = 1000  #: 1000, as in Section 8; from a start near the answer ten suffice
 
     def __post_init__(self) -> None:
-        if isinstance(self.weights, tuple):
-            if len(self.weights) != 2 or not all(np.isfinite(s) and s > 0.0 for s in self.weights):
-                raise OptionError(f"LomOptions.weights={self.weights!r}; give (sigma_R rad, sigma_t m), both positive")
-        elif self.weights not in ("paper", "matched"):
-            raise OptionError(
-                f"LomOptions.weights={self.weights!r} is not 'paper', 'matched' or (sigma_R rad, sigma_t m)"
-            )
+        w = self.weights
+        is_pair = isinstance(w, tuple) and len(w) == 2 and all(np.isfinite(s) and s > 0.0 for s in w)
+        if not is_pair and w not in ("paper", "matched"):
+            words = "is not 'paper', 'matched' or (sigma_R rad, sigma_t m), both positive"
+            raise OptionError(f"LomOptions.weights={w!r} {words}")
         if self.max_iterations < 1:
             raise OptionError(f"LomOptions.max_iterations={self.max_iterations!r}; give a positive number")
 
@@ -390,10 +388,8 @@ def from_rotation_vectors(p: Array) -> tuple[Array, Array]:
 
 def from_quaternions(p: Array) -> tuple[Array, Array]:
     """Rotations of quaternions (n, 4), scalar last, divided by their lengths."""
-    length = np.linalg.norm(p, axis=1)[:, None]
-    q = p / length
+    q, tangent = unit_quaternions(p)
     by_q = 2.0 * np.einsum("nd,cdik->ncik", q, ROTATION)
-    tangent = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
     derivative = np.einsum("ncik,ncm->nkim", by_q, tangent).reshape(len(p), 9, 4)
     return to_rotations(q), derivative
 

@@ -79,11 +79,24 @@ def descend(
 def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: int) -> Array:
     """Parameters (k,) of a local minimum of x(p)' Q x(p), for a form Q (m, m), m >= k, from ``start`` (k,)."""
     L = root(form)
+
+    def residual(p: Array) -> Array:
+        return L @ chart(p)[0]
+
+    def jacobian(p: Array) -> Array:
+        return L @ chart(p)[1]
+
     found = least_squares(
-        lambda p: L @ chart(p)[0], start, lambda p: L @ chart(p)[1], method="lm", ftol=STOP, xtol=STOP, gtol=STOP,
-        max_nfev=max_iterations,
-    )  # fmt: skip
+        residual, start, jacobian, method="lm", ftol=STOP, xtol=STOP, gtol=STOP, max_nfev=max_iterations
+    )
     return np.asarray(found.x)
+
+
+def unit_quaternions(p: Array) -> tuple[Array, Array]:
+    """Quaternions (n, 4) divided by their lengths, and their derivatives (n, 4, 4) by the numbers given."""
+    length = np.linalg.norm(p, axis=1, keepdims=True)
+    q = p / length
+    return q, (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
 
 
 def root(form: Array) -> Array:

@@ -180,10 +180,11 @@ class MethodOptions:
                 )
 
 
-def check_options(options: object) -> None:
-    """Raise an OptionError for options of another type."""
+def checked_options(options: MethodOptions | None) -> MethodOptions:
+    """The options, or the usual ones; an OptionError for options of another type."""
     if options is not None and not isinstance(options, MethodOptions):
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
+    return options or MethodOptions()
 
 
 def checked_start(
@@ -210,10 +211,10 @@ _FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
 
 def refusal(method: Method[Any], problem: Problem) -> RwhecError | None:
     """The error with which a method refuses a problem; None if it takes the problem."""
-    if not isinstance(method, Method) or not isinstance(problem, Problem):
-        check_problem(method, problem)  # raises: such a call is wrong, whatever the method can do
     try:
         check_problem(method, problem)
+    except OptionError:  # such a call is wrong, whatever the method can do
+        raise
     except RwhecError as error:
         return error
     return None

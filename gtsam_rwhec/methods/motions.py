@@ -24,12 +24,6 @@ from gtsam_rwhec.methods.dual_quaternion_cost import DualQuaternionCost, E, bloc
 LARGEST = 1e100
 
 
-def check_one_kind(weights: ArrayLike | None, covariances: ArrayLike | None) -> None:
-    """Refuse weights together with covariances (OptionError)."""
-    if weights is not None and covariances is not None:
-        raise OptionError("weights and covariances are both given; put the weights into the covariances")
-
-
 def check_alpha(alpha: float | str) -> float:
     """Alpha as a float; an OptionError when it is not a positive number from 1 / LARGEST to LARGEST."""
     if not is_between(alpha, 1.0 / LARGEST, LARGEST):
@@ -286,7 +280,8 @@ def cost_of(
     OptionError, CountError, NoiseError
         For an alpha, weights or covariances that cannot be used.
     """
-    check_one_kind(weights, covariances)
+    if weights is not None and covariances is not None:
+        raise OptionError("weights and covariances are both given; put the weights into the covariances")
     w, checked = check_weights(weights, len(motions)), check_covariances(covariances, len(motions))
     if checked is not None:
         return covariance_cost(motions, checked)

@@ -18,7 +18,7 @@ from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, conjugate, dual_parts, left, of_rotations, to_rotations
 from gtsam_rwhec.methods.dq_descent import squared, unit_combination
-from gtsam_rwhec.methods.dq_saddle import Minimum, minimum
+from gtsam_rwhec.methods.dq_saddle import minimum
 from gtsam_rwhec.methods.dual_quaternion_cost import MotionMoments, gram, to_transform
 from gtsam_rwhec.methods.linear_systems import solve_scaled
 from gtsam_rwhec.methods.motions import UNCERTAIN
@@ -296,7 +296,9 @@ def dqopt(stations: Stations) -> tuple[Array, Array]:
     alpha = np.sqrt(used / max(float(np.trace(moments.BB)), np.finfo(float).tiny))
     found = minimum(moments.cost(alpha))
     for _ in range(ROUNDS):
-        rotation, translation = squared_sums(moments, found)
+        q, p = found.q, found.q_dual
+        rotation = float(q @ moments.AA @ q)
+        translation = float(q @ moments.BB @ q + 2.0 * (q @ moments.BA @ p) + p @ moments.AA @ p)
         floor = 1e-14 * used
         if rotation <= floor or translation * alpha**2 <= floor:
             break  # exact poses: nothing to weigh
@@ -304,14 +306,6 @@ def dqopt(stations: Stations) -> tuple[Array, Array]:
         found = minimum(moments.cost(alpha))
     X = to_transform(found.q, found.q_dual)
     return X[:3, :3], X[:3, 3]
-
-
-def squared_sums(moments: MotionMoments, found: Minimum) -> tuple[float, float]:
-    """The sums of |A q|^2 and |B q + A q'|^2 of an answer."""
-    q, p = found.q, found.q_dual
-    rotation = float(q @ moments.AA @ q)
-    translation = float(q @ moments.BB @ q + 2.0 * (q @ moments.BA @ p) + p @ moments.AA @ p)
-    return rotation, translation
 
 
 RobotWorld = tuple[Array, Array, Array, Array]
@@ -403,8 +397,6 @@ def _rotations_of_vec(vectors: Array) -> Array:
             "the largest singular pair of the sum of R_B (x) R_A is not a pair of rotations; add poses that turn about "
             "two different axes"
         )
-    R: Array = U @ Wt
-    for rotation, ((a, b, c), (d, e, f), (g, h, i)) in zip(R, R.tolist(), strict=True):
-        if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0.0:
-            rotation *= -1.0
-    return R
+    R = U @ Wt
+    rotations: Array = R * np.sign(np.linalg.det(R))[:, None, None]
+    return rotations

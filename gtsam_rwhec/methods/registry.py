@@ -25,8 +25,8 @@ from gtsam_rwhec.methods.method import (
     Outcome,
     Poses,
     Proof,
-    check_options,
     check_problem,
+    checked_options,
 )
 from gtsam_rwhec.methods.reprojection import EVANGELISTA, RP1
 from gtsam_rwhec.problem.measurements import Pair
@@ -135,10 +135,10 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
         When the measurements do not determine the method's equations.
     """
     method = method_of(name)
-    check_options(options)
+    options = checked_options(options)
     check_problem(method, problem)
     start = time.perf_counter()
-    found = method.function(problem, options or MethodOptions())
+    found = method.function(problem, options)
     seconds = time.perf_counter() - start
     return estimate_of(method.name, problem, found, seconds)
 

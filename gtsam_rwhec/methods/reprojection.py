@@ -30,8 +30,9 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, one_transform, to_pose3
 from gtsam_rwhec.methods.certified import quiet_solution
 from gtsam_rwhec.methods.closed_forms import start_of
-from gtsam_rwhec.methods.corner_methods import Corners, Minimum, cost_at, evangelista_minimum, rp1_minimum
+from gtsam_rwhec.methods.corner_methods import Corners, cost_at, evangelista_minimum, rp1_minimum
 from gtsam_rwhec.methods.iterative_methods import TABB_SOURCE, Parameterisation
+from gtsam_rwhec.methods.levenberg_marquardt import Descent
 from gtsam_rwhec.methods.method import (
     Method,
     MethodOptions,
@@ -39,7 +40,7 @@ from gtsam_rwhec.methods.method import (
     Poses,
     Properties,
     Takes,
-    check_options,
+    checked_options,
     checked_start,
 )
 from gtsam_rwhec.problem.problem import Problem
@@ -49,7 +50,7 @@ OURS = "refine_corners"
 #: The published methods.
 NAMES = ("evangelista2023", "tabb2017_rp1")
 #: A descent from a start (n, 4, 4); the number is its most steps.
-Descend = Callable[[Corners, Array, int], Minimum]
+Descend = Callable[[Corners, Array, int], Descent[Array]]
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,7 @@ def run(
         When the closed form finds that the motions do not determine the poses.
     """
     check_arguments(observations, None)
-    check_options(options)
-    options = options or MethodOptions()
+    options = checked_options(options)
     descent = _descent(name, parameterisation, carrier)
     X, Y, starts_from = _start(observations, options)
     return _answer(name, descent, Corners.of(observations), X, Y, options, starts_from)
@@ -167,8 +167,7 @@ def compare(
         When there is no start, as ``rw.solve`` does.
     """
     check_arguments(observations, None)
-    check_options(options)
-    options = options or MethodOptions()
+    options = checked_options(options)
     names = tuple(methods)
     descents = {name: _ours(observations, carrier) if name == OURS else _descent(name, "axis-angle", carrier)
                 for name in names}  # fmt: skip
@@ -187,9 +186,8 @@ def compare(
     return ReprojectionTable(tuple(rows))
 
 
-def certified_start(observations: Observations, options: MethodOptions | None = None) -> tuple[Poses, Poses]:
+def certified_start(observations: Observations, options: MethodOptions) -> tuple[Poses, Poses]:
     """X and Y of the certified solution, which also chooses between the two candidate poses of each image."""
-    options = options or MethodOptions()
     solution = solved_with_chosen_poses(
         observations, lambda problem: quiet_solution(problem, options), lambda answer: (answer.X, answer.Y)
     )
@@ -216,20 +214,18 @@ def _deviations(carrier: CarrierNoise | None) -> tuple[float, float] | None:
 
 
 def _ours(observations: Observations, carrier: CarrierNoise | None) -> Descend:
-    def descent(corners: Corners, start: Array, max_iterations: int) -> Minimum:
-        n = len(corners.targets)
+    def descent(corners: Corners, start: Array, max_iterations: int) -> Descent[Array]:
         told = CornerOptions(
             stated="exact", carrier_noise=carrier or "exact", outliers=False, max_iterations=max_iterations
         )
-        X, Y = dict(zip(corners.targets, start[:n], strict=True)), dict(zip(corners.sensors, start[n:], strict=True))
-        refined = refine_corners(observations, X, Y, told)
+        refined = refine_corners(observations, *corners.named([*start]), told)
         poses = [*(refined.X[name] for name in corners.targets), *(refined.Y[name] for name in corners.sensors)]
         frames = np.array([pose.matrix() for pose in poses])
         deviations = _deviations(carrier)
         cost = corners.cost(frames)
         if deviations is not None:
             cost = cost_at(corners, frames, refined.point.A, deviations)
-        return Minimum(frames, cost, refined.iterations, refined.last_step < 0.1)
+        return Descent(frames, cost, refined.iterations, refined.last_step < 0.1)
 
     return descent
 
@@ -247,12 +243,11 @@ def _answer(
     begun = time.perf_counter()
     found = descent(corners, start, options.max_iterations)
     seconds = time.perf_counter() - begun
-    poses = [to_pose3(frame[:3, :3], frame[:3, 3]) for frame in found.frames]
-    cost, n = corners.cost(found.frames), len(corners.targets)
+    poses = [to_pose3(frame[:3, :3], frame[:3, 3]) for frame in found.point]
+    cost = corners.cost(found.point)
     return ReprojectionAnswer(
         name,
-        dict(zip(corners.targets, poses[:n], strict=True)),
-        dict(zip(corners.sensors, poses[n:], strict=True)),
+        *corners.named(poses),
         found.cost,
         cost,
         float(corners.corner_px * np.sqrt(2.0 * cost / corners.number)),

@@ -83,21 +83,14 @@ class RoleEvidence:
         tells = explains and _product(worse) > FAR_BETTER * _product(better)
         return None if not tells else "child" if better is self.child else "parent"
 
+    @property
+    def product(self) -> float:
+        """The product of both residuals of the better role; infinite without an answer."""
+        return min((_product(fit) for fit in (self.child, self.parent) if fit is not None), default=math.inf)
+
     def explains_far_better(self, other: RoleEvidence) -> bool:
         """Whether one role explains these measurements, with far smaller residuals than both roles of ``other``."""
-        if self.role is None:
-            return False
-        fits = [fit for fit in (other.child, other.parent) if fit is not None]
-        mine = min(_product(fit) for fit in (self.child, self.parent) if fit is not None)
-        return all(_product(fit) > FAR_BETTER * mine for fit in fits)
-
-    def is_better_than(self, other: RoleEvidence) -> bool:
-        """Whether the better role has smaller residuals than the better role of ``other``."""
-        mine, theirs = (
-            min((_product(fit) for fit in (one.child, one.parent) if fit is not None), default=math.inf)
-            for one in (self, other)
-        )
-        return mine < theirs
+        return self.role is not None and other.product > FAR_BETTER * self.product
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -334,6 +327,14 @@ class Rest:
 
     at_rest: bool
     words: str
+
+
+def first_time_offset(rest: Rest | None) -> tuple[float | Literal["estimate"], str]:
+    """A sensor's first time offset, and the comment beside it; `rest` is None if nothing tells about it."""
+    if rest is not None and rest.at_rest:
+        return 0.0, f"s; a guess: {rest.words}, so no clock is estimated"
+    seen = "" if rest is None else f"{rest.words}; "
+    return "estimate", f"{seen}or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
 
 
 #: A carrier that is slower than both stands still: metres a second and radians a second.

@@ -14,8 +14,8 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import PIXEL_CENTRE
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.rig.exported_poses import number
 from gtsam_rwhec.rig.rig_frames import RigFrames
+from gtsam_rwhec.rig.section_types import number
 
 #: A remark in a file has at most this many characters.
 LONGEST_COMMENT = 2_000

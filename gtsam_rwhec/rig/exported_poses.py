@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.rig_frames import CalibratedFrame, RigFrames
+from gtsam_rwhec.rig.section_types import number
 
 _LAUNCH_HEAD = '''\
 """Calibrated frames as static transforms, one tf2_ros static_transform_publisher each.
@@ -192,16 +193,6 @@ def _joint(frame: CalibratedFrame, parent: str) -> str:
         f'      <origin xyz="{xyz}" rpy="{rpy}"/>\n'
         "    </joint>\n"
     )
-
-
-def number(value: float) -> str:
-    """The fewest digits (at most 17) that are read as the same double, always with a decimal point.
-
-    Without the point, YAML 1.1 takes 1e-05 for text and 1 for an integer.
-    """
-    text = repr(float(value) + 0.0)  # + 0.0: no -0.0
-    mantissa, e, exponent = text.partition("e")
-    return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
 
 
 def quaternion_xyzw(T: Array) -> Array:

@@ -54,6 +54,11 @@ class FolderPoses:
     stamps_ns: np.ndarray | None  #: (n,): The images' stamps, if their names are stamps
     all: NamedPoses  #: All poses of the file
 
+    @property
+    def count(self) -> int:
+        """The number of images with a pose."""
+        return int(np.isfinite(self.T[:, 0, 0]).sum())
+
 
 @dataclass(frozen=True, eq=False)
 class ImageFolder:
@@ -132,28 +137,20 @@ def _around(folder: Path, place: Path, image_folders: Iterable[Path]) -> Iterato
 
 def _poses(folder: Path, place: Path, files: list[Path], image_folders: Iterable[Path]) -> FolderPoses | None:
     """The poses that fit the most images; of several, those in the nearest folder."""
-    best: tuple[int, FolderPoses] | None = None
+    best: FolderPoses | None = None
     for near in _around(folder, place, image_folders):
         there = sorted(_files(near, (*TREES, *TABLES)), key=lambda file: natural_key(file.name))
         candidates = [near] if len(there) >= LEAST_IMAGES and near != folder else []
         if len(there) <= MOST_TRIED:
             candidates += there
         for candidate in candidates:
-            fitting = _fitting(folder, files, candidate)
-            if fitting is None:
-                continue
-            number = int(np.isfinite(fitting.T[:, 0, 0]).sum())
-            if best is None or number > best[0]:
-                best = number, fitting
-        if best is not None and best[0] >= 0.8 * len(files):
+            read = (poses_read(folder, files, candidate, stated) for stated in STATEMENTS)
+            fitting = next((poses for poses in read if poses is not None), None)
+            if fitting is not None and (best is None or fitting.count > best.count):
+                best = fitting
+        if best is not None and best.count >= 0.8 * len(files):
             break  # what is further away belongs to another camera
-    return None if best is None else best[1]
-
-
-def _fitting(folder: Path, files: list[Path], path: Path) -> FolderPoses | None:
-    """The poses of a file or a folder if they fit the images, read as the first statement that reads them."""
-    found = (poses_read(folder, files, path, stated) for stated in STATEMENTS)
-    return next((poses for poses in found if poses is not None), None)
+    return best
 
 
 def poses_read(folder: Path, files: Sequence[Path], path: Path, stated: PoseStatement) -> FolderPoses | None:

@@ -14,20 +14,26 @@ from gtsam_rwhec.detect.detections import Detection
 from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs.image_folder import pose_stamps
 from gtsam_rwhec.logs.pose_rows import PoseStatement
-from gtsam_rwhec.rig.carrier_roles import Rest, RoleEvidence, Seen, evidence_of_roles, origin_of, rest_of
+from gtsam_rwhec.rig.carrier_roles import (
+    Rest,
+    RoleEvidence,
+    Seen,
+    evidence_of_roles,
+    first_time_offset,
+    origin_of,
+    rest_of,
+)
 from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, poses_read, read_folder, read_gray
-from gtsam_rwhec.rig.guessed_boards import STATED, BoardSeen, boards_seen, guessed_intrinsics
-from gtsam_rwhec.rig.guessed_targets import Guess, boards_guessed, targets_seen, with_size
+from gtsam_rwhec.rig.guessed_boards import STATED, guessed_intrinsics
+from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
 from gtsam_rwhec.rig.log_contents import ImageTopic, camera_name, free_name
 from gtsam_rwhec.rig.rig import Rig
-from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
+from gtsam_rwhec.rig.rig_file import first_rig_text, parse_rig
 from gtsam_rwhec.rig.section_types import is_text
 from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
-from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 
 #: At most this number of images of each folder, spread evenly, is searched for targets and used to solve for roles.
 IMAGES = 16
@@ -51,8 +57,8 @@ def propose_folder_rig(
     folder, tell = Path(folder), progress or silent
     notes: list[str] = []
     cameras = _cameras(folder, notes)
-    topics, boards = [], []
-    for camera in cameras:
+    topics = []
+    for camera, _ in cameras:
         tell(f"searching {camera.path}")
         topic = ImageTopic(camera.path, "", len(camera.files))
         for i in np.unique(np.linspace(0, len(camera.files) - 1, IMAGES).round().astype(int)):
@@ -60,34 +66,19 @@ def propose_folder_rig(
             if gray is not None and gray.shape[::-1] == camera.size:
                 topic.search(gray, int(i))
         topics.append(topic)
-        boards.append(boards_seen(topic.pictures))
-    guesses, remarks = targets_seen(topics, [])
-    guesses += boards_guessed(
-        (topic.topic, topic.looked_at, seen) for topic, found in zip(topics, boards, strict=True) for seen in found
-    )
-    notes += remarks
-    if guesses:
-        notes.append(f"targets seen: {', '.join(guess.name for guess in guesses)}")
-    else:
-        notes.append(
-            f"no target in {sum(topic.looked_at for topic in topics)} images: no tags of any family, no checkerboard "
-            "and no grid of circles that passes the tests. Write the targets into the rig file"
-        )
-        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
-        guesses = [Guess("tag_0", nothing, "TODO an example: no targets were seen")]
-    text = _text(folder, cameras, topics, boards, guesses, notes, tell)
+    text = _text(folder, cameras, topics, notes, tell)
     parse_rig(text, str(path))
     return text, tuple(notes)
 
 
-def _cameras(folder: Path, notes: list[str]) -> list[ImageFolder]:
-    """The folders of images that have poses."""
+def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPoses]]:
+    """The folders of images that have poses, with these."""
     if not folder.is_dir():
         raise RigError(f"{folder}: there is no such folder")
     found = [camera for camera in read_folder(folder) if is_text(camera.path)]
     if not found:
         raise RigError(f"{folder}: no folder in it has two images or more that can be read")
-    with_poses = [camera for camera in found if camera.poses is not None]
+    with_poses = [(camera, camera.poses) for camera in found if camera.poses is not None]
     if not with_poses:
         named = ", ".join(f"{camera.path} ({len(camera.files)} images)" for camera in found[:5])
         raise RigError(
@@ -95,70 +86,48 @@ def _cameras(folder: Path, notes: list[str]) -> list[ImageFolder]:
             "beside them, as poses.csv with a line an image: name, x, y, z, qx, qy, qz, qw (metres)"
         )
     notes += [f"not used: {camera.path}, no poses fit its images" for camera in found if camera.poses is None]
-    for camera in with_poses:
-        assert camera.poses is not None
-        number = int(np.isfinite(camera.poses.T[:, 0, 0]).sum())
+    for camera, poses in with_poses:
         notes.append(
-            f"camera {camera.path}: {len(camera.files)} images of {camera.size[0]} x {camera.size[1]}, {number} with a "
-            f"pose in {camera.poses.path}, intrinsics {camera.intrinsics or 'in no file'}"
+            f"camera {camera.path}: {len(camera.files)} images of {camera.size[0]} x {camera.size[1]}, {poses.count} "
+            f"with a pose in {poses.path}, intrinsics {camera.intrinsics or 'in no file'}"
         )
     return with_poses
 
 
 def _text(
     folder: Path,
-    cameras: Sequence[ImageFolder],
+    cameras: Sequence[tuple[ImageFolder, FolderPoses]],
     topics: Sequence[ImageTopic],
-    boards: Sequence[Sequence[BoardSeen]],
-    guesses: Sequence[Guess],
     notes: list[str],
     tell: Progress,
 ) -> str:
     taken = {PARENT, CHILD}
-    remarks: dict[KeyPath, str] = {}
-    names = [free_name(camera_name(camera.path, ""), taken) for camera in cameras]
-    targets: dict[str, TargetSection] = {}
-    for guess in guesses:
-        name = free_name(guess.name, taken)
-        targets[name], remarks["targets", name] = guess.section, guess.remark
+    names = [free_name(camera_name(camera.path, ""), taken) for camera, _ in cameras]
+    targets, remarks, of_targets = first_targets(topics, [], taken)
+    notes += of_targets
     sensors: dict[str, Sensor] = {}
     stated: list[tuple[str, Camera]] = []
-    for name, camera, found in zip(names, cameras, boards, strict=True):
-        assert camera.poses is not None
+    for name, (camera, poses), topic in zip(names, cameras, topics, strict=True):
         if camera.camera is not None:
             section = Intrinsics(file=camera.intrinsics, camera=camera.camera_name or None, stated="nominal")
             remarks["sensors", name, "intrinsics"] = STATED
             stated.append((name, camera.camera))
         else:
-            guess_ = guessed_intrinsics(camera.size, found)
-            section, remarks["sensors", name, "intrinsics"] = guess_.section, guess_.words
-            stated.append((name, guess_.camera))
-        rest = _rest(camera.poses)
-        remarks["sensors", name, "time_offset"] = (
-            f"s; {rest.words}, so no clock is estimated" if rest.at_rest else f"in motion: {rest.words}; or seconds"
-        )
-        sensors[name] = Sensor(
-            images=camera.path, poses=camera.poses.path, intrinsics=section,
-            time_offset=0.0 if rest.at_rest else "estimate",
-        )  # fmt: skip
+            guess = guessed_intrinsics(camera.size, topic.boards)
+            section, remarks["sensors", name, "intrinsics"] = guess.section, guess.words
+            stated.append((name, guess.camera))
+        time_offset, remarks["sensors", name, "time_offset"] = first_time_offset(_rest(poses))
+        sensors[name] = Sensor(images=camera.path, poses=poses.path, intrinsics=section, time_offset=time_offset)
     tell("solving with the cameras on either carrier")
-    views = _views(cameras, topics, stated, [section.target(name) for name, section in targets.items()])
+    views = _views(topics, stated, [section.target(name) for name, section in targets.items()])
     reading = best_reading(folder, cameras, views)
-    evidence = reading.evidence
-    notes.append(f"{evidence.in_words(PARENT, CHILD)}: {_role_words(evidence)}")
-    for name, factor in evidence.sizes.items():
-        targets[name] = with_size(targets[name], factor)
-        remarks["targets", name] += "; the length here is what the motion says"
+    notes.append(reading.evidence.in_words(PARENT, CHILD))
+    take_sizes(targets, remarks, reading.evidence.sizes)
     carriers, remarks["carriers", "poses"] = _carriers(reading)
-    origin = origin_of([f for camera in cameras if camera.poses for f in camera.poses.path.split("/")])
+    origin = origin_of([part for _, poses in cameras for part in poses.path.split("/")])
     notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
     rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
-    where = folder.resolve().name
-    head = (
-        f"# A first rig file, made from the folder {where if is_text(where) else repr(where)}; paths start from it.\n"
-        "# TODO marks what only a person knows, above all the sizes of the targets.\n"
-    )
-    return head + rig_text(rig, remarks)
+    return first_rig_text("folder", folder.resolve().name, rig, remarks, "# Paths start from that folder.\n")
 
 
 def _rest(poses: FolderPoses) -> Rest:
@@ -172,12 +141,7 @@ def _rest(poses: FolderPoses) -> Rest:
     return rest_of(stamps, Trajectory(of_poses[order], poses.all.T[order], poses.path))
 
 
-def _views(
-    cameras: Sequence[ImageFolder],
-    topics: Sequence[ImageTopic],
-    stated: Sequence[tuple[str, Camera]],
-    targets: Sequence[Target],
-) -> list[View]:
+def _views(topics: Sequence[ImageTopic], stated: Sequence[tuple[str, Camera]], targets: Sequence[Target]) -> list[View]:
     """The targets in the images that were searched."""
     by_name = {target.name: target for target in targets}
     views = []
@@ -185,14 +149,6 @@ def _views(
         for place, found in zip(topic.places, Detector(intrinsics, targets)(topic.pictures), strict=True):
             views += [View(number, place, name, by_name[d.target], d) for d in found.detections]
     return views
-
-
-def _role_words(evidence: RoleEvidence) -> str:
-    return {
-        "child": f"the cameras are on {CHILD}",
-        "parent": f"the cameras are on {PARENT}, and the targets on {CHILD}",
-        None: "the data cannot tell",
-    }[evidence.role]
 
 
 def _carriers(reading: PoseReading) -> tuple[Carriers, str]:
@@ -249,22 +205,23 @@ class PoseReading:
     otherwise: RoleEvidence | None
 
 
-def best_reading(folder: Path, cameras: Sequence[ImageFolder], views: Sequence[View]) -> PoseReading:
+def best_reading(
+    folder: Path, cameras: Sequence[tuple[ImageFolder, FolderPoses]], views: Sequence[View]
+) -> PoseReading:
     """The reading of the poses that best explains the images; the usual one unless another is far better."""
-    usual = [camera.poses for camera in cameras if camera.poses is not None]
+    usual = [poses for _, poses in cameras]
     stated = usual[0].stated
     as_read = _evidence(usual, views)
     best, found = stated, as_read
     for other in _others(stated):
-        read = [
-            poses_read(folder, camera.files, folder / poses.path, other)
-            for camera, poses in zip(cameras, usual, strict=True)
-        ]
+        read = [poses_read(folder, camera.files, folder / poses.path, other) for camera, poses in cameras]
         there = [poses for poses in read if poses is not None]
-        if len(there) < len(read) or all(_is_same(a, b) for a, b in zip(there, usual, strict=True)):
+        if len(there) < len(read) or all(
+            np.allclose(a.T, b.T, rtol=0.0, atol=SAME, equal_nan=True) for a, b in zip(there, usual, strict=True)
+        ):
             continue
         evidence = _evidence(there, views)
-        if evidence.explains_far_better(as_read) and (best is stated or evidence.is_better_than(found)):
+        if evidence.explains_far_better(as_read) and (best is stated or evidence.product < found.product):
             best, found = other, evidence
     return PoseReading(best, found, None if best is stated else as_read)
 
@@ -276,10 +233,6 @@ def _others(stated: PoseStatement) -> Iterator[PoseStatement]:
     for axes in AXES:
         yield replace(stated, euler=axes, angles="degrees")
         yield replace(stated, euler=axes, angles="radians")
-
-
-def _is_same(first: FolderPoses, second: FolderPoses) -> bool:
-    return bool(np.allclose(first.T, second.T, rtol=0.0, atol=SAME, equal_nan=True))
 
 
 def _evidence(poses: Sequence[FolderPoses], views: Sequence[View]) -> RoleEvidence:

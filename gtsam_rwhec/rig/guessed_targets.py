@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,9 +15,10 @@ import numpy as np
 from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, family_named
 from gtsam_rwhec.detect.tags import SeenTag
 from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.guessed_boards import BoardSeen
-from gtsam_rwhec.rig.log_contents import DriverTopic, ImageTopic
+from gtsam_rwhec.rig.log_contents import DriverTopic, ImageTopic, free_name
 from gtsam_rwhec.rig.target_sections import (
     AprilGridTarget,
     CharucoTarget,
@@ -42,6 +43,8 @@ BOARD = 6
 GRID = 4
 #: A size that is a guess gets this remark.
 TODO = "TODO measure"
+#: A size that a driver states gets this remark.
+OF_DRIVER = "as its driver says"
 
 
 @dataclass(frozen=True)
@@ -53,9 +56,8 @@ class Guess:
     remark: str
 
 
-def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -> tuple[list[Guess], list[str]]:
+def targets_seen(images: Sequence[ImageTopic], drivers: Iterable[DriverTopic]) -> tuple[list[Guess], list[str]]:
     """Guesses of the targets, and remarks on tags that were left out."""
-    images = list(images)
     looked_at = sum(topic.looked_at for topic in images)
     guesses, remarks = [], []
     for family in dict.fromkeys(family for topic in images for family in topic.tags):
@@ -78,17 +80,47 @@ def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -
     return guesses, remarks
 
 
-def boards_guessed(seen: Iterable[tuple[str, int, BoardSeen]]) -> list[Guess]:
-    """Guesses of boards without tags, of those that were seen by each camera: its name and its number of images."""
-    most: dict[tuple[str, tuple[int, int]], list[tuple[str, int, BoardSeen]]] = {}
-    for one in seen:
-        most.setdefault((one[2].board.family, one[2].counts), []).append(one)
+def first_targets(
+    images: Sequence[ImageTopic], drivers: Iterable[DriverTopic], taken: set[str]
+) -> tuple[dict[str, TargetSection], dict[KeyPath, str], list[str]]:
+    """Guesses of all targets by free names, the comments beside them, and notes; an example if nothing was seen."""
+    guesses, notes = targets_seen(images, drivers)
+    guesses += boards_guessed(images)
+    if guesses:
+        names = ", ".join(guess.name for guess in guesses)
+        notes.append(f"targets seen: {names} (their sizes in the rig file are guesses: measure them)")
+    else:
+        notes.append(
+            f"no target in {sum(topic.looked_at for topic in images)} images that were searched: no tags of any "
+            "family, no checkerboard and no grid of circles, and none from drivers. Write the targets into the rig file"
+        )
+        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=TAG_M)
+        guesses = [Guess("tag_0", nothing, "TODO an example: no targets were seen")]
+    named = {free_name(guess.name, taken): guess for guess in guesses}
+    remarks: dict[KeyPath, str] = {("targets", name): guess.remark for name, guess in named.items()}
+    return {name: guess.section for name, guess in named.items()}, remarks, notes
+
+
+def take_sizes(targets: dict[str, TargetSection], remarks: dict[KeyPath, str], sizes: Mapping[str, float]) -> None:
+    """Multiply lengths that nobody stated by what the motion says: true over guessed length, by target."""
+    for name, factor in sizes.items():
+        if TODO in remarks["targets", name] and OF_DRIVER not in remarks["targets", name]:
+            targets[name] = with_size(targets[name], factor)
+            remarks["targets", name] += "; the length here is what the motion says"
+
+
+def boards_guessed(images: Iterable[ImageTopic]) -> list[Guess]:
+    """Guesses of boards without tags, of those that were seen by each camera."""
+    most: dict[tuple[str, tuple[int, int]], list[tuple[ImageTopic, BoardSeen]]] = {}
+    for topic in images:
+        for seen in topic.boards:
+            most.setdefault((seen.board.family, seen.counts), []).append((topic, seen))
     guesses: dict[str, tuple[int, Guess]] = {}
     for (family, (across, down)), views in most.items():
-        images = sum(len(board.images) for _, _, board in views)
-        of = sum(count for _, count, _ in views)
-        passed = f"{across} x {down} passed every test in {images} of {of} images"
-        board = views[0][2].board
+        number = sum(len(seen.images) for _, seen in views)
+        of = sum(topic.looked_at for topic, _ in views)
+        passed = f"{across} x {down} passed every test in {number} of {of} images"
+        board = views[0][1].board
         if isinstance(board, Checkerboard):
             section: TargetSection = CheckerboardTarget(
                 type="checkerboard", inner_corners=(across, down), square_m=SQUARE_M
@@ -105,8 +137,8 @@ def boards_guessed(seen: Iterable[tuple[str, int, BoardSeen]]) -> list[Guess]:
             dot = ", with one larger dot: at the lower left as printed, or name its corner" if board.larger_dot else ""
             what = "from one row to the next" if board.asymmetric else "between centres of neighbours"
             name, remark = "grid", f"{TODO} {what}; {passed}{dot}"
-        if images > guesses.get(family, (0, None))[0]:
-            guesses[family] = images, Guess(name, section, remark)
+        if number > guesses.get(family, (0, None))[0]:
+            guesses[family] = number, Guess(name, section, remark)
     return [guess for _, guess in guesses.values()]
 
 
@@ -142,60 +174,48 @@ def _of_family(family: str, ids: dict[int, int], looked_at: int, views: Sequence
     is_aruco = family.startswith("aruco")
     if len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
         layout = layout_of(("charuco", "tag_grid") if is_aruco else ("tag_grid",), order, views)
+        if layout is None and is_aruco:
+            layout = Layout("charuco", *_squares(order[-1] - order[0] + 1), MARKER_M / SQUARE_M)
         if layout is not None:
-            yield _of_layout(family, order[0], layout)
+            yield _of_layout(family, order, layout)
             return
-    if is_aruco and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
-        columns, rows = _squares(order[-1] - order[0] + 1)
-        board = CharucoTarget(
-            type="charuco", family=family, squares=(columns, rows), square_m=SQUARE_M, marker_m=MARKER_M,
-            first_id=order[0],
-        )  # fmt: skip
-        remark = f"TODO count the squares, measure: a guess from markers {_listed(order)}"
-        yield Guess(f"board_{family.removeprefix('aruco_')}", board, remark)
-        return
     for i in order:
         tag = TagTarget(type="tag", family=family, id=i, size_m=TAG_M)
         yield Guess(f"{family}_{i}", tag, f"{TODO}; seen in {ids[i]} of {looked_at} images")
 
 
-def _of_layout(family: str, first: int, layout: Layout) -> Guess:
-    """A board with the columns and rows found in the images."""
-    counts = layout.columns, layout.rows
-    fits = (
-        f"the tags lie so in {layout.images} images, to {rounded(layout.off, 2)} of a tag's side; other columns and "
-        "rows do not fit"
-    )
+def _of_layout(family: str, ids: list[int], layout: Layout) -> Guess:
+    """A board with the columns and rows found in the images, or with guessed ones."""
+    counts, gap, first = (layout.columns, layout.rows), 1.0 / layout.share - 1.0, ids[0]
     if layout.kind == "charuco":
         marker_m = float(f"{SQUARE_M * layout.share:.3g}")
         section: TargetSection = CharucoTarget(
             type="charuco", family=family, squares=counts, square_m=SQUARE_M, marker_m=marker_m, first_id=first
         )
-        return Guess(f"board_{family.removeprefix('aruco_')}", section, f"{TODO} a square and a marker; {fits}")
-    gap = 1.0 / layout.share - 1.0
-    if layout.kind == "aprilgrid":
+        name, lengths = f"board_{family.removeprefix('aruco_')}", "a square and a marker"
+    elif layout.kind == "aprilgrid":
         section = AprilGridTarget(
             type="aprilgrid", family=family, tags=counts, tag_m=TAG_M, spacing=round(gap, 3), first_id=first
         )
-        return Guess(f"grid_{family}", section, f"{TODO} a tag, and the gap over it (spacing); {fits}")
-    section = TagGridTarget(
-        type="tag_grid", family=family, tags=counts, tag_m=TAG_M, gap_m=float(f"{TAG_M * gap:.3g}"), first_id=first
-    )
-    return Guess(f"grid_{family}", section, f"{TODO} a tag and the gap; {fits}")
+        name, lengths = f"grid_{family}", "a tag, and the gap over it (spacing)"
+    else:
+        section = TagGridTarget(
+            type="tag_grid", family=family, tags=counts, tag_m=TAG_M, gap_m=float(f"{TAG_M * gap:.3g}"), first_id=first
+        )
+        name, lengths = f"grid_{family}", "a tag and the gap"
+    if not layout.images:
+        return Guess(name, section, f"TODO count them, measure {lengths}: a guess from the ids {_listed(ids)}")
+    fits = f"the tags lie so in {layout.images} images, to {rounded(layout.off, 2)} of a tag's side"
+    return Guess(name, section, f"{TODO} {lengths}; {fits}; other columns and rows do not fit")
 
 
 def _aprilgrid(family: str, ids: list[int], views: Sequence[Sequence[SeenTag]]) -> Guess:
     layout = layout_of(("aprilgrid",), ids, views)
-    if layout is not None:
-        return _of_layout(family, ids[0], layout)
-    first, last = ids[0], ids[-1]
-    side = math.isqrt(last - first + 1)
-    columns = side if side * side == last - first + 1 else side + 1
-    rows = math.ceil((last - first + 1) / columns)
-    section = AprilGridTarget(
-        type="aprilgrid", family=family, tags=(columns, rows), tag_m=TAG_M, spacing=SPACING, first_id=first
-    )
-    return Guess(f"grid_{family}", section, f"TODO count the tags, measure: a guess from tags {_listed(ids)}")
+    if layout is None:
+        count = ids[-1] - ids[0] + 1
+        columns = math.ceil(math.sqrt(count))
+        layout = Layout("aprilgrid", columns, math.ceil(count / columns), 1.0 / (1.0 + SPACING))
+    return _of_layout(family, ids, layout)
 
 
 def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Iterator[Guess]:
@@ -210,7 +230,7 @@ def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Ite
                 have.add((known or "tag36h11", i))
                 stated = driver.size_m.get((family, i))
                 size_m = stated if stated is not None and 0.0 < stated < 10.0 else TAG_M
-                remark = f"{TODO}; {'as its driver says' if size_m == stated else 'a guess'}"
+                remark = f"{TODO}; {OF_DRIVER if size_m == stated else 'a guess'}"
                 if known is None:
                     remark += f"; TODO the family, which its driver calls {family!r}"
                 section = TagTarget(type="tag", family=known or "tag36h11", id=i, size_m=size_m)
@@ -252,8 +272,8 @@ class Layout:
     rows: int
     share: float  #: A tag's side over the step from one to the next; of a ChArUco board over a square's side
     #: Root mean square error of the tags' centres, over a tag's side; the median over images
-    off: float
-    images: int  #: The images that were compared
+    off: float = math.nan
+    images: int = 0  #: The images that were compared; none if the layout is a guess
 
 
 def layout_of(kinds: Iterable[Kind], ids: Sequence[int], views: Iterable[Sequence[SeenTag]]) -> Layout | None:

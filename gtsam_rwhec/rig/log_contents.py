@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
@@ -16,6 +17,7 @@ from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
 from gtsam_rwhec.logs.records import schema_word
+from gtsam_rwhec.rig.guessed_boards import BoardSeen, boards_seen
 from gtsam_rwhec.rig.section_types import is_name, is_text
 from gtsam_rwhec.rig.sections import PoseSource
 
@@ -58,6 +60,11 @@ class ImageTopic:
     places: list[int] = field(default_factory=list)
     seen: list[list[SeenTag]] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
+
+    @cached_property
+    def boards(self) -> list[BoardSeen]:
+        """The boards without tags in the images that were searched."""
+        return boards_seen(self.pictures)
 
     def search(self, gray: Gray, place: int) -> None:
         """Search an image for tags, and keep it; `place` is its stamp in a log, or its number in a folder."""
@@ -215,14 +222,19 @@ def moving_pairs(poses: Iterable[PoseTopic], camera_frames: Iterable[str]) -> tu
     poses = list(poses)
     cameras = list(camera_frames)
     pairs, remarks = _of_tf([p for p in poses if p.is_tf and p.child and p.child != p.parent], cameras)
+    pairs += [_of_topic(series) for series in moving_topics(poses)]
+    # The sort is stable: pairs of tf stay before topics, and pairs with more poses before others.
+    pairs.sort(key=lambda pair: (pair.on_child, pair.on_parent), reverse=True)
+    return pairs, remarks
+
+
+def moving_topics(poses: Iterable[PoseTopic]) -> list[PoseTopic]:
+    """The topics, not of tf, that have the poses of one pair of frames that moves."""
     by_topic: dict[str, list[PoseTopic]] = {}
     for series in poses:
         if not series.is_tf:
             by_topic.setdefault(series.topic, []).append(series)
-    pairs += [_of_topic(series) for (series, *others) in by_topic.values() if series.is_moving and not others]
-    # The sort is stable: pairs of tf stay before topics, and pairs with more poses before others.
-    pairs.sort(key=lambda pair: (pair.on_child, pair.on_parent), reverse=True)
-    return pairs, remarks
+    return [series for (series, *others) in by_topic.values() if series.is_moving and not others]
 
 
 def _of_tf(series: list[PoseTopic], cameras: list[str]) -> tuple[list[MovingPair], list[str]]:

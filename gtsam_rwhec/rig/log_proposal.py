@@ -10,10 +10,9 @@ from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.rig.carrier_roles import Origin, RoleEvidence, evidence_of_log
-from gtsam_rwhec.rig.guessed_boards import STATED, boards_seen
-from gtsam_rwhec.rig.guessed_targets import TODO as _TODO_SIZE
-from gtsam_rwhec.rig.guessed_targets import Guess, boards_guessed, targets_seen, with_size
+from gtsam_rwhec.rig.carrier_roles import Origin, RoleEvidence, evidence_of_log, first_time_offset
+from gtsam_rwhec.rig.guessed_boards import STATED
+from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
 from gtsam_rwhec.rig.log_contents import (
     DriverTopic,
     ImageTopic,
@@ -23,29 +22,27 @@ from gtsam_rwhec.rig.log_contents import (
     camera_name,
     free_name,
     moving_pairs,
+    moving_topics,
     read_contents,
 )
 from gtsam_rwhec.rig.odometry_sections import OdometrySensor, OdometrySource
 from gtsam_rwhec.rig.rig import Rig
-from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
+from gtsam_rwhec.rig.rig_file import first_rig_text, parse_rig
 from gtsam_rwhec.rig.section_types import is_name, is_text
 from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
-from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 
 #: Written if a log has no intrinsics; a person must replace it.
 _NO_INTRINSICS = Intrinsics(file="camera.yaml")
-#: Comment on a sensor's time offset.
-_TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
 
 
 @dataclass(frozen=True)
 class _Camera:
-    """A proposed sensor: name, section, its frame in the log, and comments on its lines by key."""
+    """A proposed sensor: name, section, its frame in the log, and the comment on its intrinsics."""
 
     name: str
     section: Sensor
     frame: str
-    remarks: dict[str, str]
+    remark: str
 
 
 def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
@@ -78,63 +75,38 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     pair = pairs[0]
     notes.append(f"moving: {_pair_words(pair)}")
     notes += [f"moves too, not used: {_pair_words(other)}" for other in pairs[1:6]]
-    used = [contents.images[c.section.images] for c in cameras if c.section.images is not None]
-    drivers = [contents.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
-    guesses, remarks = targets_seen(used, drivers)
-    guesses += boards_guessed((topic.topic, topic.looked_at, b) for topic in used for b in boards_seen(topic.pictures))
-    notes += remarks
-    looked_at = sum(images.looked_at for images in used)
-    if guesses:
-        notes.append(
-            f"targets seen: {', '.join(guess.name for guess in guesses)} (sizes in rig.yaml are guesses: measure them)"
-        )
-    else:
-        notes.append(
-            f"no tags in {looked_at} images that were searched, no checkerboard and no grid of circles, and none from "
-            "drivers. Write the targets into the rig file"
-        )
-        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
-        guesses = [Guess("tag_0", nothing, "TODO an example: no tags were seen")]
-    text = _text(log, contents, pair, cameras, guesses, notes)
+    text = _text(log, contents, pair, cameras, notes)
     parse_rig(text, str(path))
     return text, tuple(notes)
 
 
-def _text(
-    log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Camera], guesses: list[Guess], notes: list[str]
-) -> str:
+def _text(log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Camera], notes: list[str]) -> str:
     parent, child = pair.source.parent_and_child
     taken = {parent, child}
-    remarks: dict[KeyPath, str] = {}
-    sensors: dict[str, Sensor] = {}
-    targets: dict[str, TargetSection] = {}
-    names = {camera.name: free_name(camera.name, taken) for camera in cameras}
-    for guess in guesses:
-        name = free_name(guess.name, taken)
-        targets[name], remarks["targets", name] = guess.section, guess.remark
+    names = [free_name(camera.name, taken) for camera in cameras]
+    used = [contents.images[c.section.images] for c in cameras if c.section.images is not None]
+    drivers = [contents.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
+    targets, remarks, of_targets = first_targets(used, drivers, taken)
+    notes += of_targets
     has_board = any(len(section.target(name).corners()) >= CORNERS for name, section in targets.items())
-    for camera in cameras:
-        name = names[camera.name]
+    sensors: dict[str, Sensor] = {}
+    for name, camera in zip(names, cameras, strict=True):
         frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
         taken |= {frame} if frame else set()
-        sensors[name] = camera.section.model_copy(update={"frame": frame, "time_offset": "estimate"})
-        remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
-        if camera.section.images is not None and camera.section.intrinsics == _NO_INTRINSICS and has_board:
-            sensors[name] = sensors[name].model_copy(update={"intrinsics": Intrinsics(estimate="any")})
-            remarks["sensors", name, "intrinsics"] = "no topic has them: a board's images say them; a file is better"
+        intrinsics, remark = camera.section.intrinsics, camera.remark
+        if camera.section.images is not None and intrinsics == _NO_INTRINSICS and has_board:
+            intrinsics = Intrinsics(estimate="any")
+            remark = "no topic has them: a board's images say them; a file is better"
+        sensors[name] = camera.section.model_copy(update={"frame": frame, "intrinsics": intrinsics})
+        if remark:
+            remarks["sensors", name, "intrinsics"] = remark
     of_log = evidence_of_log(log, contents, pair.source, sensors, [s.target(name) for name, s in targets.items()])
     for name, sensor in sensors.items():
-        rest = of_log.rest.get(sensor.images or "")
-        remarks["sensors", name, "time_offset"] = _TIME_OFFSET
-        if rest is not None and rest.at_rest:
-            sensors[name] = sensor.model_copy(update={"time_offset": 0.0})
-            remarks["sensors", name, "time_offset"] = f"s; a guess: {rest.words}, and no clock is estimated from that"
+        time_offset, remarks["sensors", name, "time_offset"] = first_time_offset(of_log.rest.get(sensor.images or ""))
+        sensors[name] = sensor.model_copy(update={"time_offset": time_offset})
     if of_log.roles.images:
         notes.append(of_log.roles.in_words(parent, child))
-    for name, factor in of_log.roles.sizes.items():
-        if _TODO_SIZE in remarks["targets", name] and "as its driver says" not in remarks["targets", name]:
-            targets[name] = with_size(targets[name], factor)
-            remarks["targets", name] += "; the length here is what the motion says"
+    take_sizes(targets, remarks, of_log.roles.sizes)
     carriers, remarks["carriers", "poses"] = _carriers(pair, of_log.roles, of_log.origin)
     notes.append(f"poses: {of_log.origin.words}")
     if carriers.noise is not None:
@@ -143,12 +115,7 @@ def _text(
             "residuals tell too"
         )
     rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
-    file = log.files[0].path.name
-    head = (
-        f"# A first rig file, made from the log {file if is_text(file) else repr(file)}.\n"
-        "# TODO marks what only a person knows, above all the sizes of the targets: the sizes here are guesses.\n"
-    )
-    return head + rig_text(rig, remarks)
+    return first_rig_text("log", log.files[0].path.name, rig, remarks)
 
 
 def _carriers(pair: MovingPair, roles: RoleEvidence, origin: Origin) -> tuple[Carriers, str]:
@@ -185,7 +152,7 @@ def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
             intrinsics, remark = _NO_INTRINSICS, missing
         name = free_name(camera_name(source.topic, source.frame), taken)
         section = Sensor.model_validate({key: source.topic, "intrinsics": intrinsics})
-        cameras.append(_Camera(name, section, source.frame, {"intrinsics": remark} if remark else {}))
+        cameras.append(_Camera(name, section, source.frame, remark))
         return name
 
     missing = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
@@ -256,21 +223,11 @@ def _topics(contents: LogContents) -> str:
 #: Words in topic names that describe the kind of data, and not the sensor.
 OF_KIND = ("odom", "odometry", "pose", "poses", "odometry_pose", "pose_stamped", "local", "filtered")
 #: Words that indicate visual odometry of one camera, whose lengths are not in metres.
-OF_ONE_CAMERA = ("mono", "vo", "cam", "camera", "orb", "dso", "svo")
+OF_ONE_CAMERA = {"mono", "vo", "cam", "camera", "orb", "dso", "svo"}
 _SCALE = (
     "scale: estimate, inside odometry, where its lengths are not metres (visual odometry of one camera); "
     "time_offset: 0.0 for one clock"
 )
-
-
-@dataclass(frozen=True)
-class _Found:
-    name: str
-    topic: PoseTopic
-
-    @property
-    def may_lack_scale(self) -> bool:
-        return any(word in self.name.lower().split("_") for word in OF_ONE_CAMERA)
 
 
 def propose_odometries(poses: Iterable[PoseTopic], where: str) -> tuple[str, tuple[str, ...]] | None:
@@ -278,50 +235,33 @@ def propose_odometries(poses: Iterable[PoseTopic], where: str) -> tuple[str, tup
 
     `where` is the log's name, for the head of the file. Poses in tf are of the robot's own tree, and are not proposed.
     """
-    found = _found(poses)
+    taken: set[str] = set()
+    found = {free_name(_name(s.topic), taken): s for s in moving_topics(poses) if is_text(s.topic)}
     if len(found) < 2:
         return None
-    with_scale = [one for one in found if not one.may_lack_scale] or found
-    reference = max(with_scale, key=lambda one: one.topic.count)
+    may_lack_scale = {name for name in found if set(name.lower().split("_")) & OF_ONE_CAMERA}
+    with_metres = [name for name in found if name not in may_lack_scale] or found
+    reference = max(with_metres, key=lambda name: found[name].count)
     remarks: dict[KeyPath, str] = {
         ("reference",): "TODO a guess: the sensor in whose frame you want the others; its lengths must be metres"
     }
-    sensors: dict[str, OdometrySensor] = {}
-    for one in found:
-        is_reference = one is reference
-        sensors[one.name] = OdometrySensor(
-            odometry=OdometrySource(topic=one.topic.topic), time_offset=0.0 if is_reference else "estimate"
+    remarks |= {("sensors", name, "odometry"): f"TODO {_SCALE}" for name in may_lack_scale}
+    sensors = {
+        name: OdometrySensor(
+            odometry=OdometrySource(topic=series.topic), time_offset=0.0 if name == reference else "estimate"
         )
-        if one.may_lack_scale:
-            remarks["sensors", one.name, "odometry"] = f"TODO {_SCALE}"
-    rig = Rig(sensors={**sensors}, reference=reference.name)
-    head = (
-        f"# A first rig file, made from the log {where if is_text(where) else repr(where)}: it has no images and no "
-        "detections,\n# and several topics of poses, each taken as what one sensor says of its own motion.\n"
-        "# A vehicle that moves in a plane does not tell heights: add given: {heights_m: {SENSOR: 0.5, ...}}.\n"
+        for name, series in found.items()
+    }
+    more = (
+        "# It has no images and no detections, and several topics of poses, each taken as what one sensor says of its\n"
+        "# own motion. A vehicle that moves in a plane does not tell heights: add given: {heights_m: {SENSOR: 0.5}}.\n"
     )
     notes = tuple(
-        f"moves: {one.name}, topic {one.topic.topic}, {one.topic.count} poses, up to {one.topic.motion()[0]:.2g} m "
-        "from the first"
-        for one in found
+        f"moves: {name}, topic {series.topic}, {series.count} poses, up to {series.motion()[0]:.2g} m from the first"
+        for name, series in found.items()
     )
-    return head + rig_text(rig, remarks), (*notes, f"reference: {reference.name} (of those with metres, most poses)")
-
-
-def _found(poses: Iterable[PoseTopic]) -> list[_Found]:
-    by_topic: dict[str, list[PoseTopic]] = {}
-    for series in poses:
-        if not series.is_tf:
-            by_topic.setdefault(series.topic, []).append(series)
-    taken: set[str] = set()
-    found = []
-    for topic, (series, *others) in by_topic.items():
-        if others or not series.is_moving or not is_text(topic):
-            continue
-        name = free_name(_name(topic), taken)
-        taken.add(name)
-        found.append(_Found(name, series))
-    return found
+    text = first_rig_text("log", where, Rig(sensors={**sensors}, reference=reference), remarks, more)
+    return text, (*notes, f"reference: {reference} (of those with metres, most poses)")
 
 
 def _name(topic: str) -> str:

@@ -7,13 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
-from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from gtsam_rwhec.files.yaml_lines import KeyPath, shown
 from gtsam_rwhec.rig.section_types import (
     FramePair,
     Name,
+    Or,
     Positive,
     Section,
     Text,
@@ -24,13 +25,6 @@ from gtsam_rwhec.rig.section_types import (
     optional,
 )
 from gtsam_rwhec.rig.sections import Carriers
-
-
-class OrEstimate:
-    """In the JSON Schema: the word estimate may stand in place of a section."""
-
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"anyOf": [{"const": "estimate"}, handler(core)]}
 
 
 def _none_for_estimate(given: Any) -> Any:
@@ -68,7 +62,7 @@ class OdometrySource(Section):
         "estimate",
         default="known",
     )
-    noise: Annotated[OdometryNoiseSection | None, BeforeValidator(_none_for_estimate), OrEstimate()] = optional(
+    noise: Annotated[OdometryNoiseSection | None, BeforeValidator(_none_for_estimate), Or(const="estimate")] = optional(
         "how its errors grow; without it, or with the word estimate, from the data",
         {"rotation_deg_per_sqrt_s": 0.05, "translation_mm_per_sqrt_s": 4.0},
     )
@@ -91,11 +85,7 @@ class OdometrySource(Section):
     @model_validator(mode="after")
     def _is_one(self) -> OdometrySource:
         given = self._given("topic", "tf", "file")
-        if len(given) != 1:
-            raise ValueError(
-                f"{' and '.join(given) or 'nothing'} given; give one of topic (of Odometry or PoseStamped), "
-                "tf: [start, sensor] and file (TUM)"
-            )
+        self._need_one(given, "topic (of Odometry or PoseStamped), tf: [start, sensor] and file (TUM)")
         return self
 
     @property

@@ -126,7 +126,7 @@ class RigFile(Section):
         faults = [
             InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
             for path, words in (
-                *contradictions(self.carriers, self.all_sensors, self.targets, self.detection, self.reference),
+                *contradictions(self),
                 *odometry_contradictions(self.carriers, self.odometries, len(self.sensors), self.reference, self.given),
             )
         ]
@@ -166,30 +166,22 @@ class Rig(RigFile):
 Fault = tuple[KeyPath, str]
 
 
-def contradictions(
-    carriers: Carriers,
-    all_sensors: Mapping[str, Sensor | OdometrySensor],
-    targets: Mapping[str, TargetSection],
-    detection: Mapping[str, Any],
-    reference: str | None = None,
-) -> Iterator[Fault]:
+def contradictions(rig: RigFile) -> Iterator[Fault]:
     """Yield every fault of a rig file's sections, as the path of the value and what is wrong with it."""
-    sensors = {name: sensor for name, sensor in all_sensors.items() if isinstance(sensor, Sensor)}
-    yield from _carriers(carriers)
-    yield from _sensors(sensors, all_sensors)
-    yield from _poses(carriers, sensors)
+    yield from _carriers(rig.carriers)
+    yield from _sensors(rig)
     printed = []
-    if not targets and (sensors or not all_sensors):
+    if not rig.targets and (rig.sensors or not rig.all_sensors):
         yield ("targets",), "none; give at least one target"
-    if targets and all_sensors and not sensors:
+    if rig.targets and rig.all_sensors and not rig.sensors:
         yield ("targets",), "no sensor sees them: all have odometry; leave targets out, or give a camera"
-    for name, section in targets.items():
+    for name, section in rig.targets.items():
         try:
             printed.append(section.target(name))
         except TargetError as error:
             yield ("targets", name), error.fault
-    yield from _names(carriers, {name: s for name, s in all_sensors.items() if name != reference}, targets)
-    yield from _detection(detection)
+    yield from _names(rig)
+    yield from _detection(rig.detection)
     yield from _lookalikes(printed)
 
 
@@ -207,22 +199,18 @@ def _carriers(carriers: Carriers) -> Iterator[Fault]:
         )
 
 
-def _sensors(sensors: Mapping[str, Sensor], all_sensors: Mapping[str, Sensor | OdometrySensor]) -> Iterator[Fault]:
-    if not all_sensors:
+def _sensors(rig: RigFile) -> Iterator[Fault]:
+    if not rig.all_sensors:
         yield ("sensors",), "none; give at least one sensor"
     for key in ("images", "detections"):
         first: dict[str, str] = {}
-        for name, sensor in sensors.items():
+        for name, sensor in rig.sensors.items():
             topic = getattr(sensor, key)
             if topic is not None and first.setdefault(topic, name) != name:
                 words = f"{topic} is also the topic or path of sensor {first[topic]}; each sensor needs its own"
                 yield ("sensors", name, key), words
-
-
-def _poses(carriers: Carriers, sensors: Mapping[str, Sensor]) -> Iterator[Fault]:
-    """Poses in files are those of a folder, and need the frames."""
-    for name, sensor in sensors.items():
-        if sensor.poses is not None and carriers.poses.frames is None:
+    for name, sensor in rig.sensors.items():
+        if sensor.poses is not None and rig.carriers.poses.frames is None:
             yield (
                 ("sensors", name, "poses"),
                 "poses in files beside images, and carriers.poses is of a log; write carriers.poses: "
@@ -230,20 +218,20 @@ def _poses(carriers: Carriers, sensors: Mapping[str, Sensor]) -> Iterator[Fault]
             )
 
 
-def _names(
-    carriers: Carriers, sensors: Mapping[str, Sensor | OdometrySensor], targets: Mapping[str, TargetSection]
-) -> Iterator[Fault]:
+def _names(rig: RigFile) -> Iterator[Fault]:
     """Names that two frames have."""
+    carriers = rig.carriers
     named: list[tuple[str, KeyPath, str]] = [(carriers.sensors, ("carriers", "sensors"), "the sensors' carrier")]
     if carriers.targets != carriers.sensors:
         named.append((carriers.targets, ("carriers", "targets"), "the targets' carrier"))
-    for name, sensor in sensors.items():
+    for name in rig.calibrated:
+        sensor = rig.all_sensors[name]
         named.append((name, ("sensors", name), f"sensor {name}"))
         if sensor.frame not in (None, name):
             named.append((str(sensor.frame), ("sensors", name, "frame"), f"the frame of sensor {name}"))
         if isinstance(sensor, Sensor) and sensor.link is not None:
             named.append((sensor.link.frame, ("sensors", name, "link"), f"the link of sensor {name}"))
-    named += [(name, ("targets", name), f"target {name}") for name in targets]
+    named += [(name, ("targets", name), f"target {name}") for name in rig.targets]
     first: dict[str, str] = {}
     for name, path, what in named:
         if first.setdefault(name, what) != what:

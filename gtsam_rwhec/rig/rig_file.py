@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import textwrap
 import warnings
@@ -17,43 +16,15 @@ from pydantic_core import ErrorDetails
 
 from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
-from gtsam_rwhec.rig import odometry_sections, sections, target_sections
 from gtsam_rwhec.rig.odometry_sections import GivenSection
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
-from gtsam_rwhec.rig.section_types import in_yaml, keys_of, unit_of
+from gtsam_rwhec.rig.section_types import in_yaml, is_text, keys_of, models_in, unit_of
 from gtsam_rwhec.rig.sections import ESTIMATE, Intrinsics
-from gtsam_rwhec.rig.target_sections import with_kalibr_targets
+from gtsam_rwhec.rig.target_sections import KINDS, with_kalibr_targets
 
 #: A message names at most this many faults.
 MOST_FAULTS = 20
 
-#: Each type of target has this section.
-_TARGETS: dict[str, type[BaseModel]] = {
-    "tag": target_sections.TagTarget,
-    "charuco": target_sections.CharucoTarget,
-    "aprilgrid": target_sections.AprilGridTarget,
-    "tag_grid": target_sections.TagGridTarget,
-    "bundle": target_sections.BundleTarget,
-    "checkerboard": target_sections.CheckerboardTarget,
-    "circle_grid": target_sections.CircleGridTarget,
-}
-#: The section of each place in the file; * stands for any name.
-_SECTIONS: dict[KeyPath, type[BaseModel]] = {
-    (): RigFile,
-    ("carriers",): sections.Carriers,
-    ("carriers", "poses"): sections.PoseSource,
-    ("carriers", "noise"): sections.PoseNoise,
-    ("sensors", "*", "intrinsics"): sections.Intrinsics,
-    ("sensors", "*", "link"): sections.Link,
-    ("sensors", "*", "odometry"): odometry_sections.OdometrySource,
-    ("sensors", "*", "odometry", "noise"): odometry_sections.OdometryNoiseSection,
-    ("noise",): sections.DetectionNoise,
-    ("cleaning",): sections.Cleaning,
-    ("given",): odometry_sections.GivenSection,
-    ("given", "ground"): odometry_sections.GivenGround,
-    ("given", "directions", "*"): odometry_sections.GivenDirection,
-    ("given", "distances", "*"): odometry_sections.GivenDistance,
-}
 #: What to do about a fault, by pydantic's name for its kind.
 _KINDS = {
     "float_type": "give a number",
@@ -170,21 +141,20 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
         return f"is missing{'' if field is None else _about(str(path[-1]), field)}"
     if kind == "extra_forbidden":
         model = _section(path[:-1], file.data)
-        counted = getattr(model, "counted", "")
-        if counted and path[-1] in ("columns", "rows"):
-            return f"not a key any more; {_counts_before(file.data['targets'][path[1]], counted)}"
         return suggestion(str(path[-1]), list(keys_of(model)) if model else [])
     if kind == "literal_error":
         section = " or a section" if path == ("noise",) else ""
         return f"{shown(given)}; give {context['expected']}{section}"
     if kind == "union_tag_invalid":
-        return f"{shown(given['type'])}; give one of {', '.join(_TARGETS)}"
+        return f"{shown(given['type'])}; give one of {', '.join(KINDS)}"
     if kind == "union_tag_not_found":
-        return f"is missing: give one of {', '.join(_TARGETS)}"
+        return f"is missing: give one of {', '.join(KINDS)}"
     if kind in ("model_type", "model_attributes_type"):
         model = _section(path, file.data)
         keys = f" with {', '.join(keys_of(model))}" if model else " with type and sizes"
         return f"{shown(given)}; give a section{keys}"
+    if kind == "greater_than":
+        return f"{given:g} must be above {context['gt']:g}"
     if kind in _KINDS:
         return f"{shown(given)}; {_KINDS[kind]}"
     return str(context.get("error", fault["msg"]))
@@ -197,31 +167,23 @@ def _about(key: str, field: FieldInfo) -> str:
     return f": {field.description}{f', {unit}' if unit else ''}{example}" if field.description else ""
 
 
-def _counts_before(target: dict[str, Any], counted: str) -> str:
-    """The keys that replace columns and rows of old rig files."""
-    across, down = (target.get(key) for key in ("columns", "rows"))
-    if isinstance(across, int) and isinstance(down, int):
-        return f"columns: {across}, rows: {down} is now {counted}: [{across}, {down}]"
-    return f"columns and rows are now {counted}: [across, down]"
-
-
 def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
     """The section at a place."""
-    if len(path) == 2 and path[0] == "targets":
-        target = data["targets"][path[1]]
-        kind = target.get("type") if isinstance(target, dict) else None
-        return _TARGETS.get(kind) if isinstance(kind, str) else None
-    if len(path) == 4 and path[0] == "targets" and path[2] == "layout":
-        return target_sections.BundleTagPlace
-    if len(path) == 2 and path[0] == "sensors":
-        sensor = data["sensors"][path[1]]
-        has_odometry = isinstance(sensor, dict) and "odometry" in sensor
-        return odometry_sections.OdometrySensor if has_odometry else sections.Sensor
-    lists = path[:1] == ("given",)
-    general = tuple(
-        "*" if (i == 1 and path[0] == "sensors") or (i == 2 and lists) else key for i, key in enumerate(path)
-    )
-    return _SECTIONS.get(general)
+    model: type[BaseModel] | None = RigFile
+    models: list[type[BaseModel]] = [RigFile]
+    for key in path:
+        try:
+            data = data[key]
+        except (TypeError, LookupError):
+            data = None
+        field = keys_of(model).get(str(key)) if model else None
+        if field is not None:  # else the key is the name or the number of an item
+            models = models_in(field.annotation)
+        keys = data if isinstance(data, dict) else {}
+        fitting = [each for each in models if ("odometry" in keys) == ("odometry" in keys_of(each))]
+        kinds = [each for each in models if KINDS.get(str(keys.get("type"))) is each]
+        model = next(iter(kinds or ([] if models == [*KINDS.values()] else fitting or models)), None)
+    return model
 
 
 #: The mark in a comment.
@@ -269,8 +231,6 @@ def todo_lines(text: str) -> tuple[TodoLine, ...]:
     return tuple(found)
 
 
-#: Every YAML reader reads these strings as strings without quotes.
-_PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)$)[/]?[A-Za-z][A-Za-z0-9_/.]*", re.IGNORECASE)
 #: Comments begin in this column if the text before them is shorter.
 _COLUMN = 30
 #: A line has at most this many characters; longer comments stand on lines of their own.
@@ -318,6 +278,15 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
     return "\n".join(lines) + "\n"
 
 
+def first_rig_text(kind: str, source: str, rig: RigFile, remarks: Mapping[KeyPath, str], more: str = "") -> str:
+    """The text of a rig file that was made from a log or a folder (`kind`) of this name; `more` ends its head."""
+    head = (
+        f"# A first rig file, made from the {kind} {source if is_text(source) else repr(source)}.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets: the sizes here are guesses.\n"
+    )
+    return head + more + rig_text(rig, remarks)
+
+
 def _sections(rig: RigFile) -> Iterator[tuple[str, Any]]:
     """The sections by their keys, without those that follow from others."""
     for name, field in RigFile.model_fields.items():
@@ -337,31 +306,8 @@ def _lines(items: Iterable[tuple[str, Any]], path: KeyPath = ()) -> Iterator[tup
             yield here, f"{indent}{key}:"
             yield from _lines(value.items() if isinstance(value, dict) else value, here)
         else:
-            yield here, f"{indent}{key}: {_value(value)}"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Intrinsics) and value.estimate == "any":
-        return ESTIMATE
-    if isinstance(value, BaseModel):  # in one line, without what is not given
-        return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value if item is not None) + "}"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return _scalar(value)
-
-
-def _scalar(value: Any) -> str:
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, float):
-        mantissa, e, exponent = repr(value).partition("e")
-        # With a decimal point: YAML 1.1 takes 1e-05 for text.
-        return f"{mantissa}{'' if '.' in mantissa else '.0'}{e}{exponent}" if e else mantissa
-    if isinstance(value, str) and not _PLAIN.fullmatch(value):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value)
+            in_short = isinstance(value, Intrinsics) and value.estimate == "any"
+            yield here, f"{indent}{key}: {ESTIMATE if in_short else in_yaml(value)}"
 
 
 TemplateName = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "odometry"]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -17,19 +17,10 @@ from pydantic_core import core_schema
 
 from gtsam_rwhec.cameras.targets import FAMILIES
 from gtsam_rwhec.detect.detections import DetectionOptions
-from gtsam_rwhec.rig.odometry_sections import (
-    GivenDirection,
-    GivenDistance,
-    GivenGround,
-    GivenSection,
-    OdometryNoiseSection,
-    OdometrySensor,
-    OdometrySource,
-)
+from gtsam_rwhec.rig.odometry_sections import OdometrySensor
 from gtsam_rwhec.rig.rig import RigFile
-from gtsam_rwhec.rig.section_types import in_yaml, keys_of, unit_of
-from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, Link, PoseNoise, PoseSource, Sensor
-from gtsam_rwhec.rig.target_sections import BundleTagPlace, TargetSection
+from gtsam_rwhec.rig.section_types import in_yaml, keys_of, models_in, unit_of
+from gtsam_rwhec.rig.target_sections import KINDS
 
 #: Before the tables.
 HEAD = """\
@@ -52,47 +43,23 @@ A rig file names the sensors and the targets, what carries them, and where the l
   (`gtsam-rwhec init --schema` prints it). Rig files that `init` writes name it in their first line; in one of your own,
   write `# yaml-language-server: $schema=PATH`.
 """
-#: Sections and their path in the file; targets follow.
-SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
-    ("carriers", Carriers),
-    ("carriers: poses", PoseSource),
-    ("carriers: noise", PoseNoise),
-    ("sensors: NAME", Sensor),
-    ("sensors: NAME: intrinsics", Intrinsics),
-    ("sensors: NAME: link", Link),
-    ("sensors: NAME (with odometry)", OdometrySensor),
-    ("sensors: NAME: odometry", OdometrySource),
-    ("sensors: NAME: odometry: noise", OdometryNoiseSection),
-)
-#: Sections that come after the targets.
-LAST: tuple[tuple[str, type[BaseModel]], ...] = (
-    ("targets: NAME: layout", BundleTagPlace),
-    ("noise", DetectionNoise),
-    ("cleaning", Cleaning),
-    ("given", GivenSection),
-    ("given: ground", GivenGround),
-    ("given: directions", GivenDirection),
-    ("given: distances", GivenDistance),
+#: Before the sections of targets.
+OF_TARGETS = (
+    "## `targets: NAME`\n\nA target's frame has its origin in the middle of what is printed, x to the right, y up, z "
+    "towards who looks\nat it. `type` says which keys there are. Families of tags: "
+    + ", ".join(f"`{family}`" for family in FAMILIES)
+    + "."
 )
 
 
 def reference_text() -> str:
     """The text of ``docs/rig_file.md``."""
-    definitions = rig_file_schema()["$defs"]
-    parts = [HEAD, "## The file\n\n" + _table(RigFile, rig_file_schema())]
-    for where, section in SECTIONS:
-        parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
-    parts.append(
-        "## `targets: NAME`\n\nA target's frame has its origin in the middle of what is printed, x to the right, y up, "
-        "z towards who looks\nat it. `type` says which keys there are. Families of tags: "
-        + ", ".join(f"`{family}`" for family in FAMILIES)
-        + "."
-    )
-    for section in target_sections():
-        kind = get_args(section.model_fields["type"].annotation)[0]
-        parts.append(f"### `type: {kind}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
-    for where, section in LAST:
-        parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    schema = rig_file_schema()
+    parts = [HEAD, "## The file\n\n" + _table(RigFile, schema)]
+    for heading, section in _sections(RigFile):
+        if section is next(iter(KINDS.values())):
+            parts.append(OF_TARGETS)
+        parts.append(f"{heading}\n\n{_about(section)}\n\n{_table(section, schema['$defs'][section.__name__])}")
     rows = [
         (f"`{key}`", words, "number above 0", unit_of(key), f"`{default:g}`", f"`{key}: {default:g}`")
         for key, default, words in detection_keys()
@@ -101,9 +68,16 @@ def reference_text() -> str:
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
 
 
-def target_sections() -> tuple[type[BaseModel], ...]:
-    """The section of each type of target, in the order of `TargetSection`."""
-    return get_args(get_args(TargetSection)[0])
+def _sections(model: type[BaseModel], where: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    """All sections below one, with their headings."""
+    for key, field in keys_of(model).items():
+        place = f"{where}{key}" + (": NAME" if get_origin(field.annotation) is dict else "")
+        for section in models_in(field.annotation):
+            kind = next((kind for kind, of in KINDS.items() if of is section), None)
+            odometry = " (with odometry)" if section is OdometrySensor else ""
+            level = "###" if place.startswith("targets: ") else "##"
+            yield f"{level} `{f'type: {kind}' if kind else place + odometry}`", section
+            yield from _sections(section, f"{place}: ")
 
 
 def _about(section: type[BaseModel]) -> str:
@@ -116,7 +90,7 @@ def _table(section: type[BaseModel], schema: dict[str, Any]) -> str:
         said = schema["properties"][key]
         rows.append((
             f"`{key}`", field.description or _kind(said), _kind(said), unit_of(key, field), _default(field),
-            f"`{key}: {in_yaml(_example(said, field))}`",
+            f"`{key}: {_example(said, field)}`",
         ))  # fmt: skip
     return _markdown(rows)
 
@@ -138,10 +112,10 @@ def _default(field: FieldInfo) -> str:
     return "" if given is None or given == {} else f"`{in_yaml(given)}`"
 
 
-def _example(said: dict[str, Any], field: FieldInfo) -> Any:
+def _example(said: dict[str, Any], field: FieldInfo) -> str:
     if field.examples:
-        return field.examples[0]
-    return said.get("const", {})
+        return in_yaml(field.examples[0])
+    return in_yaml(said["const"]) if "const" in said else "..."
 
 
 def _kind(said: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
@@ -38,14 +38,19 @@ class InSchema:
         return handler(core) | self.keywords
 
 
-class OrText:
-    """In the JSON Schema: text may stand in place of a section, and is described by these words."""
+class Or:
+    """In the JSON Schema: a value of this schema may stand in place of a section."""
 
-    def __init__(self, words: str) -> None:
-        self.words = words
+    def __init__(self, **schema: Any) -> None:
+        self.schema = schema
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"anyOf": [{"type": "string", "minLength": 1, "description": self.words}, handler(core)]}
+        return {"anyOf": [self.schema, handler(core)]}
+
+
+def or_text(words: str) -> Or:
+    """Text may stand in place of a section, and is described by these words."""
+    return Or(type="string", minLength=1, description=words)
 
 
 def unit_of(key: str, field: FieldInfo | None = None) -> str:
@@ -56,13 +61,38 @@ def unit_of(key: str, field: FieldInfo | None = None) -> str:
     return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
 
 
+#: Every YAML reader reads these strings as strings without quotes.
+_PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)$)[/]?[A-Za-z][A-Za-z0-9_/.]*", re.IGNORECASE)
+
+
 def in_yaml(value: Any) -> str:
-    """A value as YAML in one line, for pages and messages."""
+    """A value as YAML in one line; what a section does not have is left out."""
+    if isinstance(value, BaseModel):
+        value = {key: item for key, item in value if item is not None}
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {in_yaml(item)}" for key, item in value.items()) + "}" if value else "..."
+        return "{" + ", ".join(f"{key}: {in_yaml(item)}" for key, item in value.items()) + "}"
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(in_yaml, value)) + "]"
-    return value if isinstance(value, str) else json.dumps(value)
+    if isinstance(value, float):
+        return number(value)
+    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value, ensure_ascii=False)
+
+
+def number(value: float) -> str:
+    """The fewest digits (at most 17) that are read as the same double, always with a decimal point.
+
+    Without the point, YAML 1.1 takes 1e-05 for text and 1 for an integer.
+    """
+    text = repr(float(value) + 0.0)  # + 0.0: no -0.0
+    mantissa, e, exponent = text.partition("e")
+    return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The sections that a field's value, or an item of it, may be."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in models_in(part)]
 
 
 def is_name(text: str) -> bool:
@@ -90,12 +120,6 @@ def _text(text: str) -> str:
     if not is_text(text):
         raise ValueError(f"{shown(text)} has unprintable characters, or more than {LONGEST_TEXT} characters")
     return text
-
-
-def _positive(number: float) -> float:
-    if not number > 0.0:
-        raise ValueError(f"{number:g} must be above 0")
-    return number
 
 
 def _length(number: float) -> float:
@@ -137,7 +161,7 @@ Name: TypeAlias = Annotated[str, AfterValidator(_name), InSchema(pattern=f"^{NAM
 Text: TypeAlias = Annotated[str, AfterValidator(_text), InSchema(minLength=1, maxLength=LONGEST_TEXT)]
 FramePair: TypeAlias = Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")]
 EulerAxes: TypeAlias = Annotated[str, AfterValidator(_axes), InSchema(pattern="^(rotation_vector|[xyz]{3}|[XYZ]{3})$")]
-Positive: TypeAlias = Annotated[float, AfterValidator(_positive), InSchema(exclusiveMinimum=0)]
+Positive: TypeAlias = Annotated[float, Field(gt=0)]
 Length: TypeAlias = Annotated[float, AfterValidator(_length), InSchema(exclusiveMinimum=0, exclusiveMaximum=LARGEST_M)]
 TimeOffset: TypeAlias = Annotated[float | Literal["estimate"], BeforeValidator(_offset)]
 
@@ -150,6 +174,11 @@ class Section(BaseModel):
     def _given(self, *names: str) -> list[str]:
         """The keys among `names` that the section has."""
         return [name for name in names if getattr(self, name) is not None]
+
+    def _need_one(self, given: list[str], words: str) -> None:
+        """Raise unless one key is given; `words` say of which."""
+        if len(given) != 1:
+            raise ValueError(f"{' and '.join(given) or 'nothing'} given; give one of {words}")
 
 
 def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...] = ()) -> ConfigDict:

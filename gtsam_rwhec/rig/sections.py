@@ -21,7 +21,6 @@ from gtsam_rwhec.rig.section_types import (
     EulerAxes,
     FramePair,
     Name,
-    OrText,
     Positive,
     Section,
     Text,
@@ -30,6 +29,7 @@ from gtsam_rwhec.rig.section_types import (
     needed,
     one_of,
     optional,
+    or_text,
 )
 
 #: REP 103: a link's x is forward, y left, z up; an optical frame's z is forward, x right, y down. T_link_optical's R.
@@ -118,11 +118,11 @@ class Intrinsics(Section):
         # A file of OpenCV may lack the size of the images.
         numbers = self._given("model", "width", "height", "K", "D", *([] if of_file else ["size"]))
         sources = self._given("topic", "kalibr", "file", "estimate") + (["numbers"] if numbers else [])
-        if len(sources) != 1:
-            raise ValueError(
-                f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, numbers "
-                "(K, size, and model and D with distortion), or estimate alone: the images say the rest"
-            )
+        self._need_one(
+            sources,
+            "topic, kalibr (with camera), file, numbers (K, size, and model and D with distortion), or estimate alone: "
+            "the images say the rest",
+        )
         if self.estimate is not None and self.stated is not None:
             raise ValueError(f"stated: {self.stated}, and they are to be estimated; leave stated or estimate out")
         if self.camera is not None and not of_file:
@@ -155,7 +155,7 @@ def _as_section(given: Any) -> Any:
 
 #: A section, or text alone: a file, or the word estimate.
 IntrinsicsOrText: TypeAlias = Annotated[
-    Intrinsics, BeforeValidator(_as_section), OrText("a file of intrinsics, or the word estimate")
+    Intrinsics, BeforeValidator(_as_section), or_text("a file of intrinsics, or the word estimate")
 ]
 
 
@@ -212,11 +212,11 @@ class PoseSource(Section):
 
     @model_validator(mode="after")
     def _is_one(self) -> PoseSource:
-        if len(self._given("tf", "topic", "frames")) != 1:
-            raise ValueError(
-                "give one of tf: [parent, child], topic: ... (with parent and child), and, for poses in files beside "
-                "images, frames: [parent, child]"
-            )
+        self._need_one(
+            self._given("tf", "topic", "frames"),
+            "tf: [parent, child], topic: ... (with parent and child), and, for poses in files beside images, frames: "
+            "[parent, child]",
+        )
         if self.topic is None and self._given("parent", "child"):
             raise ValueError(f"{self._given('tf', 'frames')[0]} names both frames already; leave parent and child out")
         if self.topic is not None and len(self._given("parent", "child")) < 2:
@@ -305,7 +305,7 @@ class Sensor(Section):
         unit="s",
     )
     frame: Name | None = optional("its frame in the results; without it the sensor's name", "cam_left_optical")
-    link: Annotated[Link, BeforeValidator(_frame_or_section), OrText("the name of the frame")] | None = optional(
+    link: Annotated[Link, BeforeValidator(_frame_or_section), or_text("the name of the frame")] | None = optional(
         "the frame of a camera's body; it takes the optical frame's place in the files for ROS", "camera_link"
     )
 
@@ -316,12 +316,11 @@ class Sensor(Section):
 
     @model_validator(mode="after")
     def _is_one(self) -> Sensor:
-        given = self._given("images", "detections")
-        if len(given) != 1:
-            raise ValueError(
-                f"{' and '.join(given) or 'nothing'} given; give one of images (a topic of a log, or a path in a "
-                "folder) and detections (a topic); a sensor that knows only its own motion has odometry"
-            )
+        self._need_one(
+            self._given("images", "detections"),
+            "images (a topic of a log, or a path in a folder) and detections (a topic); a sensor that knows only its "
+            "own motion has odometry",
+        )
         if self.poses is not None and self.images is None:
             raise ValueError("poses go with images in a folder; poses of detections are in the log")
         if self.images is not None and self.intrinsics is None:

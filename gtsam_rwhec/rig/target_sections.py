@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeAlias, get_args
 
 from pydantic import Field
 
@@ -171,6 +171,11 @@ TargetSection: TypeAlias = Annotated[
     Field(discriminator="type"),
 ]
 
+
+#: The section of each type of target.
+KINDS: dict[str, type[Section]] = {
+    get_args(section.model_fields["type"].annotation)[0]: section for section in get_args(get_args(TargetSection)[0])
+}
 
 #: Kalibr detects this family on its AprilGrids.
 FAMILY = "tag36h11"

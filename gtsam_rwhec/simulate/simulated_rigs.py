@@ -10,9 +10,9 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 from rwhec_factors.se3 import inverse, pose
 
-from gtsam_rwhec.errors import OptionError, ScaleError
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
 from gtsam_rwhec.problem.measurements import ByPair, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.simulated_noise import (
@@ -317,7 +317,7 @@ def true_scales(
     if isinstance(given, Mapping):
         raise OptionError(f"true_scale: a mapping is given, but with scale={mode!r} there is one scale; give a number")
     default = 1.0 if mode == "known" else SHARED_SCALE
-    alpha = _positive(default if given is None else given, "all targets")
+    alpha = checked_scale(default if given is None else given, "true_scale")
     if mode == "known" and alpha != 1.0:
         raise OptionError(f'true_scale: {alpha!r} is given, but with scale="known" it is 1; choose scale="shared"')
     return alpha
@@ -340,10 +340,4 @@ def _scales_by_name(
     missing = [name for name in names if name not in given]
     if missing:
         raise OptionError(f"true_scale: no scale is given for {', '.join(missing)}; give one for every target")
-    return {name: _positive(given[name], name) for name in names}
-
-
-def _positive(alpha: float, name: str) -> float:
-    if not (math.isfinite(alpha) and alpha > 0.0):
-        raise ScaleError(f"true_scale: the scale of {name} is {alpha!r}, but must be positive and finite")
-    return float(alpha)
+    return {name: checked_scale(given[name], f"true_scale of {name}") for name in names}

@@ -118,17 +118,10 @@ def _frame_distances(
 def _scale_errors(
     estimate: float | Mapping[str, float], truth: float | Mapping[str, float]
 ) -> float | dict[str, float]:
-    if isinstance(truth, Mapping):
-        if not isinstance(estimate, Mapping):
-            raise ScaleError(
-                f"Simulation.errors: the answer's scale is {estimate!r}, but this problem has a scale for each target; "
-                "pass a mapping from target to scale"
-            )
+    if isinstance(truth, Mapping) and isinstance(estimate, Mapping):
         _require(truth, estimate, "scale")
         return {name: abs(estimate[name] - alpha) / alpha for name, alpha in truth.items()}
-    if isinstance(estimate, Mapping):
-        raise ScaleError(
-            f"Simulation.errors: the answer's scale has entries for {', '.join(estimate)}, but this problem has one "
-            "scale; pass a number"
-        )
+    if isinstance(truth, Mapping) or isinstance(estimate, Mapping):
+        needs = "a scale for each target; pass a mapping" if isinstance(truth, Mapping) else "one scale; pass a number"
+        raise ScaleError(f"Simulation.errors: the answer's scale is {estimate!r}, but this problem has {needs}")
     return abs(estimate - truth) / truth

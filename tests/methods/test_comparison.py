@@ -24,7 +24,7 @@ from gtsam_rwhec.simulate import Noise, general
 QUICK = ("shah2013", "wang2022", "dornaika1998", "lom", "certified", "zhuang1994")
 
 
-def printed(comparison: Comparison, width: int = 160) -> str:
+def printed(comparison: Comparison, width: int = 200) -> str:
     console = Console(file=io.StringIO(), width=width, highlight=False, no_color=True)
     print_comparison(comparison, console)
     text = console.file
@@ -163,13 +163,6 @@ COUNTS = {
 }  # fmt: skip
 
 
-def printed_200(comparison: Comparison) -> str:
-    console = Console(file=io.StringIO(), width=200, highlight=False, no_color=True)
-    print_comparison(comparison, console)
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
 def of_pair(problem: rw.Problem) -> tuple[PoseLike, PoseLike]:
     """A solver of one pair that is right: this library's."""
     ((target, sensor),) = problem.pairs
@@ -209,7 +202,7 @@ def test_where_a_pair_fails_the_tree_avoids_it_and_frames_that_nothing_reaches_a
     assert found.unreached == ("target2",)
     assert found.estimate is None
     assert "target2" not in found.X
-    text = printed_200(Comparison((), solution, chained=(found,)))
+    text = printed(Comparison((), solution, chained=(found,)))
     assert "some: the tree avoids target0-sensor0, target2-sensor1: not this one" in text
     assert "some: no pair that can be used has target2." in text
 
@@ -219,7 +212,7 @@ def test_pairs_that_are_not_determined_alone_are_in_no_tree() -> None:
     result = rw.methods.compare(problem, methods=QUICK_CHAINED)
     assert result.undetermined == (Pair("target2", "sensor1"),)
     assert all(Pair("target2", "sensor1") not in row.tree for row in result.chained)
-    assert "No tree takes target2-sensor1: their own measurements do not determine their frames." in printed_200(result)
+    assert "No tree takes target2-sensor1: their own measurements do not determine their frames." in printed(result)
 
 
 def test_all_are_the_truth_without_noise_and_dearer_than_the_joint_answer_with_it() -> None:
@@ -235,7 +228,7 @@ def test_all_are_the_truth_without_noise_and_dearer_than_the_joint_answer_with_i
     assert len(costs) == len(PAIR_SOLVERS) + 2
     assert costs == sorted(costs)
     assert costs[0] > 1.01 * joint.cost
-    text = printed_200(result)
+    text = printed(result)
     for words in ("times joint", "off mm", "off°", f"{costs[0] / joint.cost:.3g}"):
         assert words in text
     fields = comparison_fields(result)

@@ -194,7 +194,7 @@ def curve_and_relaxation(make, seed: int, noise: float) -> tuple[Curve, RelaxedC
     found, relaxed = minimum(cost), relaxed_cost(cost)
     of = curve(relaxed)
     assert of is not None
-    return of, relaxed, (found.values[0] - relaxed.values[0]) / of.lambda_scale, found.mu
+    return of, relaxed, (found.values[0] - relaxed.values[0]) / relaxation_gap(relaxed), found.mu
 
 
 def test_eight_real_roots_below_the_optimum_and_six_above() -> None:

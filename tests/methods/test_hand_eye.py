@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from simulated import distance, hand_held, planar
 
-from gtsam_rwhec.errors import CountError, OptionError, UnderdeterminedError
-from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
+from gtsam_rwhec.errors import OptionError, UnderdeterminedError
 from gtsam_rwhec.methods.hand_eye import HAND_EYE_METHODS, solve_hand_eye
 from gtsam_rwhec.methods.hand_eye_request import DualQuaternionPrior
 from gtsam_rwhec.solver.free_directions import FreeKind
@@ -23,21 +22,13 @@ def test_the_call_gives_a_pose_near_the_truth(name):
     assert result.method == name
     assert result.cost > 0.0
     assert result.free_directions == ()
-    assert HAND_EYE_METHODS[name].assumes
-    assert HAND_EYE_METHODS[name].source
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_signs_of_the_callers_quaternions_do_not_matter(name):
-    data = hand_held(30, 2)
-    rows = [np.empty((30, 7)) for _ in range(2)]
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (2, 30))
-    for row, T, sign in zip(rows, (data.C, data.H), signs, strict=True):
-        q, _ = from_transforms(T)
-        row[:, :4], row[:, 4:] = sign[:, None] * q, T[:, :3, 3]
-    plain = solve_hand_eye(data.C, data.H, method=name, rng=0).X.matrix()
-    turned = solve_hand_eye(*rows, method=name, order="xyzw", rng=0).X.matrix()
-    np.testing.assert_allclose(turned, plain, atol=1e-9)
+def test_every_method_says_what_it_assumes_and_where_it_is_from():
+    for name, method in HAND_EYE_METHODS.items():
+        assert name == method.name
+        assert method.assumes
+        assert method.source
 
 
 def test_costs_have_names_and_only_proven_ones_bounds():
@@ -66,8 +57,6 @@ def test_only_the_certified_one_finds_a_scale(name):
     data = hand_held(10, 4)
     with pytest.raises(OptionError, match="unknown"):
         solve_hand_eye(data.C, data.H, method=name, scale="unknown")
-    with pytest.raises(CountError):
-        solve_hand_eye(data.C[:1], data.H[:1], method=name)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -79,9 +68,3 @@ def test_motions_about_one_axis_have_named_free_directions_or_are_refused(name):
     else:
         result = solve_hand_eye(data.C, data.H, method=name, rng=0)
         assert any(FreeKind.TRANSLATION is free.kind for free in result.free_directions)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_motion_at_all_is_refused(name):
-    with pytest.raises(UnderdeterminedError, match="identity"):
-        solve_hand_eye(np.tile(np.eye(4), (5, 1, 1)), np.tile(np.eye(4), (5, 1, 1)), method=name)

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from gtsam_rwhec import simulate, solve
 from gtsam_rwhec.errors import CountError, OptionError, PoseError, UnderdeterminedError
 from gtsam_rwhec.methods import opencv
-from gtsam_rwhec.methods import opencv as cv2
 from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms
 from gtsam_rwhec.methods.hand_eye import solve_hand_eye
 from gtsam_rwhec.methods.motions import motions_of, squared_residuals
@@ -209,11 +208,6 @@ def test_a_method_that_is_no_number_is_told_in_few_words(method):
         assert len(str(caught.value)) < 1000
 
 
-def test_an_unknown_method_is_refused():
-    with pytest.raises(OptionError, match="method=9 is not one of CALIB_HAND_EYE_TSAI = 0"):
-        opencv.calibrateHandEye([], [], [], [], method=9)
-
-
 def test_tsai_says_when_no_motion_is_in_its_range():
     gripper, seen, _, _ = stations(6, 11, spread_rad=0.05)
     with pytest.raises(UnderdeterminedError, match="0 of the 15 motions"):
@@ -265,16 +259,11 @@ def test_integers_and_lists_of_lists_are_numbers():
 def poses_of(turns: np.ndarray, places: np.ndarray) -> list[np.ndarray]:
     """Rotations and translations of a gripper, and of the target that its camera sees."""
     G, X, W = (
-        _transforms(*of) for of in ((turns, places), ([[0.4, -0.2, 0.9]], [[0.1, 0.2, 0.3]]), ([[1, 2, 3]],) * 2)
+        transforms(Rotation.from_rotvec(turn).as_matrix(), place)
+        for turn, place in ((turns, places), ([[0.4, -0.2, 0.9]], [[0.1, 0.2, 0.3]]), ([[1, 2, 3]],) * 2)
     )
     C = np.linalg.inv(X) @ np.linalg.inv(G) @ W
     return [G[:, :3, :3], G[:, :3, 3], C[:, :3, :3], C[:, :3, 3]]
-
-
-def _transforms(turns: object, places: object) -> np.ndarray:
-    T = np.tile(np.eye(4), (len(np.asarray(turns)), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = Rotation.from_rotvec(turns).as_matrix(), places
-    return T
 
 
 RNG = np.random.default_rng(0)
@@ -284,10 +273,12 @@ TURNS, PLACES = RNG.normal(size=(12, 3)), RNG.normal(size=(12, 3))
 def test_andreff_and_li_refuse_a_gripper_that_only_turns() -> None:
     R_G, t_G, R_C, t_C = poses_of(TURNS, np.zeros((12, 3)))
     with pytest.raises(UnderdeterminedError, match="Andreff's"):
-        cv2.calibrateHandEye(R_G, t_G, R_C, t_C, method=cv2.CALIB_HAND_EYE_ANDREFF)
+        opencv.calibrateHandEye(R_G, t_G, R_C, t_C, method=opencv.CALIB_HAND_EYE_ANDREFF)
     with pytest.raises(UnderdeterminedError, match="Li's"):
-        cv2.calibrateRobotWorldHandEye(R_C, t_C, R_G.transpose(0, 2, 1), t_G, method=cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI)
-    R, t = cv2.calibrateHandEye(R_G, t_G, R_C, t_C, method=cv2.CALIB_HAND_EYE_PARK)
+        opencv.calibrateRobotWorldHandEye(
+            R_C, t_C, R_G.transpose(0, 2, 1), t_G, method=opencv.CALIB_ROBOT_WORLD_HAND_EYE_LI
+        )
+    R, t = opencv.calibrateHandEye(R_G, t_G, R_C, t_C, method=opencv.CALIB_HAND_EYE_PARK)
     np.testing.assert_allclose(R, Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(t.ravel(), [0.1, 0.2, 0.3], atol=1e-12)
 
@@ -296,18 +287,10 @@ def test_tsai_refuses_one_axis_among_the_motions_that_it_uses() -> None:
     """About z within its range, about x beyond it."""
     turns = np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 0], [2.8, 0, 0]])
     with pytest.raises(UnderdeterminedError, match="rotate about one axis"):
-        cv2.calibrateHandEye(*poses_of(turns, PLACES[:4]), method=cv2.CALIB_HAND_EYE_TSAI)
-
-
-@pytest.mark.parametrize("method", [[1], np.array(1), None, 99])
-def test_methods(method: object) -> None:
-    given = poses_of(TURNS, PLACES)
-    for call in (cv2.calibrateHandEye, cv2.calibrateRobotWorldHandEye):
-        with pytest.raises(OptionError, match="is not one of CALIB_"):
-            call(*given, method=method)
+        opencv.calibrateHandEye(*poses_of(turns, PLACES[:4]), method=opencv.CALIB_HAND_EYE_TSAI)
 
 
 def test_complex_numbers() -> None:
     R_G, t_G, R_C, t_C = poses_of(TURNS, PLACES)
     with pytest.raises(PoseError, match="complex"):
-        cv2.calibrateHandEye(R_G * 1j, t_G, R_C, t_C)
+        opencv.calibrateHandEye(R_G * 1j, t_G, R_C, t_C)

@@ -16,7 +16,7 @@ from gtsam_rwhec.cameras.targets import Tag
 from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.rig import CheckerboardTarget, Rig, parse_rig, propose_folder_rig
-from gtsam_rwhec.rig.folder_contents import read_folder
+from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, read_folder
 from gtsam_rwhec.rig.folder_proposal import View, best_reading
 from gtsam_rwhec.rig.target_sections import CircleGridTarget
 
@@ -98,6 +98,10 @@ def test_no_poses_and_no_images(tmp_path: Path) -> None:
         propose_folder_rig(tmp_path, "rig.yaml")
 
 
+def with_poses(folder: Path) -> list[tuple[ImageFolder, FolderPoses]]:
+    return [(camera, camera.poses) for camera in read_folder(folder) if camera.poses is not None]
+
+
 TAG = Tag("tag", "tag36h11", 0, 0.1)
 COUNT = 12
 
@@ -145,7 +149,7 @@ def written(folder: Path, rotation: str) -> list[View]:
 )
 def test_the_reading_is_found(tmp_path: Path, rotation: str, stated: tuple[str | None, ...]) -> None:
     views = written(tmp_path, rotation)
-    reading = best_reading(tmp_path, read_folder(tmp_path), views)
+    reading = best_reading(tmp_path, with_poses(tmp_path), views)
     said = reading.stated
     assert (said.quaternion, said.euler, said.angles) == stated
     assert reading.evidence.role == "child"
@@ -154,6 +158,6 @@ def test_the_reading_is_found(tmp_path: Path, rotation: str, stated: tuple[str |
 
 def test_too_few_images_change_nothing(tmp_path: Path) -> None:
     views = written(tmp_path, "wxyz")[:4]
-    reading = best_reading(tmp_path, read_folder(tmp_path), views)
+    reading = best_reading(tmp_path, with_poses(tmp_path), views)
     assert reading.stated.quaternion is None
     assert reading.evidence.role is None

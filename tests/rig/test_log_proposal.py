@@ -250,8 +250,8 @@ def test_topics_that_are_left_out(scene: Scene) -> None:
 def test_no_tags_leave_an_example(scene: Scene) -> None:
     rig, text, notes = scene.moving("base", "hand").images("/cam/image", "cam", BLANK).first()
     assert list(rig.targets) == ["tag_0"]
-    assert "TODO an example: no tags were seen" in text
-    assert any("no tags in 2 images" in note for note in notes)
+    assert "TODO an example: no targets were seen" in text
+    assert any("no target in 2 images" in note for note in notes)
 
 
 def test_frames_that_a_rig_file_cannot_name(scene: Scene) -> None:
@@ -305,7 +305,7 @@ def test_markers_in_a_row_are_a_board(family: str, ids: range, columns: int, row
     assert isinstance(board, CharucoTarget)
     assert (*board.squares, board.family, board.first_id) == (columns, rows, named, ids[0])
     assert board.target("board").ids == tuple(ids)
-    assert "TODO count the squares, measure" in guess.remark
+    assert "TODO count them, measure" in guess.remark
     assert remarks == []
 
 

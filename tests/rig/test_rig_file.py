@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
@@ -100,19 +100,9 @@ def test_what_is_left_out() -> None:
     assert rig.folder == Path()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "noise"),
-    [
-        ("noise: estimate", "noise: {corner_px: 0.3}", DetectionNoise(corner_px=0.3)),
-        (
-            "noise: estimate",
-            "noise: {rotation_deg: 1, translation_mm: 2}",
-            DetectionNoise(rotation_deg=1.0, translation_mm=2.0),
-        ),
-    ],
-)
-def test_noise_given(old: str, new: str, noise: DetectionNoise) -> None:
-    assert parse_rig(FULL.replace(old, new), "rig.yaml").noise == noise
+@pytest.mark.parametrize("noise", [{"corner_px": 0.3}, {"rotation_deg": 1.0, "translation_mm": 2.0}])
+def test_noise_given(noise: dict[str, float]) -> None:
+    assert parse_rig(FULL.replace("noise: estimate", f"noise: {noise}"), "rig.yaml").noise == DetectionNoise(**noise)
 
 
 def test_poses_of_a_topic_in_either_direction() -> None:
@@ -172,7 +162,6 @@ def test_intrinsics_may_be_estimated() -> None:
 def test_lists_that_are_kept_elsewhere_too() -> None:
     assert get_args(Cleaning.model_fields["robust"].annotation) == get_args(Robust)
     options = asdict(DetectionOptions())
-    assert set(options) == {field.name for field in fields(DetectionOptions)}
     text = MINIMAL + f"detection: {{{', '.join(f'{key}: {value}' for key, value in options.items())}}}"
     assert parse_rig(text, "f").detection == options
 

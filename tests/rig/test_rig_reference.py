@@ -14,7 +14,7 @@ from rig_texts import FULL, MINIMAL
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import parse_yaml
 from gtsam_rwhec.rig import SCHEMA_FILE, editor_line, parse_rig, reference_text, rig_file_schema, schema_text
-from gtsam_rwhec.rig.rig_reference import target_sections
+from gtsam_rwhec.rig.target_sections import KINDS
 
 
 def test_the_page_is_up_to_date() -> None:
@@ -39,7 +39,7 @@ def test_every_key_has_a_row_with_words_and_an_example() -> None:
 
 
 def test_boards_say_what_they_count() -> None:
-    for section in target_sections():
+    for section in KINDS.values():
         counted = getattr(section, "counted", "")
         if counted:
             assert "across, down" in str(section.model_fields[counted].description), section

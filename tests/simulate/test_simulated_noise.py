@@ -165,16 +165,12 @@ def test_noise_on_no_measurements_is_empty() -> None:
     assert perturb(np.empty((0, 4, 4)), Noise(0.01, 12.0), 0).shape == (0, 4, 4)
 
 
-@pytest.mark.parametrize("sigma_m", [0.0, -1.0, float("nan"), float("inf")])
-def test_sigma_must_be_positive_and_finite(sigma_m: float) -> None:
+@pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])
+def test_sizes_must_be_positive_and_finite(size: float) -> None:
     with pytest.raises(NoiseError, match="sigma_m"):
-        Noise(sigma_m, 1.0)
-
-
-@pytest.mark.parametrize("kappa", [0.0, -1.0, float("nan"), float("inf")])
-def test_kappa_must_be_positive_and_finite(kappa: float) -> None:
+        Noise(size, 1.0)
     with pytest.raises(NoiseError, match="kappa"):
-        Noise(1.0, kappa)
+        Noise(1.0, size)
 
 
 def test_an_unknown_model_is_refused() -> None:
