@@ -14,15 +14,13 @@ zero outside of its 99 % interval; with A known, where it is below zero outside 
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from typing import Any
 
-import bars
 import cv2
 import numpy as np
 import simulated_cells
-from loky import ProcessPoolExecutor
+from bars import Row, run_script, runs_of_kinds
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
@@ -96,32 +94,26 @@ def in_pixels(parameters: np.ndarray) -> np.ndarray:
     return error * np.concatenate([np.ones(PINHOLE), moves])
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--only", default="", help="the kinds whose name has these words")
-    given = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(given.workers) as pool:
-        for name, kind in ((name, kind) for name, kind in KINDS.items() if given.only in name):
-            found = list(pool.map(one, [name] * given.runs, range(given.runs), chunksize=10))
-            ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
-            for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
-                rows.append(row(f"{name}: {what}", ours[:, columns].sum(axis=1), theirs[:, columns].sum(axis=1), kind))
-    return bars.print_rows("intrinsics' errors over OpenCV's", rows)
-
-
-def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> bars.Row:
+def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> Row:
     """The ratio, with its bar, of squared errors run by run."""
     worse = ours - theirs
     half = 2.58 * worse.std() / np.sqrt(len(worse))
     sizes = np.sqrt([ours.mean(), theirs.mean()])
     figure = f"{sizes[0] / sizes[1]:.2f} ({sizes[0]:.3g} px, {sizes[1]:.3g} px)"
     met = worse.mean() < -half if kind.knows_the_arm else worse.mean() <= half
-    return bars.Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
+    return Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
+
+
+def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
+    """The errors of all kinds."""
+    table = []
+    for name, found in runs_of_kinds(one, KINDS, runs, workers, seed, only):
+        ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
+        for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
+            sums = ours[:, columns].sum(axis=1), theirs[:, columns].sum(axis=1)
+            table.append(row(f"{name}: {what}", *sums, KINDS[name]))
+    return table
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("intrinsics' errors over OpenCV's", rows, runs=200, workers=1, seed=0, only="")

@@ -11,14 +11,13 @@ clock; the processor's own are in brackets.
 from __future__ import annotations
 
 import resource
-import sys
 import time
 from dataclasses import replace
 
-import bars
 import numpy as np
 import simulated_cells
 import simulated_clocks
+from bars import Row, run_script
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.targets import Checkerboard
@@ -67,12 +66,9 @@ def timed(given: simulated_cells.Cell, options: rw.CornerOptions = OPTIONS) -> t
     return time.perf_counter() - begun, time.process_time() - own, refined
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--views", type=int, default=250)
-    given = parser.parse_args()
-    large = large_cell(given.views)
+def rows(views: int) -> list[Row]:
+    """Times and memory."""
+    large = large_cell(views)
     clock, own, refined = timed(large)
     most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     wrong_clock, wrong_own, wrong = timed(with_misread_corners(large, 0.1))
@@ -82,23 +78,22 @@ def main() -> int:
     board_clock, board_own, board = timed(moving, replace(clocks, corners_m=1e-4))
     board_most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     left_out = sum(int(mask.sum()) for mask in wrong.left_out.values())
-    rows = [
-        bars.Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
-        bars.Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
-        bars.Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
-        bars.Row(f"every clock free too, {len(late.joint)} unknowns", f"{late_clock:.1f} s ({late_own:.1f} s)"),
-        bars.Row(
+    return [
+        Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
+        Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
+        Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
+        Row(f"every clock free too, {len(late.joint)} unknowns", f"{late_clock:.1f} s ({late_own:.1f} s)"),
+        Row(
             f"and every corner of the board, {len(board.joint)} unknowns",
             f"{board_clock:.1f} s ({board_own:.1f} s), {board_most / 1e9:.2f} GB",
         ),
-        bars.Row(
+        Row(
             "every tenth corner misread", f"{wrong_clock:.1f} s ({wrong_own:.1f} s)", f"<= {BAR_OUTLIERS_S:g} s",
             wrong_clock <= BAR_OUTLIERS_S,
         ),
-        bars.Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
+        Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
     ]  # fmt: skip
-    return bars.print_rows("refinement from corners", rows)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("refinement from corners", rows, views=250)

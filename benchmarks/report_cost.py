@@ -19,8 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bars import Row, benchmark_parser, print_rows
-from dataset import utias_folder
+from bars import Row, benchmark_parser, print_rows, utias_folder
 from places import CELL
 from shown_numbers import numbers_of, wrong_numbers
 
