@@ -10,6 +10,7 @@ import json
 import os
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -194,7 +195,7 @@ def planned_logs(manifest: Manifest) -> list[PlannedLog]:
         read_rig_source(manifest.shared_rig)
     entries = [(robot, source) for robot in manifest.robots for source in robot.logs]
     urls = list(dict.fromkeys(source.rig for _, source in entries))
-    rigs = dict(zip(urls, _many(_rig, urls), strict=True))
+    rigs = dict(zip(urls, _many(lambda url: _or_why(read_rig_source, url), urls), strict=True))
     expanded = [log for several in _many(_listed, entries) for log in several]
     owner: dict[str, tuple[str, str]] = {}
     for robot, url, rig, failure in expanded:
@@ -207,10 +208,10 @@ def planned_logs(manifest: Manifest) -> list[PlannedLog]:
     return _many(lambda log: _planned(*log, rigs), dict.fromkeys(expanded))
 
 
-def _rig(url: str) -> RigSource | str:
-    """A rig file, or the reason why it cannot be used."""
+def _or_why(function: Callable[[str], Told], url: str) -> Told | str:
+    """What a function says of a URL, or why it cannot."""
     try:
-        return read_rig_source(url)
+        return function(url)
     except (RwhecError, OSError) as error:
         return without_secrets(str(error))
 
@@ -220,23 +221,23 @@ def _listed(entry: tuple[Robot, LogSource]) -> list[tuple[str, str, str, str]]:
     robot, source = entry
     if not source.is_pattern:
         return [(robot.name, source.url, source.rig, "")]
-    try:
-        found = listed(source.url)
-        failure = "" if found else f"no log matches {shown(source.url)} ({source.place})"
-    except (RwhecError, OSError) as error:
-        found, failure = [], without_secrets(str(error))
-    return [(robot.name, url, source.rig, failure) for url in found or [source.url]]
+    found = _or_why(listed, source.url)
+    if isinstance(found, str) or not found:
+        return [(robot.name, source.url, source.rig, found or f"no log matches {shown(source.url)} ({source.place})")]
+    return [(robot.name, url, source.rig, "") for url in found]
 
 
 def _planned(robot: str, url: str, rig_url: str, failure: str, rigs: Mapping[str, RigSource | str]) -> PlannedLog:
     rig = rigs[rig_url]
     if failure or isinstance(rig, str):
         return PlannedLog(robot, url, failure=failure or str(rig))
-    try:
-        path = local_path(url)  # absolute: runs and workers may start in other folders
-        return PlannedLog(robot, url, LogTask(url if path is None else os.path.abspath(path), stamp_of(url), rig))
-    except (RwhecError, OSError) as error:
-        return PlannedLog(robot, url, failure=without_secrets(str(error)))
+    task = _or_why(lambda url: _task(url, rig), url)
+    return PlannedLog(robot, url, failure=task) if isinstance(task, str) else PlannedLog(robot, url, task)
+
+
+def _task(url: str, rig: RigSource) -> LogTask:
+    path = local_path(url)  # absolute: runs and workers may start in other folders
+    return LogTask(url if path is None else os.path.abspath(path), stamp_of(url), rig)
 
 
 def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Outcome], each: Each) -> list[UnitTask]:
@@ -269,12 +270,12 @@ def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Ou
 
 def _names(robot: str, logs: Sequence[PlannedLog]) -> list[str]:
     """A unique name for each log: the file's name, with a number if several files share it."""
-    taken: dict[str, int] = {}
+    taken: Counter[str] = Counter()
     names = []
     for log in logs:
         stem = shown(log.url).rpartition("/")[2].removesuffix(".mcap")
         name = f"{robot}@{_NOT_OF_NAMES.sub('_', stem)}"
-        taken[name] = taken.get(name, 0) + 1
+        taken[name] += 1
         names.append(name if taken[name] == 1 else f"{name}.{taken[name]}")
     return names
 
