@@ -71,7 +71,7 @@ def given_options(**defaults: Any) -> dict[str, Any]:
     return vars(parser.parse_args())
 
 
-def run_script(title: str, rows: Callable[..., list[Row]], **defaults: Any) -> NoReturn:
+def run_script(title: str, rows: Callable[..., list[Row]], /, **defaults: Any) -> NoReturn:
     """Print the table of ``rows`` with the given options; exit with 1 if a bar is missed. The title may name one."""
     given = given_options(**defaults)
     sys.exit(print_rows(title.format(**given), rows(**given)))

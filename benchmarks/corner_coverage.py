@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import bars
 import numpy as np
 import simulated_cells
-from bars import Row, Share, run_script, runs_of_kinds
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -79,17 +79,17 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
     return squares
 
 
-def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
     """The shares of all kinds."""
     table = []
-    for name, found in runs_of_kinds(one, KINDS, runs, workers, seed, only):
+    for name, found in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only):
         for what in found[0]:
             radii, ratios = np.array([each[what] for each in found]).T
-            share = Share.of((radii < 1.0).tolist())
+            share = bars.Share.of((radii < 1.0).tolist())
             figure = f"{share}, ratio {ratios.mean():.2f}"
-            table.append(Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
+            table.append(bars.Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
     return table
 
 
 if __name__ == "__main__":
-    run_script("95 % ellipsoids of a refinement from corners", rows, runs=2000, workers=2, seed=0, only="")
+    bars.run_script("95 % ellipsoids of a refinement from corners", rows, runs=2000, workers=2, seed=0, only="")

@@ -21,9 +21,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import bars
 import numpy as np
 import simulated_cells
-from bars import Row, run_script, runs_of_kinds
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -152,15 +152,15 @@ def squared(
     return float(error @ np.linalg.solve(bound[np.ix_(rows, rows)], error)) / len(error)
 
 
-def rows_of(what: str, squares: np.ndarray) -> list[Row]:
+def rows_of(what: str, squares: np.ndarray) -> list[bars.Row]:
     """Whether 5 % over the bound is outside of the mean's 99 % interval; and the gain over the poses."""
     corners, poses = squares.T
     mean, half = corners.mean(), interval(corners)
-    rows = [Row(what, f"{mean:.3f} +- {half:.3f}", f"<= {MOST:g}", bool(mean - half <= MOST))]
+    rows = [bars.Row(what, f"{mean:.3f} +- {half:.3f}", f"<= {MOST:g}", bool(mean - half <= MOST))]
     if np.isfinite(poses).all():
         figure = f"{poses.mean():.3g} ({poses.mean() / mean:.3g} times ours)"
         worse = corners - poses
-        rows.append(Row("  of a refinement from poses", figure, ">= 1", bool(worse.mean() <= interval(worse))))
+        rows.append(bars.Row("  of a refinement from poses", figure, ">= 1", bool(worse.mean() <= interval(worse))))
     return rows
 
 
@@ -169,15 +169,15 @@ def interval(values: np.ndarray) -> float:
     return float(2.58 * values.std() / np.sqrt(len(values)))
 
 
-def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
     """The errors of all kinds."""
     return [
         row
-        for name, found in runs_of_kinds(one, KINDS, runs, workers, seed, only)
+        for name, found in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only)
         for what in found[0]
         for row in rows_of(f"{name}: {what}", np.array([each[what] for each in found]))
     ]
 
 
 if __name__ == "__main__":
-    run_script("mean squared errors over the Cramer-Rao bound", rows, runs=2000, workers=1, seed=0, only="")
+    bars.run_script("mean squared errors over the Cramer-Rao bound", rows, runs=2000, workers=1, seed=0, only="")

@@ -17,10 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import bars
 import cv2
 import numpy as np
 import simulated_cells
-from bars import Row, run_script, runs_of_kinds
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
@@ -94,20 +94,20 @@ def in_pixels(parameters: np.ndarray) -> np.ndarray:
     return error * np.concatenate([np.ones(PINHOLE), moves])
 
 
-def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> Row:
+def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> bars.Row:
     """The ratio, with its bar, of squared errors run by run."""
     worse = ours - theirs
     half = 2.58 * worse.std() / np.sqrt(len(worse))
     sizes = np.sqrt([ours.mean(), theirs.mean()])
     figure = f"{sizes[0] / sizes[1]:.2f} ({sizes[0]:.3g} px, {sizes[1]:.3g} px)"
     met = worse.mean() < -half if kind.knows_the_arm else worse.mean() <= half
-    return Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
+    return bars.Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
 
 
-def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
     """The errors of all kinds."""
     table = []
-    for name, found in runs_of_kinds(one, KINDS, runs, workers, seed, only):
+    for name, found in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only):
         ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
         for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
             sums = ours[:, columns].sum(axis=1), theirs[:, columns].sum(axis=1)
@@ -116,4 +116,4 @@ def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
 
 
 if __name__ == "__main__":
-    run_script("intrinsics' errors over OpenCV's", rows, runs=200, workers=1, seed=0, only="")
+    bars.run_script("intrinsics' errors over OpenCV's", rows, runs=200, workers=1, seed=0, only="")

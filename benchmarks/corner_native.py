@@ -14,12 +14,12 @@ import resource
 import time
 from dataclasses import dataclass, replace
 
+import bars
 import corner_times
 import gtsam
 import native_graph
 import numpy as np
 import simulated_models
-from bars import Row, alone, run_script
 from rwhec_factors import se3
 
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
@@ -74,26 +74,26 @@ def measured(kind: str, views: int) -> Measured:
     )
 
 
-def rows(views: int) -> list[Row]:
+def rows(views: int) -> list[bars.Row]:
     """Both graphs."""
-    ours, native = (alone(measured, kind, views) for kind in ("ours", "native"))
+    ours, native = (bars.alone(measured, kind, views) for kind in ("ours", "native"))
     table = []
     for name, each in (("one factor an image", ours), ("GTSAM's own, one a corner", native)):
         parts = f"{each.build_s:.1f} + {each.optimise_s:.1f} + {each.covariance_s:.1f} s"
-        table.append(Row(name, f"{each.total_s:.1f} s"))
-        table.append(Row("  to build, optimise, and have the covariance", parts))
-        table.append(Row("  steps", f"{each.iterations}"))
-        table.append(Row("  memory of the process", f"{each.memory / 1e9:.2f} GB"))
+        table.append(bars.Row(name, f"{each.total_s:.1f} s"))
+        table.append(bars.Row("  to build, optimise, and have the covariance", parts))
+        table.append(bars.Row("  steps", f"{each.iterations}"))
+        table.append(bars.Row("  memory of the process", f"{each.memory / 1e9:.2f} GB"))
     off = np.abs(ours.off - native.off).max()
     apart = np.abs(ours.deviations / native.deviations - 1.0).max()
     return [
         *table,
-        Row("poses apart (rad, m)", f"{off:.0e}", "<= 1e-6", bool(off <= 1e-6)),
-        Row("deviations apart, a share", f"{apart:.0e}", "<= 1e-6", bool(apart <= 1e-6)),
-        Row("time of GTSAM's own over ours", f"{native.total_s / ours.total_s:.1f}"),
-        Row("memory of GTSAM's own over ours", f"{native.memory / ours.memory:.1f}"),
+        bars.Row("poses apart (rad, m)", f"{off:.0e}", "<= 1e-6", bool(off <= 1e-6)),
+        bars.Row("deviations apart, a share", f"{apart:.0e}", "<= 1e-6", bool(apart <= 1e-6)),
+        bars.Row("time of GTSAM's own over ours", f"{native.total_s / ours.total_s:.1f}"),
+        bars.Row("memory of GTSAM's own over ours", f"{native.memory / ours.memory:.1f}"),
     ]
 
 
 if __name__ == "__main__":
-    run_script("GTSAM's own factors of corners", rows, views=250)
+    bars.run_script("GTSAM's own factors of corners", rows, views=250)

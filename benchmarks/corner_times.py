@@ -14,10 +14,10 @@ import resource
 import time
 from dataclasses import replace
 
+import bars
 import numpy as np
 import simulated_cells
 import simulated_clocks
-from bars import Row, run_script
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.targets import Checkerboard
@@ -66,7 +66,7 @@ def timed(given: simulated_cells.Cell, options: rw.CornerOptions = OPTIONS) -> t
     return time.perf_counter() - begun, time.process_time() - own, refined
 
 
-def rows(views: int) -> list[Row]:
+def rows(views: int) -> list[bars.Row]:
     """Times and memory."""
     large = large_cell(views)
     clock, own, refined = timed(large)
@@ -79,21 +79,21 @@ def rows(views: int) -> list[Row]:
     board_most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     left_out = sum(int(mask.sum()) for mask in wrong.left_out.values())
     return [
-        Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
-        Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
-        Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
-        Row(f"every clock free too, {len(late.joint)} unknowns", f"{late_clock:.1f} s ({late_own:.1f} s)"),
-        Row(
+        bars.Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
+        bars.Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
+        bars.Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
+        bars.Row(f"every clock free too, {len(late.joint)} unknowns", f"{late_clock:.1f} s ({late_own:.1f} s)"),
+        bars.Row(
             f"and every corner of the board, {len(board.joint)} unknowns",
             f"{board_clock:.1f} s ({board_own:.1f} s), {board_most / 1e9:.2f} GB",
         ),
-        Row(
+        bars.Row(
             "every tenth corner misread", f"{wrong_clock:.1f} s ({wrong_own:.1f} s)", f"<= {BAR_OUTLIERS_S:g} s",
             wrong_clock <= BAR_OUTLIERS_S,
         ),
-        Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
+        bars.Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
     ]  # fmt: skip
 
 
 if __name__ == "__main__":
-    run_script("refinement from corners", rows, views=250)
+    bars.run_script("refinement from corners", rows, views=250)

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import bars
 import numpy as np
 import placements
 import simulated_cells
-from bars import Row, Share, run_script, runs_of_kinds
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -92,26 +92,26 @@ def one(name: str, seed: int) -> dict[str, bool]:
     return found
 
 
-def rows_of(name: str, found: list[dict[str, bool]]) -> list[Row]:
+def rows_of(name: str, found: list[dict[str, bool]]) -> list[bars.Row]:
     """What a kind has in the table."""
-    refused = Share.of([each["refused"] for each in found])
+    refused = bars.Share.of([each["refused"] for each in found])
     if KINDS[name].is_refused:
-        return [Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
-    rows = [Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
+        return [bars.Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
+    rows = [bars.Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
     for what in [what for what in found[0] if what != "refused"]:
-        share = Share.of([each[what] for each in found if not each["refused"]])
+        share = bars.Share.of([each[what] for each in found if not each["refused"]])
         is_coverage = what in ("target", "sensor", "intrinsics")
         bar, met = (">= 93 %", share.meets(LEAST, 1.0)) if is_coverage else ("100 %", share.value == 1.0)
         if what == "named":
             what = f"{', '.join(KINDS[name].named)} named as held by the prior, or widened"
-        rows.append(Row(f"  {what}", str(share), bar, met))
+        rows.append(bars.Row(f"  {what}", str(share), bar, met))
     return rows
 
 
-def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
     """What is said of all kinds."""
-    return [row for pair in runs_of_kinds(one, KINDS, runs, workers, seed, only) for row in rows_of(*pair)]
+    return [row for pair in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only) for row in rows_of(*pair)]
 
 
 if __name__ == "__main__":
-    run_script("intrinsics that the images do not tell", rows, runs=60, workers=2, seed=0, only="")
+    bars.run_script("intrinsics that the images do not tell", rows, runs=60, workers=2, seed=0, only="")

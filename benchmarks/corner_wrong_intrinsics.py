@@ -17,10 +17,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import bars
 import numpy as np
 import placements
 import simulated_cells
-from bars import Row, Share, run_script, runs_of_kinds
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -162,37 +162,37 @@ def _told_deviations(refined: RefinedIntrinsics, stated: Camera, told: Stated) -
     return float(np.sqrt(worst))
 
 
-def rows_of(name: str, found: list[Found]) -> list[Row]:
+def rows_of(name: str, found: list[Found]) -> list[bars.Row]:
     """What a cell of the table has."""
     kind, rows = KINDS[name.split(": ")[1]], []
     is_right = kind.drawn or not kind.wrong
     of_calibration = kind.told == "calibration" and not is_right
     for what in ("target", "sensors"):
         frames = [(each, frame) for each in found for frame in each.inside if (frame == "board") == (what == "target")]
-        share = Share.of([each.inside[frame] for each, frame in frames])
-        unless = Share.of([each.inside[frame] or each.named(frame) for each, frame in frames])
+        share = bars.Share.of([each.inside[frame] for each, frame in frames])
+        unless = bars.Share.of([each.inside[frame] or each.named(frame) for each, frame in frames])
         figure = f"{share}; or named {100 * unless.value:.1f} %" if of_calibration else str(share)
         bar = ">= 93 %" + (", or held by the prior" if of_calibration else "")
-        rows.append(Row(f"{name}: {what}", figure, bar, (unless if of_calibration else share).meets(LEAST, 1.0)))
+        rows.append(bars.Row(f"{name}: {what}", figure, bar, (unless if of_calibration else share).meets(LEAST, 1.0)))
     flags = np.array([flag for each in found for flag in each.flagged.values()])
     deviations = np.array([deviation for each in found for deviation in each.innovation.values()])
     if is_right:
-        share = Share.of(flags.tolist())
-        rows.append(Row("  flagged falsely", str(share), "<= 1 %", share.meets(0.0, FALSELY)))
+        share = bars.Share.of(flags.tolist())
+        rows.append(bars.Row("  flagged falsely", str(share), "<= 1 %", share.meets(0.0, FALSELY)))
     elif (deviations > FAR).any():
-        share = Share.of(flags[deviations > FAR].tolist())
-        rows.append(Row("  flagged beyond 5 deviations", str(share), ">= 95 %", share.meets(FLAGGED, 1.0)))
+        share = bars.Share.of(flags[deviations > FAR].tolist())
+        rows.append(bars.Row("  flagged beyond 5 deviations", str(share), ">= 95 %", share.meets(FLAGGED, 1.0)))
     held = np.mean([any(each.held.values()) for each in found])
     figure = f"{100 * flags.mean():.0f} %; {np.median(deviations):.2g}; {100 * held:.0f} %"
-    rows.append(Row("  flagged; median of innovation's deviations; named as held", figure))
+    rows.append(bars.Row("  flagged; median of innovation's deviations; named as held", figure))
     return rows
 
 
-def rows(runs: int, workers: int, seed: int, only: str) -> list[Row]:
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
     """All kinds in both geometries."""
     names = [f"{geometry}: {kind}" for kind in KINDS for geometry in GEOMETRIES]
-    return [row for pair in runs_of_kinds(one, names, runs, workers, seed, only) for row in rows_of(*pair)]
+    return [row for pair in bars.runs_of_kinds(one, names, runs, workers, seed, only) for row in rows_of(*pair)]
 
 
 if __name__ == "__main__":
-    run_script("95 % ellipsoids where stated intrinsics are wrong", rows, runs=400, workers=2, seed=0, only="")
+    bars.run_script("95 % ellipsoids where stated intrinsics are wrong", rows, runs=400, workers=2, seed=0, only="")
