@@ -42,13 +42,17 @@ class Freedom:
         rest: Array = np.linalg.svd(self.left, full_matrices=True)[0][:, self.left.shape[1] :]
         return rest
 
-    def covariance(self) -> Array:
-        """(p, p), zero along the directions that are left free."""
+    def inverse(self) -> Array:
+        """The inverse (p, p) of the information, zero along the directions that are left free."""
         Z = self.complement()
         inner = Z.T @ self.information @ Z
-        inverse = np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner)))
-        covariance: Array = Z @ inverse @ (Z.T @ self.score @ Z) @ inverse @ Z.T
-        return covariance
+        inverse: Array = Z @ np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner))) @ Z.T
+        return inverse
+
+    def covariance(self) -> Array:
+        """(p, p), zero along the directions that are left free."""
+        inverse = self.inverse()
+        return inverse @ self.score @ inverse
 
 
 def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, squares: float, spare: float) -> Freedom:
