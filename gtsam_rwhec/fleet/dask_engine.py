@@ -22,7 +22,7 @@ from gtsam_rwhec.errors import FleetError, OptionError
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.progress import Progress, Remark, silent
 from gtsam_rwhec.fleet.dask_cluster import START_S, DaskCluster
-from gtsam_rwhec.fleet.store_requests import without_secrets
+from gtsam_rwhec.fleet.stores import without_secrets
 from gtsam_rwhec.fleet.tasks import ATTEMPTS, Failed, Receipt, Task, carried_out, failed
 
 _CLIENT_LOG = logging.getLogger("distributed.client")

@@ -27,12 +27,27 @@ from gtsam_rwhec.errors import (
     StoreInterruptedError,
 )
 from gtsam_rwhec.files.progress import Counted, Progress, Remark, check_progress, silent
-from gtsam_rwhec.fleet.fleet_parquet import rows_parquet
-from gtsam_rwhec.fleet.fleet_rows import PARQUET_FILE, ROWS_FILE, FailedLog, RobotRow, read_rows, rows_json
+from gtsam_rwhec.fleet.fleet_rows import (
+    PARQUET_FILE,
+    ROWS_FILE,
+    FailedLog,
+    RobotRow,
+    read_rows,
+    rows_json,
+    rows_parquet,
+)
 from gtsam_rwhec.fleet.log_task import LogTask, map_log
 from gtsam_rwhec.fleet.manifest import LogSource, Manifest, RigSource, Robot, read_rig_source
-from gtsam_rwhec.fleet.store_requests import shown, without_secrets
-from gtsam_rwhec.fleet.stores import exists, listed, local_path, read_bytes, stamp_of, write_once
+from gtsam_rwhec.fleet.stores import (
+    exists,
+    listed,
+    local_path,
+    read_bytes,
+    shown,
+    stamp_of,
+    without_secrets,
+    write_once,
+)
 from gtsam_rwhec.fleet.tasks import Engine, Failed, InProcess, Receipt, Task, below, kept_receipt
 from gtsam_rwhec.fleet.unit_task import Answer, Each, UnitTask, solve_unit, write_results
 
@@ -222,8 +237,10 @@ def _listed(entry: tuple[Robot, LogSource]) -> list[tuple[str, str, str, str]]:
     if not source.is_pattern:
         return [(robot.name, source.url, source.rig, "")]
     found = _or_why(listed, source.url)
-    if isinstance(found, str) or not found:
-        return [(robot.name, source.url, source.rig, found or f"no log matches {shown(source.url)} ({source.place})")]
+    if not found:
+        found = f"no log matches {shown(source.url)} ({source.place})"
+    if isinstance(found, str):
+        return [(robot.name, source.url, source.rig, found)]
     return [(robot.name, url, source.rig, "") for url in found]
 
 

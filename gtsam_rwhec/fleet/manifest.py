@@ -19,8 +19,8 @@ from typing import Any
 from gtsam_rwhec.errors import FileFormatError, ManifestError, RigError, StoreError, UnfinishedRigWarning
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, dotted, parse_yaml, read_text, shown, suggestion
-from gtsam_rwhec.fleet.store_requests import shown as shown_url
 from gtsam_rwhec.fleet.stores import listed, local_path, read_bytes
+from gtsam_rwhec.fleet.stores import shown as shown_url
 from gtsam_rwhec.rig import Rig, parse_rig
 from gtsam_rwhec.rig.sections import ESTIMATE
 

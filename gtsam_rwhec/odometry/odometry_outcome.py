@@ -11,13 +11,12 @@ from rwhec_factors import se3
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.freedom import REACHES, seven_each
 from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
 from gtsam_rwhec.odometry.prior_knowledge import upside_down
 from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
 from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE
 from gtsam_rwhec.odometry.window_motions import axes_turned
-from gtsam_rwhec.odometry.window_solution import Answer, Task, refined
+from gtsam_rwhec.odometry.window_solution import REACHES, Answer, Task, refined, seven_each
 from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_directions_of, reason_for, sparse_basis
