@@ -8,15 +8,13 @@ each in a process of its own. Exits with 1 if a bar is missed.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 import warnings
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import dense_logs
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, alone, at_most, run_script
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import RwhecWarning
@@ -58,31 +56,13 @@ def rows(runs: int) -> list[Row]:
     """The times against the bars: of the calls after the first, the median."""
     result = []
     for name, case in CASES.items():
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            first, *later = pool.submit(seconds_of_calls, case, runs + 1).result()
+        first, *later = alone(seconds_of_calls, case, runs + 1)
         second = float(np.median(later))
-        result.append(
-            Row(
-                f"rw.calibrate, {name}: a call after the first",
-                f"{second:.2f} s (most {max(later):.2f} s of {len(later)})",
-                f"<= {case.bar_s:g} s",
-                second <= case.bar_s,
-            )
-        )
-        more = first - second
-        result.append(
-            Row("    the first takes longer by", f"{more:.2f} s", f"<= {MOST_MORE_S:g} s", more <= MOST_MORE_S)
-        )
+        most = f" (most {max(later):.2f} s of {len(later)})"
+        result.append(at_most(f"rw.calibrate, {name}: a call after the first", second, case.bar_s, " s", ".2f", most))
+        result.append(at_most("    the first takes longer by", first - second, MOST_MORE_S, " s", ".2f"))
     return result
 
 
-def main() -> int:
-    """Run it; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=5, help="calls after the first (default: 5)")
-    arguments = parser.parse_args()
-    return print_rows("Time of rw.calibrate", rows(arguments.runs))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Time of rw.calibrate", rows, runs=5)

@@ -24,22 +24,15 @@ with 1 if a bar is missed.
 
 from __future__ import annotations
 
-import json
-import multiprocessing
-import sys
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from binomial import Share
+from bars import Row, Share, each_done, keep_line, kept_lines, run_script
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 from scipy.optimize import brentq
 from scipy.special import chdtri
 from scipy.stats import ncx2
@@ -210,29 +203,19 @@ def noncentrality(dimension: int) -> float:
 
 def runs_of(runs: int, seed: int, workers: int, keep: Path | None) -> Iterator[dict[str, Any]]:
     """All pairs of all kinds: those of the file, then those that it lacks, which are added to it."""
-    done = set()
-    if keep is not None and keep.exists():
-        for line in keep.read_text().splitlines():
-            one = json.loads(line)
-            if one["seed"] == seed and one["number"] < runs:
-                done.add((one["kind"], one["number"]))
-                yield one
-    missing = [(kind, number) for number in range(runs) for kind in KINDS if (kind, number) not in done]
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(run, kind, number, seed) for kind, number in missing]
-        try:
-            for future in track(as_completed(waiting), "pairs", total=len(waiting), console=Console(stderr=True)):
-                one = future.result() | {"seed": seed}
-                if keep is not None:
-                    with keep.open("a") as file:
-                        file.write(json.dumps(one) + "\n")
-                yield one
-        finally:
-            pool.shutdown(cancel_futures=True)
+    kept = [one for one in kept_lines(keep) if one["seed"] == seed and one["number"] < runs]
+    yield from kept
+    done = {(one["kind"], one["number"]) for one in kept}
+    missing = [(kind, i, seed) for i in range(runs) for kind in KINDS if (kind, i) not in done]
+    for _, found in each_done(run, missing, workers, "pairs"):
+        one = found | {"seed": seed}
+        keep_line(keep, one)
+        yield one
 
 
-def rows(found: list[dict[str, Any]]) -> list[Row]:
+def rows(runs: int, seed: int, workers: int, keep: Path | None) -> list[Row]:
     """The shares against the bars."""
+    found = list(runs_of(runs, seed, workers, keep))
     answered = [one for one in found if one["answered"]]
     result = [Row("pairs of logs", f"{len(found)}, {len(answered)} with covariances")]
     for kind in ("", *KINDS):
@@ -301,18 +284,5 @@ def rows(found: list[dict[str, Any]]) -> list[Row]:
     return result
 
 
-def main() -> int:
-    """Run it; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=1000, help="pairs of logs of each kind (default: 1000)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines, to go on from")
-    arguments = parser.parse_args()
-    found = list(runs_of(arguments.runs, arguments.seed, arguments.workers, arguments.keep))
-    title = f"Changes, {arguments.runs} pairs of logs of each of {len(KINDS)} kinds"
-    return print_rows(title, rows(found))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("Changes, {runs} pairs of logs of each kind", rows, runs=1000, seed=0, workers=1, keep=Path)

@@ -1,6 +1,6 @@
 """Refinement from corners: do 95 % ellipsoids hold the truth, and how efficient is it?
 
-    python benchmarks/corner_coverage.py [--runs 2000] [--workers 2] [--kinds WORD ...] [--seed 0]
+    python benchmarks/corner_coverage.py [--runs 2000] [--workers 2] [--only WORDS] [--seed 0]
 
 Simulated cells (`tests/fitting/simulated_cells.py`): two fixed cameras, a board of 7 x 5 corners on the hand, 30
 instants, corners with 0.1 pixels of noise. Intrinsics are known; or drawn from the prior of a calibration, or of
@@ -11,15 +11,11 @@ mean of the squared deviations over their number: 1 where covariances are right.
 
 from __future__ import annotations
 
-import sys
-from collections import defaultdict
 from dataclasses import dataclass, replace
 
 import bars
 import numpy as np
 import simulated_cells
-from binomial import Share
-from loky import ProcessPoolExecutor
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -83,31 +79,17 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
     return squares
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=2000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0, help="the first run's")
-    parser.add_argument("--kinds", nargs="*", default=[""], help="only kinds that have one of these words")
-    given = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(given.workers) as pool:
-        for name in KINDS:
-            if not any(word in name for word in given.kinds):
-                continue
-            squares = defaultdict(list)
-            for found in pool.map(one, [name] * given.runs, range(given.seed, given.seed + given.runs), chunksize=10):
-                for what, each in found.items():
-                    squares[what].append(each)
-            for what, each in squares.items():
-                share = Share.of([radius < 1.0 for radius, _ in each])
-                low, high = share.interval()
-                ratio = np.mean([ratio for _, ratio in each])
-                figure = f"{100 * share.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}], ratio {ratio:.2f}"
-                rows.append(bars.Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
-    return bars.print_rows("95 % ellipsoids of a refinement from corners", rows)
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
+    """The shares of all kinds."""
+    table = []
+    for name, found in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only):
+        for what in found[0]:
+            radii, ratios = np.array([each[what] for each in found]).T
+            share = bars.Share.of((radii < 1.0).tolist())
+            figure = f"{share}, ratio {ratios.mean():.2f}"
+            table.append(bars.Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
+    return table
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("95 % ellipsoids of a refinement from corners", rows, runs=2000, workers=2, seed=0, only="")

@@ -16,9 +16,7 @@ zero outside of its 99 % interval.
 
 from __future__ import annotations
 
-import sys
 import warnings
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -26,7 +24,6 @@ from typing import Any
 import bars
 import numpy as np
 import simulated_cells
-from loky import ProcessPoolExecutor
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -155,25 +152,6 @@ def squared(
     return float(error @ np.linalg.solve(bound[np.ix_(rows, rows)], error)) / len(error)
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=2000)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--only", default="", help="the geometries whose name has these words")
-    given = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(given.workers) as pool:
-        for name in (name for name in KINDS if given.only in name):
-            squares = defaultdict(list)
-            for found in pool.map(one, [name] * given.runs, range(given.runs), chunksize=10):
-                for what, each in found.items():
-                    squares[what].append(each)
-            for what, each in squares.items():
-                rows += rows_of(f"{name}: {what}", np.array(each))
-    return bars.print_rows("mean squared errors over the Cramer-Rao bound", rows)
-
-
 def rows_of(what: str, squares: np.ndarray) -> list[bars.Row]:
     """Whether 5 % over the bound is outside of the mean's 99 % interval; and the gain over the poses."""
     corners, poses = squares.T
@@ -191,5 +169,15 @@ def interval(values: np.ndarray) -> float:
     return float(2.58 * values.std() / np.sqrt(len(values)))
 
 
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
+    """The errors of all kinds."""
+    return [
+        row
+        for name, found in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only)
+        for what in found[0]
+        for row in rows_of(f"{name}: {what}", np.array([each[what] for each in found]))
+    ]
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("mean squared errors over the Cramer-Rao bound", rows, runs=2000, workers=1, seed=0, only="")

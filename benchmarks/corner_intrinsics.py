@@ -14,7 +14,6 @@ zero outside of its 99 % interval; with A known, where it is below zero outside 
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +21,6 @@ import bars
 import cv2
 import numpy as np
 import simulated_cells
-from loky import ProcessPoolExecutor
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian
@@ -96,23 +94,6 @@ def in_pixels(parameters: np.ndarray) -> np.ndarray:
     return error * np.concatenate([np.ones(PINHOLE), moves])
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--only", default="", help="the kinds whose name has these words")
-    given = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(given.workers) as pool:
-        for name, kind in ((name, kind) for name, kind in KINDS.items() if given.only in name):
-            found = list(pool.map(one, [name] * given.runs, range(given.runs), chunksize=10))
-            ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
-            for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
-                rows.append(row(f"{name}: {what}", ours[:, columns].sum(axis=1), theirs[:, columns].sum(axis=1), kind))
-    return bars.print_rows("intrinsics' errors over OpenCV's", rows)
-
-
 def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> bars.Row:
     """The ratio, with its bar, of squared errors run by run."""
     worse = ours - theirs
@@ -123,5 +104,16 @@ def row(what: str, ours: np.ndarray, theirs: np.ndarray, kind: Kind) -> bars.Row
     return bars.Row(what, figure, "< 1" if kind.knows_the_arm else "<= 1", bool(met))
 
 
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
+    """The errors of all kinds."""
+    table = []
+    for name, found in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only):
+        ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
+        for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
+            sums = ours[:, columns].sum(axis=1), theirs[:, columns].sum(axis=1)
+            table.append(row(f"{name}: {what}", *sums, KINDS[name]))
+    return table
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("intrinsics' errors over OpenCV's", rows, runs=200, workers=1, seed=0, only="")

@@ -10,9 +10,7 @@ other. Times are the processor's own. Memory is the peak of the whole process, s
 
 from __future__ import annotations
 
-import multiprocessing
 import resource
-import sys
 import time
 from dataclasses import dataclass, replace
 
@@ -76,33 +74,26 @@ def measured(kind: str, views: int) -> Measured:
     )
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--views", type=int, default=250)
-    given = parser.parse_args()
-    found = {}
-    for kind in ("ours", "native"):
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            found[kind] = pool.apply(measured, (kind, given.views))
-    ours, native = found["ours"], found["native"]
-    rows = []
+def rows(views: int) -> list[bars.Row]:
+    """Both graphs."""
+    ours, native = (bars.alone(measured, kind, views) for kind in ("ours", "native"))
+    table = []
     for name, each in (("one factor an image", ours), ("GTSAM's own, one a corner", native)):
         parts = f"{each.build_s:.1f} + {each.optimise_s:.1f} + {each.covariance_s:.1f} s"
-        rows.append(bars.Row(name, f"{each.total_s:.1f} s"))
-        rows.append(bars.Row("  to build, optimise, and have the covariance", parts))
-        rows.append(bars.Row("  steps", f"{each.iterations}"))
-        rows.append(bars.Row("  memory of the process", f"{each.memory / 1e9:.2f} GB"))
+        table.append(bars.Row(name, f"{each.total_s:.1f} s"))
+        table.append(bars.Row("  to build, optimise, and have the covariance", parts))
+        table.append(bars.Row("  steps", f"{each.iterations}"))
+        table.append(bars.Row("  memory of the process", f"{each.memory / 1e9:.2f} GB"))
     off = np.abs(ours.off - native.off).max()
     apart = np.abs(ours.deviations / native.deviations - 1.0).max()
-    rows += [
+    return [
+        *table,
         bars.Row("poses apart (rad, m)", f"{off:.0e}", "<= 1e-6", bool(off <= 1e-6)),
         bars.Row("deviations apart, a share", f"{apart:.0e}", "<= 1e-6", bool(apart <= 1e-6)),
         bars.Row("time of GTSAM's own over ours", f"{native.total_s / ours.total_s:.1f}"),
         bars.Row("memory of GTSAM's own over ours", f"{native.memory / ours.memory:.1f}"),
     ]
-    return bars.print_rows("GTSAM's own factors of corners", rows)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("GTSAM's own factors of corners", rows, views=250)

@@ -11,7 +11,6 @@ clock; the processor's own are in brackets.
 from __future__ import annotations
 
 import resource
-import sys
 import time
 from dataclasses import replace
 
@@ -67,12 +66,9 @@ def timed(given: simulated_cells.Cell, options: rw.CornerOptions = OPTIONS) -> t
     return time.perf_counter() - begun, time.process_time() - own, refined
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--views", type=int, default=250)
-    given = parser.parse_args()
-    large = large_cell(given.views)
+def rows(views: int) -> list[bars.Row]:
+    """Times and memory."""
+    large = large_cell(views)
     clock, own, refined = timed(large)
     most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     wrong_clock, wrong_own, wrong = timed(with_misread_corners(large, 0.1))
@@ -82,7 +78,7 @@ def main() -> int:
     board_clock, board_own, board = timed(moving, replace(clocks, corners_m=1e-4))
     board_most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     left_out = sum(int(mask.sum()) for mask in wrong.left_out.values())
-    rows = [
+    return [
         bars.Row("all variables free", f"{clock:.1f} s ({own:.1f} s)", f"<= {BAR_S:g} s", clock <= BAR_S),
         bars.Row("  steps", f"{refined.iterations}; one more would be {refined.last_step:.0e} deviations"),
         bars.Row("memory of the process", f"{most / 1e9:.2f} GB", "<= 1 GB", most <= BAR_BYTES),
@@ -97,8 +93,7 @@ def main() -> int:
         ),
         bars.Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
     ]  # fmt: skip
-    return bars.print_rows("refinement from corners", rows)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("refinement from corners", rows, views=250)

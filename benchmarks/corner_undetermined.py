@@ -1,6 +1,6 @@
 """Refinement from corners of images that do not tell the intrinsics: is it said, and are no more claims made than held?
 
-    python benchmarks/corner_undetermined.py [--runs 60] [--workers 2] [--kinds WORD ...] [--seed 0]
+    python benchmarks/corner_undetermined.py [--runs 60] [--workers 2] [--only WORDS] [--seed 0]
 
 Simulated cells (`tests/fitting/placements.py`): boards that face their camera almost straight, at one depth, or in
 a corner of the image only; stated intrinsics are drawn from the prior of a calibration, or of nominal ones. Parameters
@@ -11,15 +11,12 @@ their camera straight leave a place free, which must be refused.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 import bars
 import numpy as np
 import placements
 import simulated_cells
-from binomial import Share
-from loky import ProcessPoolExecutor
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -97,12 +94,12 @@ def one(name: str, seed: int) -> dict[str, bool]:
 
 def rows_of(name: str, found: list[dict[str, bool]]) -> list[bars.Row]:
     """What a kind has in the table."""
-    refused = Share.of([each["refused"] for each in found])
+    refused = bars.Share.of([each["refused"] for each in found])
     if KINDS[name].is_refused:
         return [bars.Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
     rows = [bars.Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
     for what in [what for what in found[0] if what != "refused"]:
-        share = Share.of([each[what] for each in found if not each["refused"]])
+        share = bars.Share.of([each[what] for each in found if not each["refused"]])
         is_coverage = what in ("target", "sensor", "intrinsics")
         bar, met = (">= 93 %", share.meets(LEAST, 1.0)) if is_coverage else ("100 %", share.value == 1.0)
         if what == "named":
@@ -111,22 +108,10 @@ def rows_of(name: str, found: list[dict[str, bool]]) -> list[bars.Row]:
     return rows
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=60)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0, help="the first run's")
-    parser.add_argument("--kinds", nargs="*", default=[""], help="only kinds that have one of these words")
-    given = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(given.workers) as pool:
-        for name in KINDS:
-            if any(word in name for word in given.kinds):
-                seeds = range(given.seed, given.seed + given.runs)
-                rows += rows_of(name, list(pool.map(one, [name] * given.runs, seeds, chunksize=5)))
-    return bars.print_rows("intrinsics that the images do not tell", rows)
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
+    """What is said of all kinds."""
+    return [row for pair in bars.runs_of_kinds(one, KINDS, runs, workers, seed, only) for row in rows_of(*pair)]
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("intrinsics that the images do not tell", rows, runs=60, workers=2, seed=0, only="")

@@ -1,6 +1,6 @@
 """Refinement from corners with stated intrinsics that are wrong: do the 95 % ellipsoids of extrinsics hold the truth?
 
-    python benchmarks/corner_wrong_intrinsics.py [--runs 400] [--workers 2] [--kinds WORD ...] [--seed 0]
+    python benchmarks/corner_wrong_intrinsics.py [--runs 400] [--workers 2] [--only WORDS] [--seed 0]
 
 Simulated cells (`tests/fitting/simulated_cells.py`): two fixed cameras, a board on the hand, corners with 0.1
 pixels of noise. Strong geometry is a board of 7 x 5 corners, 1.5 m away, tilted by 20 degrees and more, in 30 images;
@@ -15,15 +15,12 @@ with the prior P and the posterior C would, without noise, show as m = (P - C) P
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 
 import bars
 import numpy as np
 import placements
 import simulated_cells
-from binomial import Share
-from loky import ProcessPoolExecutor
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -126,8 +123,9 @@ class Found:
         return self.held.get(frame, any(self.held.values()))
 
 
-def one(geometry: str, name: str, seed: int) -> Found:
+def one(case: str, seed: int) -> Found:
     """One run."""
+    geometry, name = case.split(": ")
     kind = KINDS[name]
     given = cell_of(geometry, name, seed)
     options = rw.CornerOptions(stated=kind.told, carrier_noise="estimate" if kind.noisy else "exact")
@@ -171,18 +169,18 @@ def rows_of(name: str, found: list[Found]) -> list[bars.Row]:
     of_calibration = kind.told == "calibration" and not is_right
     for what in ("target", "sensors"):
         frames = [(each, frame) for each in found for frame in each.inside if (frame == "board") == (what == "target")]
-        share = Share.of([each.inside[frame] for each, frame in frames])
-        unless = Share.of([each.inside[frame] or each.named(frame) for each, frame in frames])
+        share = bars.Share.of([each.inside[frame] for each, frame in frames])
+        unless = bars.Share.of([each.inside[frame] or each.named(frame) for each, frame in frames])
         figure = f"{share}; or named {100 * unless.value:.1f} %" if of_calibration else str(share)
         bar = ">= 93 %" + (", or held by the prior" if of_calibration else "")
         rows.append(bars.Row(f"{name}: {what}", figure, bar, (unless if of_calibration else share).meets(LEAST, 1.0)))
     flags = np.array([flag for each in found for flag in each.flagged.values()])
     deviations = np.array([deviation for each in found for deviation in each.innovation.values()])
     if is_right:
-        share = Share.of(flags.tolist())
+        share = bars.Share.of(flags.tolist())
         rows.append(bars.Row("  flagged falsely", str(share), "<= 1 %", share.meets(0.0, FALSELY)))
     elif (deviations > FAR).any():
-        share = Share.of(flags[deviations > FAR].tolist())
+        share = bars.Share.of(flags[deviations > FAR].tolist())
         rows.append(bars.Row("  flagged beyond 5 deviations", str(share), ">= 95 %", share.meets(FLAGGED, 1.0)))
     held = np.mean([any(each.held.values()) for each in found])
     figure = f"{100 * flags.mean():.0f} %; {np.median(deviations):.2g}; {100 * held:.0f} %"
@@ -190,24 +188,11 @@ def rows_of(name: str, found: list[Found]) -> list[bars.Row]:
     return rows
 
 
-def main() -> int:
-    """Run, and print a table."""
-    parser = bars.benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=400)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0, help="the first run's")
-    parser.add_argument("--kinds", nargs="*", default=[""], help="only rows that have one of these words")
-    given = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(given.workers) as pool:
-        for name in [f"{geometry}: {kind}" for kind in KINDS for geometry in GEOMETRIES]:
-            if not any(word in name for word in given.kinds):
-                continue
-            seeds = range(given.seed, given.seed + given.runs)
-            found = list(pool.map(one, *zip(*[(*name.split(": "), seed) for seed in seeds], strict=True), chunksize=5))
-            rows += rows_of(name, found)
-    return bars.print_rows("95 % ellipsoids where stated intrinsics are wrong", rows)
+def rows(runs: int, workers: int, seed: int, only: str) -> list[bars.Row]:
+    """All kinds in both geometries."""
+    names = [f"{geometry}: {kind}" for kind in KINDS for geometry in GEOMETRIES]
+    return [row for pair in bars.runs_of_kinds(one, names, runs, workers, seed, only) for row in rows_of(*pair)]
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    bars.run_script("95 % ellipsoids where stated intrinsics are wrong", rows, runs=400, workers=2, seed=0, only="")

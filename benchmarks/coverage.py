@@ -15,22 +15,19 @@ Exits with 1 if a bar is missed.
 from __future__ import annotations
 
 import itertools
-import multiprocessing
 import os
 import sys
 import time
 import warnings
 from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, benchmark_parser, each_done, print_rows, wide_console
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 import gtsam_rwhec as rw
@@ -274,24 +271,12 @@ def coverage(runs: int, workers: int, seed: int, console: Console) -> dict[Case,
     """All cases, in chunks over processes."""
     seeds = dict(zip(CASES, np.random.SeedSequence(seed).spawn(len(CASES)), strict=True))
     results: dict[Case, list[Outcome]] = {case: [] for case in CASES}
-    columns = (TextColumn("coverage"), BarColumn(), MofNCompleteColumn(), TextColumn("runs"), TimeRemainingColumn())
-    with (
-        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool,
-        Progress(*columns, console=Console(stderr=True)) as progress,
-    ):
-        task = progress.add_task("coverage", total=runs * len(CASES))
-        waiting = {}
-        for case in CASES:
-            of_runs = seeds[case].spawn(runs)
-            for first in range(0, runs, CHUNK):
-                waiting[pool.submit(run_chunk, case, of_runs[first : first + CHUNK])] = case
-        try:
-            for future in as_completed(waiting):
-                outcome = future.result()
-                results[waiting[future]].append(outcome)
-                progress.advance(task, outcome.runs)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    chunks = []
+    for case in CASES:
+        of_runs = seeds[case].spawn(runs)
+        chunks += [(case, of_runs[first : first + CHUNK]) for first in range(0, runs, CHUNK)]
+    for (case, _), outcome in each_done(run_chunk, chunks, workers, "coverage"):
+        results[case].append(outcome)
     return {case: joined(outcomes) for case, outcomes in results.items()}
 
 
@@ -313,9 +298,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write coverage.png there")
     arguments = parser.parse_args()
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=120)
+    console = wide_console()
     begin = time.perf_counter()
     status = 0
     if arguments.runs:

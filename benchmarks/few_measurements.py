@@ -1,6 +1,6 @@
 """From 2 to 40 measurements: is motion about one axis ever called unique, and is rich motion recognised?
 
-    python benchmarks/few_measurements.py [--quick] [--trials 2000] [--counts 2 3 ... 40] [--seed 7]
+    python benchmarks/few_measurements.py [--quick] [--trials 2000] [--seed 7]
 
 Random rigs: one pair, two targets, two sensors, both, motions of a sensor, and both kinds together; known, shared and
 own scales; noise of 0.01 to 2 degrees in B and up to 1 degree in A, in both or in one of them, about either origin of
@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, run_script
 from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse, pose
 
@@ -216,8 +216,9 @@ def verdicts(
     return counted, unique, refused
 
 
-def rows(counts: Sequence[int], trials: int, seed: int) -> list[Row]:
+def rows(quick: bool, trials: int, seed: int) -> list[Row]:
     """Both rows, each with the worst number of measurements."""
+    counts, trials = ([2, 3, 4, 5, 6, 8, 12, 20, 40], 60) if quick else (list(range(2, 41)), trials)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rw.errors.RwhecWarning)
         counted, unique, refused = verdicts(False, counts, trials, seed, lambda problem, solution: True)
@@ -261,18 +262,5 @@ def rows(counts: Sequence[int], trials: int, seed: int) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--quick", action="store_true", help="60 trials for each of nine numbers of measurements")
-    parser.add_argument("--trials", type=int, default=2000, help="for each number of measurements")
-    parser.add_argument("--counts", type=int, nargs="+", default=list(range(2, 41)), help="numbers of measurements")
-    parser.add_argument("--seed", type=int, default=SEED)
-    arguments = parser.parse_args()
-    counts, trials = ([2, 3, 4, 5, 6, 8, 12, 20, 40], 60) if arguments.quick else (arguments.counts, arguments.trials)
-    title = f"Few measurements{', a small part' if arguments.quick else ''}"
-    return print_rows(title, rows(counts, trials, arguments.seed))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Few measurements", rows, quick=False, trials=2000, seed=SEED)

@@ -19,7 +19,6 @@ what each fleet gave, from which an interrupted campaign goes on. Exits with 1 i
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import warnings
@@ -28,8 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from binomial import Share
+from bars import Row, Share, benchmark_parser, keep_line, kept_lines, print_rows
 from changes import log_of
 from numpy.typing import NDArray
 from rwhec_factors import se3
@@ -170,11 +168,7 @@ def fleets_of(kind: str, robots: int) -> int:
 
 def campaign(given: Any) -> Iterator[dict[str, Any]]:
     """What the file has, and what it lacks."""
-    done = {}
-    if given.keep is not None and given.keep.exists():
-        for line in given.keep.read_text().splitlines():
-            one = json.loads(line)
-            done[one["kind"], one["number"], one["seed"]] = one
+    done = {(one["kind"], one["number"], one["seed"]): one for one in kept_lines(given.keep)}
     jobs = [(kind, number) for kind in given.only or KINDS for number in range(fleets_of(kind, given.robots))]
     jobs += [("moved" if number % 2 else "still", number) for number in range(given.calibrations)]
     for kind, number in jobs:
@@ -182,9 +176,7 @@ def campaign(given: Any) -> Iterator[dict[str, Any]]:
         if one is None:
             calibrated = kind in ("moved", "still")
             one = calibrations(number, given.seed) if calibrated else run(kind, number, given.seed)
-            if given.keep is not None:
-                with given.keep.open("a") as file:
-                    file.write(json.dumps(one) + "\n")
+            keep_line(given.keep, one)
         yield one
 
 

@@ -9,21 +9,20 @@ when it begins and when it has done its work, in a file that no process owns.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import random
 import signal
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
 import psutil
-from bars import Row, benchmark_parser, print_rows
-from fleets import write_fleet
+from bars import Row, run_script
+from fleets import MadeFleet, write_fleet
 from kept_outcomes import Kept, counts_of
 
 from gtsam_rwhec import fleet
@@ -62,22 +61,21 @@ def workers_dying(engine: DaskEngine, every_s: float, seed: int, deaths: list[in
         thread.join()
 
 
-def killed_run(manifest: str, output: Path, arguments: argparse.Namespace, scheduler_too: bool) -> tuple[str, int, int]:
-    """What it said at its end, how many tasks it was told of, how many workers died."""
+def killed_run(manifest: str, output: Path, every: float, seed: int, kill_at: float = np.inf) -> tuple[str, int, int]:
+    """What it said, how many tasks and deaths of workers it had; the scheduler dies after ``kill_at`` tasks."""
     deaths: list[int] = []
     with DaskEngine(2, dashboard=False) as engine:
         engine.start()
         kept = Kept(engine, output / "told")
-        total = arguments.robots * arguments.logs
 
         def progress(stage: object) -> None:
             assert engine.cluster is not None
-            if scheduler_too and len(kept.receipts) >= total // 2:
+            if len(kept.receipts) >= kill_at:
                 with suppress(ProcessLookupError):
                     engine.cluster.scheduler.kill()
 
         said = ""
-        with workers_dying(engine, arguments.every, arguments.seed + (not scheduler_too), deaths):
+        with workers_dying(engine, every, seed, deaths):
             try:
                 done = fleet.run(fleet.read_manifest(manifest), str(output), engine=kept, progress=progress)
                 said = "; ".join(row.failure for row in done.rows if row.failure)
@@ -96,17 +94,22 @@ def checksums(output: Path) -> dict[str, str]:
     }
 
 
-def rows(arguments: argparse.Namespace, folder: Path) -> list[Row]:
+def rows(robots: int, logs: int, images: int, every: float, seed: int) -> list[Row]:
     """The table's rows."""
-    made = write_fleet(folder, arguments.robots, arguments.logs, images=arguments.images)
+    with tempfile.TemporaryDirectory() as folder:
+        return rows_in(Path(folder), write_fleet(Path(folder), robots, logs, images=images), every, seed)
+
+
+def rows_in(folder: Path, made: MadeFleet, every: float, seed: int) -> list[Row]:
+    """The rows of a fleet."""
     alone, output = folder / "alone", folder / "killed"
     output.mkdir()
     with DaskEngine(2, dashboard=False) as engine:
         kept = Kept(engine)
         fleet.run(fleet.read_manifest(made.manifest), str(alone), engine=kept)
     tasks = len(kept.receipts)
-    said, first, deaths = killed_run(made.manifest, output, arguments, scheduler_too=True)
-    again, second, more = killed_run(made.manifest, output, arguments, scheduler_too=False)
+    said, first, deaths = killed_run(made.manifest, output, every, seed, sum(map(len, made.logs.values())) // 2)
+    again, second, more = killed_run(made.manifest, output, every, seed + 1)
     counts = counts_of(output / "told")
     twice = sum(count - 1 for count in counts["done"].values())
     lost = sum(counts["begun"].values()) - sum(counts["done"].values()) - sum(counts["found"].values())
@@ -128,19 +131,5 @@ def rows(arguments: argparse.Namespace, folder: Path) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table; the exit status."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--robots", type=int, default=60)
-    parser.add_argument("--logs", type=int, default=5)
-    parser.add_argument("--images", type=int, default=40, help="of a log")
-    parser.add_argument("--every", type=float, default=3.0, help="seconds between two deaths")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        found = rows(arguments, Path(temporary))
-    return print_rows("fleets: killed on the way", found)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("fleets: killed on the way", rows, robots=60, logs=5, images=40, every=3.0, seed=0)

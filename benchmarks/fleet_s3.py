@@ -8,12 +8,10 @@ detections in bursts, and images of 200 kB at 10 Hz, which no rig asks for, in c
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 from pathlib import Path
 
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, run_script
 from mixed_log import TOPICS, write_mixed_log
 from s3_server import BUCKET, s3_server
 
@@ -22,14 +20,14 @@ from gtsam_rwhec.fleet.topic_copy import Needed, local_copy_of_topics, needed_of
 from gtsam_rwhec.logs import open_log
 
 
-def rows(arguments: argparse.Namespace) -> list[Row]:
+def rows(logs: int, seconds: int) -> list[Row]:
     """The table's rows."""
     whole = chunks = sent = asked = 0
     with tempfile.TemporaryDirectory() as temporary, s3_server() as server:
-        for seed in range(arguments.logs):
+        for seed in range(logs):
             path, folder = Path(temporary) / "log.mcap", Path(temporary) / str(seed)
             folder.mkdir()
-            whole += write_mixed_log(path, arguments.seconds, seed=seed)
+            whole += write_mixed_log(path, seconds, seed=seed)
             needed = needed_of(str(path), path.stat().st_size, TOPICS)
             assert isinstance(needed, Needed)
             chunks += needed.chunk_bytes
@@ -42,23 +40,14 @@ def rows(arguments: argparse.Namespace) -> list[Row]:
             sent, asked = sent + count.count, asked + server.asked - before[1]
             with open_log(copy) as log:
                 counts = {topic.name: topic.count for topic in log.topics()}
-            assert counts["/tf"] == counts["/detections"] == 200 * (arguments.seconds // 10)
+            assert counts["/tf"] == counts["/detections"] == 200 * (seconds // 10)
             copy.unlink()
     return [
         Row("bytes read over the needed topics' chunks", f"{sent / chunks:.3f}x", "<= 1.2x", sent <= 1.2 * chunks),
         Row("  bytes read, of the logs' bytes", f"{sent:,} of {whole:,} ({sent / whole:.1%})"),
-        Row("  requests a log", f"{asked / arguments.logs:.1f}"),
+        Row("  requests a log", f"{asked / logs:.1f}"),
     ]
 
 
-def main() -> int:
-    """Print the table; the exit status."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--logs", type=int, default=5)
-    parser.add_argument("--seconds", type=int, default=120, help="of a log")
-    arguments = parser.parse_args()
-    return print_rows("fleets: bytes from s3", rows(arguments))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("fleets: bytes from s3", rows, logs=5, seconds=120)

@@ -13,7 +13,6 @@ before is then missing in the times, so only counts are right.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -23,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, run_script
 from fleets import write_fleet
 from kept_outcomes import Kept
 
@@ -92,14 +91,20 @@ def spread(values: list[float], unit: str, digits: int) -> str:
     return f"{np.median(values):.{digits}f} {unit} (largest {max(values):.{digits}f})"
 
 
-def rows(arguments: argparse.Namespace, folder: Path) -> list[Row]:
+def rows(robots: int, logs: int, images: int, folder: Path | None) -> list[Row]:
     """The table's rows."""
-    made = write_fleet(folder, arguments.robots, arguments.logs, images=arguments.images)
+    with tempfile.TemporaryDirectory() as temporary:
+        return rows_in(folder or Path(temporary), robots, logs, images)
+
+
+def rows_in(folder: Path, robots: int, each: int, images: int) -> list[Row]:
+    """The table's rows."""
+    folder.mkdir(parents=True, exist_ok=True)
+    made = write_fleet(folder, robots, each, images=images)
     size = sum(path.stat().st_size for paths in made.logs.values() for path in paths)
     one, two = (measured(made.manifest, folder / f"out_{workers}", workers) for workers in (1, 2))
     logs = two.of("map_log")
     speed_up, overhead = one.seconds / two.seconds, 1.0 - two.task_cpu_s / two.cpu_s
-    later = len(two.receipts) - len(logs)
     found = [
         Row("speed-up of two workers over one", f"{speed_up:.2f}x", ">= 1.8x", speed_up >= 1.8),
         Row("  seconds on the clock: one worker, two", f"{one.seconds:.1f}, {two.seconds:.1f}"),
@@ -112,42 +117,25 @@ def rows(arguments: argparse.Namespace, folder: Path) -> list[Row]:
         Row("  bytes read", spread([one.bytes_read / 1024 for one in logs], "KiB", 0)),
         Row("  peak memory of the worker", spread([one.peak_bytes / MIB for one in logs], "MiB", 0)),
     ]
-    return found + modelled(two, len(logs), later, arguments)
+    return found + modelled(two, len(two.receipts), robots, each)
 
 
-def modelled(two: Measured, logs: int, later: int, arguments: argparse.Namespace) -> list[Row]:
+def modelled(two: Measured, tasks: int, robots: int, logs: int) -> list[Row]:
     """Seconds on the clock of 1,000 robots on 100 workers, and what that assumes."""
-    scale = ROBOTS / arguments.robots
+    scale = ROBOTS / robots
     work_s = scale * two.task_cpu_s / WORKERS
     # All that is not in tasks grows with the tasks, but for the start; scheduler and client are one thread each.
     serial_s = scale * max(0.0, two.cpu_s - two.task_cpu_s - two.start_cpu_s)
     last_s = max(receipt.seconds for _, receipt in two.receipts) * 2
     total = two.start_s + max(work_s, serial_s) + last_s
     return [
-        Row(f"model: {ROBOTS} robots, {arguments.logs} logs each, {WORKERS} workers", f"{total:.0f} s"),
+        Row(f"model: {ROBOTS} robots, {logs} logs each, {WORKERS} workers", f"{total:.0f} s"),
         Row("  tasks' seconds over the workers", f"{work_s:.1f} s"),
         Row("  what one thread does (scheduler and client), beside it", f"{serial_s:.1f} s"),
         Row("  start, and the last robot's merge and solution", f"{two.start_s:.1f} s, {last_s:.1f} s"),
-        Row("  assumes", f"these processors; {logs + later} tasks here, times {scale:g}; a store that answers at once"),
+        Row("  assumes", f"these processors; {tasks} tasks here, times {scale:g}; a store that answers at once"),
     ]
 
 
-def main() -> int:
-    """Print the table; the exit status."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--robots", type=int, default=200)
-    parser.add_argument("--logs", type=int, default=5)
-    parser.add_argument("--images", type=int, default=40, help="of a log")
-    parser.add_argument("--folder", type=Path, help="where logs and outputs stay")
-    arguments = parser.parse_args()
-    if arguments.folder is not None:
-        arguments.folder.mkdir(parents=True, exist_ok=True)
-        found = rows(arguments, arguments.folder)
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            found = rows(arguments, Path(temporary))
-    return print_rows("fleets: two workers", found)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("fleets: two workers", rows, robots=200, logs=5, images=40, folder=Path)

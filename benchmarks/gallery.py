@@ -23,9 +23,8 @@ from pathlib import Path
 
 import gallery_scene as scene
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, benchmark_parser, each_done, print_rows
 from gallery_faults import FAULTS, Fault
-from loky import ProcessPoolExecutor, as_completed
 from rich.console import Console
 
 import gtsam_rwhec as rw
@@ -115,18 +114,13 @@ def outcomes(faults: list[Fault], seeds: list[int], workers: int, out: Path | No
     """All runs; each is said when it ends."""
     jobs = [(FAULTS.index(fault), seed, is_good, out) for seed in seeds for fault in faults for is_good in kinds]
     found = []
-    with ProcessPoolExecutor(workers) as pool:
-        waiting = [pool.submit(kept_run, *job) for job in jobs]
-        for done, future in enumerate(as_completed(waiting), start=1):
-            one = future.result()
-            found.append(one)
-            what = (
-                ("ACCUSED" if one.accused else "not accused") if one.is_good else ("named" if one.named else "MISSED")
-            )
-            kind = "good" if one.is_good else "bad "
-            print(
-                f"{done:4d} of {len(jobs)}  {one.fault:17s} {one.seed:6d} {kind} {one.verdict:11s} {what}", flush=True
-            )
+    for _, one in each_done(kept_run, jobs, workers, "runs"):
+        found.append(one)
+        what = ("ACCUSED" if one.accused else "not accused") if one.is_good else ("named" if one.named else "MISSED")
+        kind = "good" if one.is_good else "bad "
+        print(
+            f"{len(found):4d} of {len(jobs)}  {one.fault:17s} {one.seed:6d} {kind} {one.verdict:11s} {what}", flush=True
+        )
     return found
 
 

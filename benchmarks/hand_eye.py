@@ -23,8 +23,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from interleaved import in_words, interleaved
+from bars import Row, in_words, interleaved, run_script
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -249,15 +248,5 @@ def rows(problems: int, starts: int, repetitions: int) -> list[Row]:
     return time_rows(repetitions) + cost_rows(problems, starts)
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--problems", type=int, default=2450)
-    parser.add_argument("--starts", type=int, default=4, help="random starts of nonlinear least squares a problem")
-    parser.add_argument("--repetitions", type=int, default=301, help="of the calls that are timed")
-    arguments = parser.parse_args()
-    return print_rows("AX = XB by dual quaternions", rows(arguments.problems, arguments.starts, arguments.repetitions))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("AX = XB by dual quaternions", rows, problems=2450, starts=4, repetitions=301)

@@ -15,20 +15,16 @@ baselines' answers. Exits with 1 if a bar is missed.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import TypeVar
 
 import kinhec_tables
-from bars import benchmark_parser, print_rows
+from bars import benchmark_parser, each_done, print_rows, wide_console
 from calibrate_times import rows as time_rows
 from kinhec_answers import Answer, Offsets, answers_of, baselines_of, store_baselines, stored_baselines
 from kinhec_sequences import STANDARD_SEED, TRACKS, generated, numbers_of
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 CHUNK = 20
 Result = TypeVar("Result")
@@ -39,22 +35,8 @@ def in_chunks(
 ) -> Iterator[Result]:
     """``of_chunk(root, seed, numbers, ...)`` of all numbers, in processes if there are several jobs."""
     chunks = [numbers[first : first + CHUNK] for first in range(0, len(numbers), CHUNK)]
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(what, total=len(numbers))
-        if jobs == 1:
-            for chunk in chunks:
-                yield of_chunk(root, seed, chunk, *others)
-                progress.advance(task, len(chunk))
-            return
-        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-            waiting = {pool.submit(of_chunk, root, seed, chunk, *others): chunk for chunk in chunks}
-            try:
-                for future in as_completed(waiting):
-                    yield future.result()
-                    progress.advance(task, len(waiting[future]))
-            finally:
-                pool.shutdown(cancel_futures=True)
+    calls = [(root, seed, chunk, *others) for chunk in chunks]
+    yield from (result for _, result in each_done(of_chunk, calls, jobs, what))
 
 
 def answers(
@@ -98,9 +80,7 @@ def main() -> int:
     parser.add_argument("--no-times", action="store_true", help="leave out the times of a second call")
     arguments = parser.parse_args()
     seeds = [int(seed) for seed in arguments.seeds.split(",")]
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=180)
+    console = wide_console()
     found = answers(
         seeds,
         arguments.offsets,

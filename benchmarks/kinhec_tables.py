@@ -7,8 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 
 import numpy as np
-from bars import Row
-from binomial import Share
+from bars import Row, Share
 from kinhec_answers import Answer, Error, Offsets
 from kinhec_sequences import TRACKS
 from rich.table import Table

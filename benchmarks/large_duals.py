@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, run_script
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.measurements import Pair
@@ -111,16 +111,5 @@ def rows(problems: int, most: int, kinds: Sequence[str], seed: int) -> list[Row]
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--problems", type=int, default=100)
-    parser.add_argument("--most", type=int, default=400, help="frames of the largest problem")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    return print_rows("Large duals", rows(arguments.problems, arguments.most, arguments.kinds, arguments.seed))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Large duals", rows, problems=100, most=400, kinds=KINDS, seed=1)

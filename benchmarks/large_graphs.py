@@ -10,25 +10,23 @@ The graphs (--case), each with ten measurements a pair:
 
 The bar is for the call ``rw.solve(problem)``, which splits the graph, solves it, proves the answer and asks what the
 motion determines. Simulating, and adding the measurements to the problem, come before it and are printed apart. Memory
-is the largest resident set of the process up to the end, with Python, the libraries and the problem in it. As in
-many_frames.py a problem keeps moments only, unless --keep-measurements is given. --share makes all graphs smaller: 0.1
+is the largest resident set of the process up to the end, with Python, the libraries and the problem in it.
+A problem keeps moments only, unless --keep-measurements is given. --share makes all graphs smaller: 0.1
 is a tenth of the frames. Seconds of the clock depend on who else uses the machine; those of the processor do so less.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
-import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, alone, at_most, run_script
 from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
@@ -38,7 +36,7 @@ from gtsam_rwhec.simulate.simulated_noise import Noise, perturb, random_poses, r
 from gtsam_rwhec.simulate.simulated_rigs import Motion, bipartite_edges, carrier_poses
 
 MEASUREMENTS = 10
-#: Of a small rig, as in many_frames.py.
+#: Of a small rig.
 NOISE = Noise(sigma_m=0.01, kappa=125.0)
 #: Of a camera that sees tags of a hall: 0.9 degrees about each axis.
 NOISE_OF_TAGS = Noise(sigma_m=0.01, kappa=2000.0)
@@ -130,7 +128,7 @@ def warehouse(tags: int, robots: int, cameras: int) -> Iterator[Seen]:
         yield _seen(edges, inverse(pose(R, t)), X, Y, NOISE_OF_TAGS, draw)
 
 
-def case(name: str, share: float) -> tuple[Noise, Iterator[Seen]]:
+def measurements(name: str, share: float) -> tuple[Noise, Iterator[Seen]]:
     """The noise and the measurements of a case."""
 
     def of(count: int, least: int) -> int:
@@ -145,7 +143,7 @@ def case(name: str, share: float) -> tuple[Noise, Iterator[Seen]]:
 
 def run(name: str, share: float, keep: bool) -> Measured:
     """Build a case and solve it in this process."""
-    noise, batches = case(name, share)
+    noise, batches = measurements(name, share)
     problem = rw.Problem(keep_measurements=keep)
     building = 0.0
     for seen in batches:
@@ -182,30 +180,20 @@ def _gigabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * per_unit / 1e9
 
 
-def rows(names: list[str], share: float, keep: bool) -> list[Row]:
+def rows(case: Sequence[str], share: float, keep_measurements: bool) -> list[Row]:
     """A process for each case; without bars where graphs are smaller."""
     table = []
-    for name in names:
-        command = [sys.executable, __file__, "--alone", name, "--share", str(share)]
-        done = subprocess.run([*command, *(["--keep-measurements"] if keep else [])], stdout=subprocess.PIPE, text=True)
-        if done.returncode:
-            table.append(Row(name, f"the process ended with {done.returncode}", "an answer", met=False))
+    for name in case:
+        try:
+            found = alone(run, name, share, keep_measurements)
+        except BrokenProcessPool as error:
+            table.append(Row(name, f"the process ended: {error}", "an answer", met=False))
             continue
-        found, bar = Measured(**json.loads(done.stdout.splitlines()[-1])), BARS[name]
-        measured = share == 1.0
+        seconds, gigabytes = (BARS[name].seconds, BARS[name].gigabytes) if share == 1.0 else (None, None)
+        own = f" (processor {found.processor_s:.1f} s)"
         table += [
-            Row(
-                f"{name}: {found.size}: solve",
-                f"{found.clock_s:.1f} s (processor {found.processor_s:.1f} s)",
-                f"<= {bar.seconds:g} s" if measured else "",
-                found.clock_s <= bar.seconds if measured else None,
-            ),
-            Row(
-                "    peak memory",
-                f"{found.peak_gb:.2f} GB",
-                f"<= {bar.gigabytes:g} GB" if measured else "",
-                found.peak_gb <= bar.gigabytes if measured else None,
-            ),
+            at_most(f"{name}: {found.size}: solve", found.clock_s, seconds, " s", ".1f", own),
+            at_most("    peak memory", found.peak_gb, gigabytes, " GB", ".2f"),
             Row(
                 "    status, relative gap",
                 f"{found.status}, {found.relative_gap:.1e}{'' if found.unique else ', not unique'}",
@@ -218,20 +206,5 @@ def rows(names: list[str], share: float, keep: bool) -> list[Row]:
     return table
 
 
-def main() -> int:
-    """Print the table; with --alone, one case in this process as JSON."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--case", action="append", choices=list(BARS), help="this one; again for more. All if left out")
-    parser.add_argument("--share", type=float, default=1.0, help="this part of the frames, for a quick look")
-    parser.add_argument("--keep-measurements", action="store_true", help="certify by the raw measurements")
-    parser.add_argument("--alone", choices=list(BARS), help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.alone:
-        print(json.dumps(asdict(run(arguments.alone, arguments.share, arguments.keep_measurements))))
-        return 0
-    table = rows(arguments.case or list(BARS), arguments.share, arguments.keep_measurements)
-    return print_rows("Large graphs", table)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Large graphs", rows, case=tuple(BARS), share=1.0, keep_measurements=False)

@@ -12,8 +12,7 @@ import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from interleaved import in_words, interleaved
+from bars import Row, at_most, in_words, interleaved, run_script
 from numpy.typing import NDArray
 
 import gtsam_rwhec as rw
@@ -78,11 +77,9 @@ def rows(count: int, repetitions: int) -> list[Row]:
     many = peak_bytes(lambda: to_certificate(A, B, NOISE.sigma_m, NOISE.kappa))
     ratio = times.ratio("ours", "copies")
     return [
-        Row(
-            f"{count:,} measurements, arrays to certificate, over A.copy(); B.copy()",
-            f"{ratio:.2f}x ({in_words(times.median('ours'))}; copies {in_words(times.median('copies'))})",
-            "<= 10x",
-            ratio <= 10.0,
+        at_most(
+            f"{count:,} measurements, arrays to certificate, over A.copy(); B.copy()", ratio, 10.0, "x", ".2f",
+            f" ({in_words(times.median('ours'))}; copies {in_words(times.median('copies'))})",
         ),
         Row("    with a sigma and a kappa for each measurement", f"{times.ratio('own weights', 'copies'):.2f}x"),
         Row("    status, relative gap", f"{c.status}, {c.relative_gap:.1e}", "certified", c.is_certified),
@@ -92,17 +89,8 @@ def rows(count: int, repetitions: int) -> list[Row]:
             "O(1)",
             many - few <= GROWTH_BYTES,
         ),
-    ]
-
-
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--count", type=int, default=1_000_000)
-    parser.add_argument("--repetitions", type=int, default=9)
-    arguments = parser.parse_args()
-    return print_rows("Many measurements", rows(arguments.count, arguments.repetitions))
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Many measurements", rows, count=1_000_000, repetitions=9)

@@ -18,8 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from dataset import utias_folder
+from bars import Row, run_script, utias_folder
 from misread_problems import KINDS, KINDS_OF_GRAPHS, Kind, misread
 from rwhec_factors.se3 import expmap
 
@@ -165,41 +164,36 @@ def named(name: str, problem: rw.Problem, kinds: tuple[Kind, ...]) -> tuple[list
     return rows, seconds
 
 
-def main() -> int:
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--good", type=int, default=1000, help="number of good problems (default: 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first good problem")
-    arguments = parser.parse_args()
+def rows(good: int, seed: int) -> list[Row]:
     warnings.simplefilter("ignore")
-    rows = []
-    for name, problem, is_graph in rigs() if arguments.good != -1 else ():
+    table = []
+    for name, problem, is_graph in rigs():
         begin = time.process_time()
         accused = misreadings(problem, solved(problem))
         cost = time.process_time() - begin
         found, seconds = named(name, problem, KINDS + (KINDS_OF_GRAPHS if is_graph else ()))
-        rows.append(Row(f"{name}: as it is", str(len(accused)), "0", not accused))
-        rows.append(
+        table.append(Row(f"{name}: as it is", str(len(accused)), "0", not accused))
+        table.append(
             Row(f"{name}: seconds as it is, with solving; a misreading", f"{cost:.3f}; {seconds / len(found):.2f}")
         )
-        rows += found
+        table += found
     accusations: Counter[str] = Counter()
     kinds = good_problems()
     begin = time.process_time()
-    for number in range(arguments.good):
-        seed = arguments.seed + number
+    for number in range(good):
         kind = list(kinds)[number % len(kinds)]
-        problem = kinds[kind](seed, np.random.default_rng(seed))
+        problem = kinds[kind](seed + number, np.random.default_rng(seed + number))
         solution = solved(problem)
         reasons = [*misreadings(problem, solution), implausible(problem, solution)]
         for reason in filter(None, reasons):
             accusations[kind] += 1
-            print(f"accused: {kind}, seed {seed}: {reason}")
+            print(f"accused: {kind}, seed {seed + number}: {reason}")
     seconds = time.process_time() - begin
     total = accusations.total()
-    rows.append(Row("good problems accused", f"{total} of {arguments.good}", "0", total == 0))
-    rows.append(Row("seconds of a good problem, with making and solving it", f"{seconds / max(arguments.good, 1):.3f}"))
-    return print_rows("Misreadings", rows)
+    table.append(Row("good problems accused", f"{total} of {good}", "0", total == 0))
+    table.append(Row("seconds of a good problem, with making and solving it", f"{seconds / max(good, 1):.3f}"))
+    return table
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Misreadings", rows, good=1000, seed=0)

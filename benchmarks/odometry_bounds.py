@@ -10,13 +10,11 @@ clocks and the ground as nuisances. Exits with 1 where a root mean square is abo
 
 from __future__ import annotations
 
-import sys
 import time
 
 import numpy as np
 import odometry_drives
-from bars import Row, benchmark_parser, print_rows
-from binomial import Share
+from bars import Row, Share, run_script
 from scipy.special import chdtri
 
 from gtsam_rwhec.simulate.drives import DriveShape
@@ -27,13 +25,13 @@ LEVEL = 0.95
 CASES: dict[str, tuple[DriveShape, bool]] = {"3 D": ("3d", False), "planar, a height each": ("planar", True)}
 
 
-def rows(runs: int, seconds: float, outliers: float = 0.0, *, clocks: bool = True) -> list[Row]:
+def rows(runs: int, seconds: float, outliers: float, one_clock: bool) -> list[Row]:
     """Errors and shares of each case."""
     result = []
     for what, (shape, heights) in CASES.items():
         begun = time.process_time()
         done = [
-            odometry_drives.run(shape, seconds, seed, heights=heights, outliers=outliers, clocks=clocks)
+            odometry_drives.run(shape, seconds, seed, heights=heights, outliers=outliers, clocks=not one_clock)
             for seed in range(runs)
         ]
         each = (time.process_time() - begun) / runs
@@ -69,17 +67,5 @@ def rows(runs: int, seconds: float, outliers: float = 0.0, *, clocks: bool = Tru
     return result
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=40, help="drives of each case")
-    parser.add_argument("--seconds", type=float, default=120.0, help="length of a drive")
-    parser.add_argument("--outliers", type=float, default=0.0, help="share of steps that are outliers")
-    parser.add_argument("--one-clock", action="store_true", help="no time offsets, and none estimated")
-    given = parser.parse_args()
-    found = rows(given.runs, given.seconds, given.outliers, clocks=not given.one_clock)
-    return print_rows("six odometries", found)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("six odometries", rows, runs=40, seconds=120.0, outliers=0.0, one_clock=False)

@@ -8,11 +8,9 @@ In 3 D nothing is. Exits with 1 where one of the planar drives says less or more
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import odometry_drives
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, run_script
 
 from gtsam_rwhec import odometry
 
@@ -46,14 +44,5 @@ def rows(runs: int, seconds: float) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=200, help="drives of each kind")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of a drive")
-    given = parser.parse_args()
-    return print_rows("planar odometries", rows(given.runs, given.seconds))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script("planar odometries", rows, runs=200, seconds=60.0)

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from interleaved import in_words, interleaved
+from bars import Row, at_most, in_words, interleaved, run_script
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, frame_distance, general
@@ -46,14 +45,9 @@ def rows_of(count: int, repetitions: int) -> list[Row]:
     theirs[:3, :3], theirs[:3, 3] = R, t.ravel()
     errors = [frame_distance(T, simulation.X["target0"]) for T in (solution.X["target0"].matrix(), theirs)]
     ratio, with_build = times.ratio("solve", "opencv"), times.ratio("build", "opencv")
-    bar = BARS.get(count)
+    took = f" ({in_words(times.median('solve'))}; OpenCV {in_words(times.median('opencv'))})"
     return [
-        Row(
-            f"N = {count}: solve over OpenCV",
-            f"{ratio:.3g}x ({in_words(times.median('solve'))}; OpenCV {in_words(times.median('opencv'))})",
-            "" if bar is None else f"<= {bar:g}x",
-            None if bar is None else ratio <= bar,
-        ),
+        at_most(f"N = {count}: solve over OpenCV", ratio, BARS.get(count), "x", more=took),
         Row("    building the problem and solving it over OpenCV", f"{with_build:.3g}x"),
         Row(
             "    status; error of X, ours and OpenCV's",
@@ -72,13 +66,5 @@ def rows(repetitions: int) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--repetitions", type=int, default=51)
-    arguments = parser.parse_args()
-    return print_rows(f"One X, one Y, against OpenCV {cv2.__version__}", rows(arguments.repetitions))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script(f"One X, one Y, against OpenCV {cv2.__version__}", rows, repetitions=51)

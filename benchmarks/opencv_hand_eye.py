@@ -19,8 +19,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from interleaved import Times, in_words, interleaved
+from bars import Row, Times, in_words, interleaved, run_script
 from rich.progress import track
 
 import gtsam_rwhec as rw
@@ -208,6 +207,7 @@ def transform(answer: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 def rows(repetitions: int, problems: int) -> list[Row]:
     """All of it."""
+    cv2.setNumThreads(1)
     return [
         *same_names(repetitions),
         *certified_speed(),
@@ -216,15 +216,5 @@ def rows(repetitions: int, problems: int) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--repetitions", type=int, default=3)
-    parser.add_argument("--problems", type=int, default=200)
-    arguments = parser.parse_args()
-    cv2.setNumThreads(1)
-    return print_rows("Hand-eye calls", rows(arguments.repetitions, arguments.problems))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Hand-eye calls", rows, repetitions=3, problems=200)

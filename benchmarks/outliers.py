@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from dataset import utias_folder
+from bars import Row, run_script, utias_folder
 from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse
 
@@ -246,15 +245,15 @@ def _share(inliers: Masks) -> float:
     return 100.0 * float(np.concatenate(list(inliers.values())).mean())
 
 
-def rows(seeds: int, plot_to: Path | None = None) -> list[Row]:
+def rows(seeds: int, plot: Path | None = None) -> list[Row]:
     """All cases and the real dataset; the plot if a folder is given."""
     results = {case: sweep(case, seeds) for case in CASES}
-    if plot_to is not None:
-        print(f"Written to {plot(plot_to, results, seeds)}.", file=sys.stderr)
+    if plot is not None:
+        print(f"Written to {plotted(plot, results, seeds)}.", file=sys.stderr)
     return [row for case, found in results.items() for row in rows_of(case, found)] + real_dataset()
 
 
-def plot(folder: Path, results: dict[Case, list[Result]], seeds: int) -> Path:
+def plotted(folder: Path, results: dict[Case, list[Result]], seeds: int) -> Path:
     """Ratio, and how many runs stay within the bar, against the share of outliers."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import PercentFormatter, ScalarFormatter
@@ -291,14 +290,5 @@ def plot(folder: Path, results: dict[Case, list[Result]], seeds: int) -> Path:
     return path
 
 
-def main() -> int:
-    """Print the table; plot if asked to."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--seeds", type=int, default=40)
-    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write outliers.png there")
-    arguments = parser.parse_args()
-    return print_rows("Outliers", rows(arguments.seeds, arguments.plot))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Outliers", rows, seeds=40, plot=Path)

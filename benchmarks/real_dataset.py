@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from bars import Row, benchmark_parser, print_rows
-from dataset import utias_folder
-from interleaved import in_words, interleaved
+from bars import Row, in_words, interleaved, run_script, utias_folder
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.solver.solve_options import Method
@@ -25,6 +23,11 @@ SCALE = 1.0254
 def real_problem(scale: rw.ScaleMode) -> rw.Problem:
     """All 73 pairs with sigma = kappa = 1."""
     return rw.read_csv(utias_folder(), scale=scale, sigma=1.0, kappa=1.0)
+
+
+def rows(repetitions: int) -> list[Row]:
+    """Answers and times."""
+    return answers() + speed(repetitions)
 
 
 def answers() -> list[Row]:
@@ -62,13 +65,5 @@ def speed(repetitions: int) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--repetitions", type=int, default=15)
-    arguments = parser.parse_args()
-    return print_rows("The RWHEC paper's real dataset, sigma = kappa = 1", answers() + speed(arguments.repetitions))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("The RWHEC paper's real dataset, sigma = kappa = 1", rows, repetitions=15)

@@ -22,8 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rendered_scenes as scenes
-from bars import Row, benchmark_parser, print_rows
-from binomial import Share
+from bars import Row, Share, benchmark_parser, print_rows
 from loky import ProcessPoolExecutor
 from rendered_kinds import KINDS, Kind, outline_of
 from rendered_prints import Array

@@ -11,16 +11,13 @@ from __future__ import annotations
 import cProfile
 import json
 import pstats
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bars import Row, benchmark_parser, print_rows
-from dataset import utias_folder
+from bars import Row, alone, at_most, run_script, utias_folder
 from places import CELL
 from shown_numbers import numbers_of, wrong_numbers
 
@@ -77,7 +74,7 @@ def real(folder: Path, timed: Timed) -> None:
 REPORTS = {"demo": demo, "real": real}
 
 
-def measured(name: str, *, is_profiled: bool = False) -> dict[str, Any]:
+def measured(name: str, is_profiled: bool) -> dict[str, Any]:
     """Time, size and numbers of a report."""
     timed = Timed(lambda: None)
     timed.is_profiled = is_profiled
@@ -94,32 +91,19 @@ def measured(name: str, *, is_profiled: bool = False) -> dict[str, Any]:
     return {"seconds": timed.seconds, "bytes": size, "numbers": len(numbers_of(page)), "wrong": wrong}
 
 
-def rows() -> list[Row]:
+def rows(profile: bool) -> list[Row]:
     """Time, size and numbers of both reports, each in a process of its own."""
     table = []
     for name in REPORTS:
-        done = subprocess.run([sys.executable, __file__, "--of", name], check=True, capture_output=True, text=True)
-        found = json.loads(done.stdout.splitlines()[-1])
-        size, wrong = 1e-6 * found["bytes"], len(found["wrong"])
+        found = alone(measured, name, profile)
+        wrong = len(found["wrong"])
         table += [
-            Row(f"{name}: s of a processor", f"{found['seconds']:.2f}", f"<= {SECONDS}", found["seconds"] <= SECONDS),
-            Row(f"{name}: MB", f"{size:.2f}", f"<= {MEGABYTES}", size <= MEGABYTES),
+            at_most(f"{name}: s of a processor", found["seconds"], SECONDS, spec=".2f"),
+            at_most(f"{name}: MB", 1e-6 * found["bytes"], MEGABYTES, spec=".2f"),
             Row(f"{name}: numbers unlike the JSON's", f"{wrong} of {found['numbers']}", "0", wrong == 0),
         ]
     return table
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--profile", action="store_true")
-    parser.add_argument("--of", choices=REPORTS, help="one report, as JSON")
-    arguments = parser.parse_args()
-    if arguments.of is not None:
-        print(json.dumps(measured(arguments.of, is_profiled=arguments.profile)))
-        return 0
-    return print_rows("Report", rows())
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Report", rows, profile=False)

@@ -12,10 +12,10 @@ from __future__ import annotations
 import time
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from dataset import utias_folder
+from bars import Row, run_script, utias_folder
 from numpy.typing import NDArray
 
 import gtsam_rwhec as rw
@@ -184,15 +184,10 @@ def rows_of(scale: rw.ScaleMode, starts: int) -> list[Row]:
     ]
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--starts", type=int, default=100, help="random starts of each pair")
-    parser.add_argument("--scale", nargs="+", choices=("known", "shared"), default=("known", "shared"))
-    arguments = parser.parse_args()
-    rows = [row for scale in arguments.scale for row in rows_of(scale, arguments.starts)]
-    return print_rows("The real dataset's 73 pairs, each alone", rows)
+def rows(starts: int, scale: Sequence[rw.ScaleMode]) -> list[Row]:
+    """Every scale mode."""
+    return [row for each in scale for row in rows_of(each, starts)]
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("The real dataset's 73 pairs, each alone", rows, starts=100, scale=("known", "shared"))

@@ -9,19 +9,14 @@ such as the arm's constant error, is in both covariances and in neither differen
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import warnings
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 
 import dense_logs
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from binomial import Share
-from rich.console import Console
-from rich.progress import track
+from bars import Row, Share, each_done, run_script
 from scipy.special import chdtri
 
 import gtsam_rwhec as rw
@@ -66,13 +61,8 @@ def run(seed: np.random.SeedSequence, frames: int) -> Halves:
 
 def runs_of(runs: int, frames: int, jobs: int, seed: int = 0) -> list[Halves]:
     """All runs, in processes if there are several jobs."""
-    seeds = np.random.SeedSequence(seed).spawn(runs)
-    if jobs == 1:
-        return [run(of_run, frames) for of_run in seeds]
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(run, of_run, frames) for of_run in seeds]
-        done = track(as_completed(waiting), "split halves", total=runs, console=Console(stderr=True))
-        return [future.result() for future in done]
+    calls = [(of_run, frames) for of_run in np.random.SeedSequence(seed).spawn(runs)]
+    return [halves for _, halves in each_done(run, calls, jobs, "split halves")]
 
 
 def rows(runs: int, frames: int, jobs: int) -> list[Row]:
@@ -101,16 +91,5 @@ def rows(runs: int, frames: int, jobs: int) -> list[Row]:
     return result
 
 
-def main() -> int:
-    """Run it; 0 if the bar is met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=300, help="logs (default: 300)")
-    parser.add_argument("--frames", type=int, default=1500, help="of each log (default: 1500)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one for each core)")
-    arguments = parser.parse_args()
-    found = rows(arguments.runs, arguments.frames, arguments.jobs)
-    return print_rows(f"Split halves, {arguments.runs} logs", found)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Split halves, {runs} logs", rows, runs=300, frames=1500, jobs=os.cpu_count() or 1)

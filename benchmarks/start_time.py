@@ -12,8 +12,7 @@ import subprocess
 import sys
 from functools import partial
 
-from bars import Row, benchmark_parser, print_rows
-from interleaved import in_words, interleaved
+from bars import Row, at_most, in_words, interleaved, run_script
 
 PROGRAMS = {
     "import gtsam": ("-c", "import gtsam"),
@@ -35,23 +34,10 @@ def rows(repetitions: int) -> list[Row]:
     )
     table = []
     for name in list(PROGRAMS)[1:]:
-        ratio, bar = times.ratio(name, "import gtsam"), BARS.get(name)
-        figure = f"{ratio:.2f}x ({in_words(times.median(name))})"
-        table.append(
-            Row(f"{name}, over import gtsam", figure)
-            if bar is None
-            else Row(f"{name}, over import gtsam", figure, f"<= {bar}x", ratio <= bar)
-        )
+        ratio, took = times.ratio(name, "import gtsam"), in_words(times.median(name))
+        table.append(at_most(f"{name}, over import gtsam", ratio, BARS.get(name), "x", ".2f", f" ({took})"))
     return table
 
 
-def main() -> int:
-    """Print the table."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--repetitions", type=int, default=15)
-    arguments = parser.parse_args()
-    return print_rows("Start", rows(arguments.repetitions))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Start", rows, repetitions=15)

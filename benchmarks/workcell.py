@@ -17,8 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from bars import Row, benchmark_parser, print_rows
-from interleaved import in_words, interleaved
+from bars import Row, in_words, interleaved, run_script
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.camera import Camera
@@ -123,15 +122,5 @@ def rows(repetitions: int) -> list[Row]:
     return [*result, Row("images a second, two workers, from files' bytes", f"{rate:.0f}", ">= 20", rate >= 20.0)]
 
 
-def main() -> int:
-    """Run it; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--repetitions", type=int, default=3)
-    arguments = parser.parse_args()
-    if not FOLDER.is_dir():
-        parser.error(f"{FOLDER} does not exist: set GTSAM_RWHEC_DATA to the folder that holds workcell_camera2")
-    return print_rows("Workcell", rows(arguments.repetitions))
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Workcell", rows, repetitions=3)

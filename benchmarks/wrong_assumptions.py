@@ -11,18 +11,14 @@ not USE in at least 99 % of runs. Exits with 1 if one is missed.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import warnings
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
-from binomial import Share
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from bars import Row, Share, each_done, run_script
 from rwhec_factors.se3 import inverse
 from simulated_arms import ARM, BENT_RAD, FloatArray, moved_by, white
 
@@ -192,47 +188,20 @@ def outcomes(names: list[str], runs: int, jobs: int, seed: int = 0) -> dict[str,
     for name in names:
         of_runs = of_row[name].spawn(runs)
         chunks += [(name, of_runs[first : first + CHUNK]) for first in range(0, runs, CHUNK)]
-    if jobs == 1:
-        for name, seeds in chunks:
-            found[name] += run_chunk(name, seeds)
-        return found
-    columns: tuple[object, ...] = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool,
-        Progress(*columns, console=Console(stderr=True)) as progress,  # type: ignore[arg-type]
-    ):
-        task = progress.add_task("runs", total=runs * len(names))
-        waiting = {pool.submit(run_chunk, name, seeds): name for name, seeds in chunks}
-        try:
-            for future in as_completed(waiting):
-                found[waiting[future]] += future.result()
-                progress.advance(task, future.result().runs)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    for (name, _), outcome in each_done(run_chunk, chunks, jobs, "wrong assumptions"):
+        found[name] += outcome
     return found
 
 
-def rows(runs: int, jobs: int, names: list[str] | None = None) -> list[Row]:
+def table(runs: int, jobs: int, rows: Sequence[str]) -> list[Row]:
     """The table against the bar."""
     result = []
-    for name, outcome in outcomes(names or list(CASES), runs, jobs).items():
+    for name, outcome in outcomes(list(rows), runs, jobs).items():
         shares = ", ".join(f"{what} {outcome.held[what].value:.3f}" for what in NAMES)
         said = ", ".join(f"{verdict} {number}" for verdict, number in outcome.verdicts.most_common())
         result.append(Row(name, f"{shares}; {said}", "meets .92 to .98, or not USE in .99", outcome.is_met))
     return result
 
 
-def main() -> int:
-    """Run it; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=1000, help="of each row (default: 1000)")
-    parser.add_argument("--rows", nargs="+", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one for each core)")
-    arguments = parser.parse_args()
-    return print_rows(
-        f"Wrong assumptions, {arguments.runs} runs a row", rows(arguments.runs, arguments.jobs, arguments.rows)
-    )
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_script("Wrong assumptions, {runs} runs a row", table, runs=1000, jobs=os.cpu_count() or 1, rows=tuple(CASES))

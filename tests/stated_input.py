@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import pytest
 from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 GENERATOR = np.random.default_rng(5)
@@ -32,3 +35,12 @@ def with_(problem: rw.Problem, *calls: Callable[[rw.Problem], None]) -> rw.Probl
     for call in calls:
         call(problem)
     return problem
+
+
+@contextmanager
+def says(error: type[Exception], said: str) -> Iterator[None]:
+    """An error of the library whose message has all these words, with | between them."""
+    with pytest.raises(error) as caught:
+        yield
+    assert isinstance(caught.value, RwhecError)
+    assert [words for words in said.split("|") if words not in str(caught.value)] == []

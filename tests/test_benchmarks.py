@@ -48,7 +48,7 @@ def imported(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
 def test_shares_meet_a_band_by_their_interval(
     imported: Callable[[str], ModuleType], held: int, runs: int, meets: bool
 ) -> None:
-    share = imported("binomial").Share(held, runs)
+    share = imported("bars").Share(held, runs)
     low, high = share.interval()
     assert low < share.value < high or share.value == high == 1.0
     assert share.meets(0.93, 0.98) is meets

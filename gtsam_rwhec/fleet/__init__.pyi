@@ -11,9 +11,9 @@ from .fleet_rows import RobotRow as RobotRow
 from .fleet_rows import RowFrame as RowFrame
 from .fleet_rows import read_rows as read_rows
 from .fleet_rows import rows_json as rows_json
-from .fleet_parquet import read_history as read_history
-from .fleet_parquet import read_parquet as read_parquet
-from .fleet_parquet import rows_parquet as rows_parquet
+from .fleet_rows import read_history as read_history
+from .fleet_rows import read_parquet as read_parquet
+from .fleet_rows import rows_parquet as rows_parquet
 
 # A run over all of them.
 from .fleet_run import FleetRun as FleetRun
@@ -28,7 +28,7 @@ from .tasks import Receipt as Receipt
 from .tasks import Task as Task
 from .dask_engine import DaskEngine as DaskEngine
 from .dask_engine import bytes_of as bytes_of
-from .store_requests import shown as shown
+from .stores import shown as shown
 
 # Drift of each robot over time.
 from .watching import RobotChart as RobotChart

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import select
 import shutil
 import subprocess
 import sys
@@ -42,6 +41,8 @@ _ENVIRONMENT = {
     "DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE": "False",
     "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "1.0",
 }
+#: The scheduler writes its address to this file.
+PLACE = "scheduler.json"
 #: How the processes' log file is opened: all of them append to it.
 _APPENDING = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 
@@ -62,19 +63,19 @@ class DaskCluster:
         self.folder = Path(tempfile.mkdtemp(prefix="gtsam-rwhec-fleet-"))
         self._processes: list[subprocess.Popen[bytes]] = []
         try:
-            options: dict[str, Any] = {
-                "host": "127.0.0.1", "port": 0, "dashboard": dashboard, "dashboard_address": "127.0.0.1:0",
-                "allowed_failures": allowed_failures,
-            }  # fmt: skip
-            self.scheduler = self._started("scheduler", json.dumps(options))
-            options = {"nthreads": 1, "memory_limit": memory_bytes, "local_directory": str(self.folder)}
-            self.workers = self._started("workers", str(workers), json.dumps(options))
-            told = json.loads(self._first_line())
-            self.address, self.dashboard = str(told["address"]), str(told["dashboard"])
-            assert self.workers.stdin is not None
-            with suppress(BrokenPipeError):  # the process has ended: the caller that waits for it reports this
-                self.workers.stdin.write(f"{self.address}\n".encode())
-                self.workers.stdin.flush()
+            self.scheduler = self._started(
+                "scheduler",
+                host="127.0.0.1",
+                port=0,
+                dashboard=dashboard,
+                dashboard_address="127.0.0.1:0",
+                allowed_failures=allowed_failures,
+            )
+            self.workers = self._started(
+                f"{workers} workers", nthreads=1, memory_limit=memory_bytes, local_directory=str(self.folder)
+            )
+            self.address, port = self._place()
+            self.dashboard = f"http://127.0.0.1:{port}/status" if port else ""
         except BaseException:
             self.close()
             raise
@@ -105,48 +106,42 @@ class DaskCluster:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _started(self, *arguments: str) -> subprocess.Popen[bytes]:
+    def _started(self, what: str, **options: Any) -> subprocess.Popen[bytes]:
         # The other processes can import what this one can: they find the tasks' functions by name.
         paths = [os.getcwd() if path == "" else path for path in sys.path]
         environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(paths)}
+        told = json.dumps(options | {"scheduler_file": str(self.folder / PLACE)})
+        said = os.open(self.folder / "said", _APPENDING, 0o600)
         process = subprocess.Popen(
-            [sys.executable, "-m", "gtsam_rwhec.fleet.dask_cluster", *arguments],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=os.open(self.folder / "said", _APPENDING, 0o600),
-            env=environment, start_new_session=True,
+            [sys.executable, "-m", "gtsam_rwhec.fleet.dask_cluster", what, told],
+            stdin=subprocess.PIPE, stdout=said, stderr=said, env=environment, start_new_session=True,
         )  # fmt: skip
+        os.close(said)
         self._processes.append(process)
         return process
 
-    def _first_line(self) -> bytes:
-        """The first line of the scheduler's output: it is ready."""
-        assert self.scheduler.stdout is not None
-        ready, _, _ = select.select([self.scheduler.stdout], [], [], START_S)
-        line = self.scheduler.stdout.readline() if ready else b""
-        if not line:
-            raise FleetError(f"Dask's scheduler does not start within {START_S:.0f} s. {self.last_words()}")
-        return line
+    def _place(self) -> tuple[str, int | None]:
+        """The scheduler's address, and the port of its page, from the file that it writes when it is ready."""
+        deadline = time.monotonic() + START_S
+        while time.monotonic() < deadline and not self.gone():
+            with suppress(OSError, ValueError):  # it is not there, or not whole
+                told = json.loads((self.folder / PLACE).read_bytes())
+                return told["address"], told["services"].get("dashboard")
+            time.sleep(0.02)
+        raise FleetError(f"Dask's scheduler does not start within {START_S:.0f} s. {self.last_words()}")
 
 
-async def _scheduler(options: dict[str, Any]) -> None:
-    from distributed import Scheduler
+async def _run(what: str, options: dict[str, Any]) -> None:
+    """Run the scheduler, or workers, each with a nanny that restarts it when it dies or exceeds its memory."""
+    from distributed import Nanny, Scheduler
 
-    async with Scheduler(**options) as scheduler:
-        port = scheduler.services["dashboard"].port if "dashboard" in scheduler.services else None
-        page = f"http://{scheduler.ip}:{port}/status" if port else ""
-        print(json.dumps({"address": scheduler.address, "dashboard": page}), flush=True)
-        await scheduler.finished()
-
-
-async def _workers(address: str, count: int, options: dict[str, Any]) -> None:
-    """Workers, each with a nanny that restarts it when it dies or exceeds its memory."""
-    from distributed import Nanny
-
-    nannies = [await Nanny(address, name=f"worker-{number}", **options) for number in range(count)]
-    await asyncio.gather(*(nanny.finished() for nanny in nannies))
+    if what == "scheduler":
+        servers = [await Scheduler(**options)]
+    else:
+        servers = [await Nanny(name=f"worker-{number}", **options) for number in range(int(what.split()[0]))]
+    await asyncio.gather(*(server.finished() for server in servers))
 
 
 def _end_with_the_caller() -> None:
@@ -157,22 +152,9 @@ def _end_with_the_caller() -> None:
 
 
 def main() -> None:
-    """Run ``scheduler OPTIONS``, or ``workers COUNT OPTIONS``, which reads the scheduler's address from a line."""
-    what, *words = sys.argv[1:]
-    if what == "scheduler":
-        running = _scheduler(json.loads(words[0]))
-    else:
-        import distributed  # noqa: F401  # imported while the scheduler starts
-
-        address = ""
-        while not address.endswith("\n"):
-            letter = os.read(0, 1).decode()  # one byte only: the thread reads the rest
-            if not letter:
-                return
-            address += letter
-        running = _workers(address.strip(), int(words[0]), json.loads(words[1]))
+    """Run ``scheduler OPTIONS`` or ``"COUNT workers" OPTIONS``; the workers wait for the scheduler's file."""
     threading.Thread(target=_end_with_the_caller, daemon=True).start()
-    asyncio.run(running)
+    asyncio.run(_run(sys.argv[1], json.loads(sys.argv[2])))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from importlib.util import find_spec
 from itertools import count, islice
@@ -22,9 +23,11 @@ from gtsam_rwhec.errors import FleetError, OptionError
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.progress import Progress, Remark, silent
 from gtsam_rwhec.fleet.dask_cluster import START_S, DaskCluster
-from gtsam_rwhec.fleet.store_requests import without_secrets
+from gtsam_rwhec.fleet.stores import without_secrets
 from gtsam_rwhec.fleet.tasks import ATTEMPTS, Failed, Receipt, Task, carried_out, failed
 
+#: Errors of a client whose scheduler is lost.
+_LOST = (OSError, asyncio.CancelledError, CancelledError)
 _CLIENT_LOG = logging.getLogger("distributed.client")
 #: Tasks at the scheduler at a time: for each thread, and at least.
 TASKS_OF_A_THREAD, FEWEST_TASKS = 4, 16
@@ -155,13 +158,13 @@ class DaskEngine:
                     yield outcome
         finally:
             if running and not self._is_gone:
-                with suppress(OSError, asyncio.CancelledError):
+                with suppress(*_LOST):
                     self._client.cancel([future for _, future in running.values()], force=True)
 
     def close(self) -> None:
         """Stop the processes that this engine started; a scheduler given by its address keeps running."""
         if self._client is not None:
-            with suppress(OSError, asyncio.CancelledError):
+            with suppress(*_LOST):
                 self._client.close(timeout=2)
             self._client = None
         _CLIENT_LOG.setLevel(self._level)
@@ -220,7 +223,7 @@ class DaskEngine:
         finished = [future for future in futures if future.status == "finished"]
         try:
             outcomes = list(zip(finished, self._client.gather(finished), strict=True))
-        except (OSError, asyncio.CancelledError) as error:
+        except _LOST as error:
             raise self._gone(of_all, f"{error or type(error).__name__}.") from None
         for future in futures:
             task = running[future.key][0]

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -26,12 +27,27 @@ from gtsam_rwhec.errors import (
     StoreInterruptedError,
 )
 from gtsam_rwhec.files.progress import Counted, Progress, Remark, check_progress, silent
-from gtsam_rwhec.fleet.fleet_parquet import rows_parquet
-from gtsam_rwhec.fleet.fleet_rows import PARQUET_FILE, ROWS_FILE, FailedLog, RobotRow, read_rows, rows_json
+from gtsam_rwhec.fleet.fleet_rows import (
+    PARQUET_FILE,
+    ROWS_FILE,
+    FailedLog,
+    RobotRow,
+    read_rows,
+    rows_json,
+    rows_parquet,
+)
 from gtsam_rwhec.fleet.log_task import LogTask, map_log
 from gtsam_rwhec.fleet.manifest import LogSource, Manifest, RigSource, Robot, read_rig_source
-from gtsam_rwhec.fleet.store_requests import shown, without_secrets
-from gtsam_rwhec.fleet.stores import exists, listed, local_path, read_bytes, stamp_of, write_once
+from gtsam_rwhec.fleet.stores import (
+    exists,
+    listed,
+    local_path,
+    read_bytes,
+    shown,
+    stamp_of,
+    without_secrets,
+    write_once,
+)
 from gtsam_rwhec.fleet.tasks import Engine, Failed, InProcess, Receipt, Task, below, kept_receipt
 from gtsam_rwhec.fleet.unit_task import Answer, Each, UnitTask, solve_unit, write_results
 
@@ -194,7 +210,7 @@ def planned_logs(manifest: Manifest) -> list[PlannedLog]:
         read_rig_source(manifest.shared_rig)
     entries = [(robot, source) for robot in manifest.robots for source in robot.logs]
     urls = list(dict.fromkeys(source.rig for _, source in entries))
-    rigs = dict(zip(urls, _many(_rig, urls), strict=True))
+    rigs = dict(zip(urls, _many(lambda url: _or_why(read_rig_source, url), urls), strict=True))
     expanded = [log for several in _many(_listed, entries) for log in several]
     owner: dict[str, tuple[str, str]] = {}
     for robot, url, rig, failure in expanded:
@@ -207,10 +223,10 @@ def planned_logs(manifest: Manifest) -> list[PlannedLog]:
     return _many(lambda log: _planned(*log, rigs), dict.fromkeys(expanded))
 
 
-def _rig(url: str) -> RigSource | str:
-    """A rig file, or the reason why it cannot be used."""
+def _or_why(function: Callable[[str], Told], url: str) -> Told | str:
+    """What a function says of a URL, or why it cannot."""
     try:
-        return read_rig_source(url)
+        return function(url)
     except (RwhecError, OSError) as error:
         return without_secrets(str(error))
 
@@ -220,23 +236,25 @@ def _listed(entry: tuple[Robot, LogSource]) -> list[tuple[str, str, str, str]]:
     robot, source = entry
     if not source.is_pattern:
         return [(robot.name, source.url, source.rig, "")]
-    try:
-        found = listed(source.url)
-        failure = "" if found else f"no log matches {shown(source.url)} ({source.place})"
-    except (RwhecError, OSError) as error:
-        found, failure = [], without_secrets(str(error))
-    return [(robot.name, url, source.rig, failure) for url in found or [source.url]]
+    found = _or_why(listed, source.url)
+    if not found:
+        found = f"no log matches {shown(source.url)} ({source.place})"
+    if isinstance(found, str):
+        return [(robot.name, source.url, source.rig, found)]
+    return [(robot.name, url, source.rig, "") for url in found]
 
 
 def _planned(robot: str, url: str, rig_url: str, failure: str, rigs: Mapping[str, RigSource | str]) -> PlannedLog:
     rig = rigs[rig_url]
     if failure or isinstance(rig, str):
         return PlannedLog(robot, url, failure=failure or str(rig))
-    try:
-        path = local_path(url)  # absolute: runs and workers may start in other folders
-        return PlannedLog(robot, url, LogTask(url if path is None else os.path.abspath(path), stamp_of(url), rig))
-    except (RwhecError, OSError) as error:
-        return PlannedLog(robot, url, failure=without_secrets(str(error)))
+    task = _or_why(lambda url: _task(url, rig), url)
+    return PlannedLog(robot, url, failure=task) if isinstance(task, str) else PlannedLog(robot, url, task)
+
+
+def _task(url: str, rig: RigSource) -> LogTask:
+    path = local_path(url)  # absolute: runs and workers may start in other folders
+    return LogTask(url if path is None else os.path.abspath(path), stamp_of(url), rig)
 
 
 def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Outcome], each: Each) -> list[UnitTask]:
@@ -269,12 +287,12 @@ def _units(manifest: Manifest, logs: Sequence[PlannedLog], read: Mapping[str, Ou
 
 def _names(robot: str, logs: Sequence[PlannedLog]) -> list[str]:
     """A unique name for each log: the file's name, with a number if several files share it."""
-    taken: dict[str, int] = {}
+    taken: Counter[str] = Counter()
     names = []
     for log in logs:
         stem = shown(log.url).rpartition("/")[2].removesuffix(".mcap")
         name = f"{robot}@{_NOT_OF_NAMES.sub('_', stem)}"
-        taken[name] = taken.get(name, 0) + 1
+        taken[name] += 1
         names.append(name if taken[name] == 1 else f"{name}.{taken[name]}")
     return names
 

@@ -14,8 +14,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, StoreInterruptedError
 from gtsam_rwhec.fleet.manifest import RigSource
 from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION, LogFacts, PairMeasurements, PartialResult, camera_fields
-from gtsam_rwhec.fleet.store_requests import shown
-from gtsam_rwhec.fleet.stores import stamp_of
+from gtsam_rwhec.fleet.stores import shown, stamp_of
 from gtsam_rwhec.fleet.tasks import Receipt, filed, key_of
 from gtsam_rwhec.fleet.topic_copy import local_copy_of_topics
 from gtsam_rwhec.logs import Log, open_log

@@ -19,8 +19,8 @@ from typing import Any
 from gtsam_rwhec.errors import FileFormatError, ManifestError, RigError, StoreError, UnfinishedRigWarning
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, dotted, parse_yaml, read_text, shown, suggestion
-from gtsam_rwhec.fleet.store_requests import shown as shown_url
 from gtsam_rwhec.fleet.stores import listed, local_path, read_bytes
+from gtsam_rwhec.fleet.stores import shown as shown_url
 from gtsam_rwhec.rig import Rig, parse_rig
 from gtsam_rwhec.rig.sections import ESTIMATE
 
@@ -91,15 +91,19 @@ def read_manifest(url: str) -> Manifest:
     """
     try:
         path = local_path(url)
-        if path is not None:
-            return parse_manifest(read_text(path), url)
-        return parse_manifest(read_bytes(url, most_bytes=MOST_BYTES).decode("utf-8-sig"), url)
-    except UnicodeDecodeError as error:
-        raise ManifestError(f"{shown_url(url)} is not a text file in UTF-8; YAML was expected.") from error
-    except ManifestError:
-        raise
+        text = _text(url, MOST_BYTES) if path is None else read_text(path)
     except (FileFormatError, StoreError) as error:
         raise ManifestError(str(error)) from error
+    return parse_manifest(text, url)
+
+
+def _text(url: str, most_bytes: int) -> str:
+    try:
+        return read_bytes(url, most_bytes=most_bytes).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(
+            f"{shown_url(url)} is not a text file in UTF-8 (byte {error.start}); YAML was expected."
+        ) from error
 
 
 def manifest_of_pattern(pattern: str, rig: str) -> Manifest:
@@ -171,8 +175,8 @@ class _Checks:
         found = [self._robot(name, value, shared, sites.get(name)) for name, value in robots.items()]
         if self.faults:
             words = [said for _, said in sorted(self.faults)]
-            rest = [f"and {len(words) - MOST_FAULTS} more faults"] if len(words) > MOST_FAULTS else []
-            raise ManifestError("\n".join(words[:MOST_FAULTS] + rest))
+            words[MOST_FAULTS:] = [f"and {len(words) - MOST_FAULTS} more faults"] * (len(words) > MOST_FAULTS)
+            raise ManifestError("\n".join(words))
         return Manifest(self.url, tuple(robot for robot in found if robot is not None), shared)
 
     def _fault(self, path: KeyPath, words: str) -> None:
@@ -223,28 +227,22 @@ class _Checks:
 
     def _robot(self, name: str, value: Any, shared: str | None, site: str | None) -> Robot | None:
         path: KeyPath = ("robots", name)
-        if not isinstance(value, dict):
-            value = {"logs": value}
-            logs_path: KeyPath = path
-        else:
+        entries, place, rig = value, path, shared
+        if isinstance(value, dict):
             self._known(value, path, ("rig", "logs"))
-            logs_path = (*path, "logs")
-        if "logs" not in value:
-            self._fault(path, "its logs are missing: give logs: with a URL, a pattern or a list of them")
-            return None
-        rig = self._url(value["rig"], (*path, "rig")) if "rig" in value else shared
-        entries = value["logs"]
-        is_list = isinstance(entries, tuple)
-        if is_list and not entries:
-            self._fault(logs_path, "an empty list; give at least one log")
-        found = []
-        for i, entry in enumerate(entries if is_list else (entries,)):
-            source = self._log(entry, (*logs_path, i) if is_list else logs_path, rig)
-            if source is not None:
-                found.append(source)
+            if "logs" not in value:
+                self._fault(path, "its logs are missing: give logs: with a URL, a pattern or a list of them")
+                return None
+            entries, place = value["logs"], (*path, "logs")
+            rig = self._url(value["rig"], (*path, "rig")) if "rig" in value else shared
+        if entries == ():
+            self._fault(place, "an empty list; give at least one log")
+        each = enumerate(entries) if isinstance(entries, tuple) else [(None, entries)]
+        sources = [self._log(entry, place if i is None else (*place, i), rig) for i, entry in each]
+        found = tuple(source for source in sources if source is not None)
         if any(source.rig == "" for source in found):
             self._fault(path, "it has no rig file: give rig: here, or at the top for all robots")
-        return Robot(name, tuple(found), site)
+        return Robot(name, found, site)
 
     def _log(self, entry: Any, path: KeyPath, rig: str | None) -> LogSource | None:
         if isinstance(entry, dict):
@@ -296,16 +294,12 @@ class RigSource:
                 place = base / name
                 place.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(place, content)
-        return _in_words(self.text, shown_url(self.url), base)
+        return _parsed(self.text, shown_url(self.url), base)
 
 
 @lru_cache(maxsize=8)
-def _parsed(text: str, where: str) -> Rig:
-    """The rig of a file that names no other files: a worker parses it only once."""
-    return _in_words(text, where, Path())
-
-
-def _in_words(text: str, where: str, folder: Path) -> Rig:
+def _parsed(text: str, where: str, folder: Path = Path()) -> Rig:
+    """The rig; a worker parses a file that names no other files only once."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfinishedRigWarning)
         return parse_rig(text, where, folder)
@@ -314,14 +308,10 @@ def _in_words(text: str, where: str, folder: Path) -> Rig:
 def read_rig_source(url: str) -> RigSource:
     """Read and check a rig file and the files that it names, which start from its folder; errors as ``read_rig``."""
     try:
-        text = read_bytes(url, most_bytes=MOST_RIG_BYTES).decode("utf-8-sig")
+        text = _text(url, MOST_RIG_BYTES)
         data = parse_yaml(text, shown_url(url)).data
         named = sorted(_named(data)) if isinstance(data, dict) else []
         files = tuple((name, read_bytes(joined(url, name), most_bytes=MOST_RIG_BYTES)) for name in named)
-    except UnicodeDecodeError as error:
-        raise RigError(
-            f"{shown_url(url)} is not a text file in UTF-8 (byte {error.start}); YAML was expected."
-        ) from error
     except (FileFormatError, StoreError) as error:
         raise RigError(str(error)) from error
     source = RigSource(url, text, files)
@@ -332,15 +322,13 @@ def read_rig_source(url: str) -> RigSource:
 
 def _named(data: dict[str, Any]) -> set[str]:
     """The files that the sections of sensors and targets name."""
-    found = set()
-    sensors, targets = data.get("sensors"), data.get("targets")
-    for sensor in sensors.values() if isinstance(sensors, dict) else ():
-        stated = sensor.get("intrinsics") if isinstance(sensor, dict) else None
+
+    def of(section: Any) -> list[Any]:
+        return list(section.values()) if isinstance(section, dict) else []
+
+    intrinsics = [sensor.get("intrinsics") for sensor in of(data.get("sensors")) if isinstance(sensor, dict)]
+    found = [stated for stated in intrinsics if stated != ESTIMATE]
+    for stated in (*intrinsics, *of(data.get("targets"))):
         if isinstance(stated, dict):
-            found |= {stated[key] for key in ("file", "kalibr") if isinstance(stated.get(key), str)}
-        elif isinstance(stated, str) and stated != ESTIMATE:
-            found.add(stated)
-    for target in targets.values() if isinstance(targets, dict) else ():
-        if isinstance(target, dict) and isinstance(target.get("kalibr"), str):
-            found.add(target["kalibr"])
-    return found
+            found += [stated.get("file"), stated.get("kalibr")]
+    return {name for name in found if isinstance(name, str)}

@@ -21,8 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from gtsam_rwhec.errors import FileFormatError, RwhecError
-from gtsam_rwhec.fleet.store_requests import without_secrets
-from gtsam_rwhec.fleet.stores import counted_bytes, exists, read_bytes, write_once
+from gtsam_rwhec.fleet.stores import counted_bytes, exists, read_bytes, without_secrets, write_once
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 
 try:

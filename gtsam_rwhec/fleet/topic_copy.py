@@ -20,8 +20,7 @@ from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Header, McapRecor
 from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
 from gtsam_rwhec.files.budgets import Spending
 from gtsam_rwhec.files.whole_files import atomic_stream
-from gtsam_rwhec.fleet.store_requests import shown
-from gtsam_rwhec.fleet.stores import count_bytes, local_path, read_ranges, size_of
+from gtsam_rwhec.fleet.stores import count_bytes, local_path, read_ranges, shown, size_of
 from gtsam_rwhec.logs.mcap_file import FAULTS, MAGIC, RECORD, read_index
 from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 

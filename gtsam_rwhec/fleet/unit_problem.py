@@ -16,7 +16,7 @@ from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fleet.partial_result import LogFacts, PairMeasurements, PartialResult
-from gtsam_rwhec.fleet.store_requests import shown
+from gtsam_rwhec.fleet.stores import shown
 from gtsam_rwhec.fleet.tasks import Receipt
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory

@@ -11,13 +11,12 @@ from rwhec_factors import se3
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.freedom import REACHES, seven_each
 from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
 from gtsam_rwhec.odometry.prior_knowledge import upside_down
 from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
 from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE
 from gtsam_rwhec.odometry.window_motions import axes_turned
-from gtsam_rwhec.odometry.window_solution import Answer, Task, refined
+from gtsam_rwhec.odometry.window_solution import REACHES, Answer, Task, refined, seven_each
 from gtsam_rwhec.results.removed_measurements import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_directions_of, reason_for, sparse_basis
@@ -139,15 +138,12 @@ def _free_directions(answer: Answer, task: Task) -> tuple[FreeDirection, ...]:
 def _influences(answer: Answer, task: Task, change: Array, order: tuple[str, ...]) -> tuple[Influence, ...]:
     """The influence of each given number: dx / dg = (information)^-1 row' / sigma, with its whitened row."""
     rows = answer.fit.rows
-    Z = answer.freedom.complement()
-    inner = Z.T @ answer.freedom.information @ Z
-    solve = Z @ np.linalg.solve(inner + 1e-13 * np.diag(np.diagonal(inner)), Z.T)
     result = []
-    C = answer.freedom.covariance()
+    inverse, C = answer.freedom.inverse(), answer.freedom.covariance()
     for r, row, number in zip(rows.r, rows.J, rows.numbers, strict=True):
         if not number.what:
             continue
-        moved = (change @ solve @ row / number.sigma)[: 6 * len(order)].reshape(-1, 6)
+        moved = (change @ inverse @ row / number.sigma)[: 6 * len(order)].reshape(-1, 6)
         spare = 1.0 - float(row @ C @ row)
         result.append(
             Influence(
@@ -310,31 +306,30 @@ def _remarks(task: Task) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _misfit(answer: Answer, k: int, shares: tuple[float, float]) -> float:
+def _misfit(answer: Answer, k: int, shares: Array) -> float:
     """Residuals as a share of the sensor's motion, if they are large and correlate by large ``shares``; else zero."""
-    windows, r = answer.windows, answer.fit.linear.r[k]
-    motion = se3.logmap(windows.M[k])
-    used, found = windows.used[k], 0.0
-    for part, share in zip((slice(0, 3), slice(3, 6)), shares, strict=True):
-        of_motion = np.sqrt((r[used, part] ** 2).sum() / max(float((motion[used, part] ** 2).sum()), 1e-300))
-        if share > SAME and of_motion > SAME_PART:
-            found = max(found, float(of_motion))
-    return found
+    windows, used = answer.windows, answer.windows.used[k]
+    r, motion = answer.fit.linear.r[k, used], se3.logmap(windows.M[k, used])
+    parts = np.sqrt(_products(r, r) / np.maximum(_products(motion, motion), 1e-300))
+    return float(parts[(shares > SAME) & (parts > SAME_PART)].max(initial=0.0))
 
 
-def _correlations(answer: Answer, k: int) -> tuple[float, float]:
-    """The correlation of a sensor's residuals with those of the previous window: rotations, translations."""
+def _products(x: Array, y: Array) -> Array:
+    """Sums (2,) of products of twists (N, 6): of the rotations, and of the translations."""
+    sums: Array = (x * y).reshape(-1, 2, 3).sum(axis=(0, 2))
+    return sums
+
+
+def _correlations(answer: Answer, k: int) -> Array:
+    """The correlations (2,) of a sensor's residuals with those of the previous window: rotations, translations."""
     windows, r = answer.windows, answer.fit.linear.r[k]
     follows = windows.used[k, 1:] & windows.used[k, :-1] & (np.abs(windows.start[1:] - windows.end[:-1]) < 1e-6)
     if follows.sum() < 20:
-        return 0.0, 0.0
+        return np.zeros(2)
     before, after = r[:-1][follows], r[1:][follows]
-    product, squares = (before * after), np.stack([before**2, after**2])
-    shares = (
-        float(product[:, part].sum() / max(np.sqrt(squares[:, :, part].sum(axis=(1, 2)).prod()), 1e-300))
-        for part in (slice(0, 3), slice(3, 6))
-    )
-    return next(shares), next(shares)
+    squares = _products(before, before) * _products(after, after)
+    shares: Array = _products(before, after) / np.sqrt(np.maximum(squares, 1e-300))
+    return shares
 
 
 #: An answer fits equally well if its cost is at most this much above the best one's: two standard deviations.

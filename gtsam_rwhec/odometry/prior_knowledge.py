@@ -55,11 +55,6 @@ class Given:
     #: by (sensor, sensor): measured distances between two sensors' origins, metres; only the refinement uses them
     distances_m: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict, hash=False)
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no height, direction or distance is given."""
-        return not (self.heights_m or self.directions or self.distances_m)
-
     def checked(self, sensors: Collection[str], reference: str) -> None:
         """Raise an error for what does not fit these sensors or is not a valid number.
 
@@ -133,7 +128,7 @@ class Given:
             yield "the ground's normal", self.ground.normal
 
 
-_AXES = {"x": 0, "y": 1, "z": 2}
+_AXES = {"x": 0, "y": 1, "z": 2}  # columns of a rotation
 #: The least length of a lever arm, metres: a shorter one has no direction.
 LEAST_ARM_M = 1e-3
 
@@ -194,7 +189,7 @@ class GivenRows:
     def _first(self) -> str:
         return next(name for name, k in self.place.items() if k == 0)
 
-    def rows(self, state: State, layout: Layout, *, distances: bool = True) -> Rows:
+    def rows(self, state: State, layout: Layout) -> Rows:
         """All residuals at a state."""
         r: list[float] = []
         J: list[Array] = []
@@ -204,58 +199,42 @@ class GivenRows:
             row = np.zeros(layout.size + 1)
             for at, derivative in parts:
                 row[at] += derivative
-            r.append(off / number.sigma)
+            r.append(float(off) / number.sigma)
             J.append(row[:-1] / number.sigma)
             numbers.append(number)
 
-        T = state.T
+        R, t = state.T[:, :3, :3], state.T[:, :3, 3]
         if self.has_ground:
             across = _across(self.normal)
             n = self.normal + across @ state.tilt
             tilts, height = layout.ground[:2], int(layout.ground[2])
-            for i in range(2):
-                number = Number(
-                    f"the ground's normal ({'first' if i == 0 else 'second'} tilt)", 0.0, self.sigma_normal, "rad"
-                )
-                add(number, float(state.tilt[i]), (int(tilts[i]), 1.0))
-            ground = self.given.ground
-            if ground is not None:
+            for tilt, which, off in zip(tilts, ("first", "second"), state.tilt, strict=True):
+                add(Number(f"the ground's normal ({which} tilt)", 0.0, self.sigma_normal, "rad"), off, (tilt, 1.0))
+            if (ground := self.given.ground) is not None:
                 number = Number("the ground's distance", ground.distance_m, ground.sigma_m, "m")
                 add(number, state.height - ground.distance_m, (height, 1.0))
             for name, (value, sigma) in self.given.heights_m.items():
                 k = self.place[name]
-                off = float(n @ T[k, :3, 3]) + state.height - value
-                by_pose = np.r_[np.zeros(3), n @ T[k, :3, :3]]
-                number = Number(f"height of {name}", value, sigma, "m")
-                add(number, off, (layout.at[k, :6], by_pose), (tilts, across.T @ T[k, :3, 3]), (height, 1.0))
+                by_pose, by_tilts = (layout.at[k, 3:6], n @ R[k]), (tilts, across.T @ t[k])
+                off = n @ t[k] + state.height - value
+                add(Number(f"height of {name}", value, sigma, "m"), off, by_pose, by_tilts, (height, 1.0))
         for known in self.given.directions:
-            k, across = self.place[known.sensor], _across(_unit(known.direction))
-            R, t = T[k, :3, :3], T[k, :3, 3]
-            for i in range(2):
-                number = Number(
-                    f"direction of {known.sensor}'s {known.of.replace('_', ' ')} ({i + 1})", 0.0, known.sigma_rad, "rad"
-                )
+            k = self.place[known.sensor]
+            what = f"direction of {known.sensor}'s {known.of.replace('_', ' ')}"
+            for i, across in enumerate(_across(_unit(known.direction)).T, start=1):
+                number = Number(f"{what} ({i})", 0.0, known.sigma_rad, "rad")
                 if known.of == "lever_arm":
-                    arm = max(float(np.linalg.norm(t)), LEAST_ARM_M)
-                    by_pose = np.r_[np.zeros(3), across[:, i] @ R] / arm
-                    add(number, float(across[:, i] @ t) / arm, (layout.at[k, :6], by_pose))
+                    arm = max(float(np.linalg.norm(t[k])), LEAST_ARM_M)
+                    add(number, across @ t[k] / arm, (layout.at[k, 3:6], across @ R[k] / arm))
                 else:
                     e = np.eye(3)[_AXES[known.of]]
-                    by_pose = np.r_[-across[:, i] @ R @ se3.hat(e[None])[0], np.zeros(3)]
-                    add(number, float(across[:, i] @ R @ e), (layout.at[k, :6], by_pose))
-        if distances:
-            for (first, second), (value, sigma) in self.given.distances_m.items():
-                j, k = self.place[first], self.place[second]
-                apart = T[k, :3, 3] - T[j, :3, 3]
-                length = max(float(np.linalg.norm(apart)), LEAST_ARM_M)
-                u = apart / length
-                number = Number(f"distance of {first} and {second}", value, sigma, "m")
-                add(
-                    number,
-                    length - value,
-                    (layout.at[k, 3:6], u @ T[k, :3, :3]),
-                    (layout.at[j, 3:6], -u @ T[j, :3, :3]),
-                )
+                    add(number, across @ R[k] @ e, (layout.at[k, :3], -across @ R[k] @ se3.hat(e[None])[0]))
+        for (first, second), (value, sigma) in self.given.distances_m.items():
+            j, k = self.place[first], self.place[second]
+            length = max(float(np.linalg.norm(t[k] - t[j])), LEAST_ARM_M)
+            u = (t[k] - t[j]) / length
+            number = Number(f"distance of {first} and {second}", value, sigma, "m")
+            add(number, length - value, (layout.at[k, 3:6], u @ R[k]), (layout.at[j, 3:6], -u @ R[j]))
         for k in np.flatnonzero(layout.open[:, 7]).tolist():
             add(Number("", 0.0, self.clock_sigma_s, "s"), float(state.offset[k]), (int(layout.at[k, 7]), 1.0))
         return Rows(np.array(r), np.array(J).reshape(-1, layout.size), tuple(numbers))
@@ -267,8 +246,7 @@ class GivenRows:
         likelihood has the correlations between heights.
         """
         K = len(state.T) - 1
-        which = np.flatnonzero(scaled[1:])
-        d = 12 * K + len(which) + 1
+        d = 12 * K + int(scaled[1:].sum()) + 1
         rows = []
         for name, (value, sigma) in self.given.heights_m.items():
             k = self.place[name]
@@ -283,22 +261,19 @@ class GivenRows:
             row[-1] = -state.scale[k] * (value - self.first_height)
             rows.append(row / (whole * state.scale[k]))
         for known in self.given.directions:
-            k, across = self.place[known.sensor], _across(_unit(known.direction))
-            for i in range(2):
+            k, along = self.place[known.sensor], _unit(known.direction)
+            is_arm = known.of == "lever_arm"
+            arm = max(float(np.linalg.norm(state.T[k, :3, 3])), 0.1) * state.scale[k] if is_arm else 1.0
+            at = 9 * K + 3 * k - 3 if is_arm else 9 * (k - 1) + 3 * _AXES[known.of]
+            for across in _across(along).T:
                 row = np.zeros(d)
-                if known.of == "lever_arm":
-                    arm = max(float(np.linalg.norm(state.T[k, :3, 3])), 0.1) * state.scale[k]
-                    row[9 * K + 3 * k - 3 : 9 * K + 3 * k] = across[:, i] / arm
-                else:
-                    axis = 9 * (k - 1) + 3 * _AXES[known.of]
-                    row[axis : axis + 3] = across[:, i]
-                rows.append(row / known.sigma_rad)
-                if known.of != "lever_arm":
+                row[at : at + 3] = across / (arm * known.sigma_rad)
+                rows.append(row)
+                if not is_arm:
                     # The rows across also fit the opposite direction; the component along the axis excludes it.
-                    along = np.zeros(d)
-                    along[axis : axis + 3] = _unit(known.direction)
-                    along[-1] = -1.0
-                    rows.append(along)
+                    row = np.zeros(d)
+                    row[at : at + 3], row[-1] = along, -1.0
+                    rows.append(row)
         return np.array(rows).reshape(-1, d)
 
     @property
@@ -336,8 +311,7 @@ def up_direction(given: Given, windows: WindowMotions, variances: Array, referen
         Heights are given without the ground, and the turning axis is near neither z nor y.
     """
     if given.ground is not None:
-        normal = np.asarray(given.ground.normal, dtype=float)
-        return normal / np.linalg.norm(normal), given.ground.sigma_rad
+        return _unit(given.ground.normal), given.ground.sigma_rad
     axis, sigma = turning_axis(windows, variances)
     if abs(axis[2]) > np.cos(NEAR_RAD):
         axis = axis * np.sign(axis[2])

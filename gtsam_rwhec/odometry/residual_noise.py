@@ -31,18 +31,20 @@ def _groups(stated: np.ndarray) -> Array:
     """Ones (g, m) at the sensors of each noise that is estimated: two sensors without stated noise share one."""
     if len(stated) == 2 and not stated.any():
         return np.ones((1, 2))
-    return np.eye(len(stated))[~stated]
+    groups: Array = np.eye(len(stated))[~stated]
+    return groups
 
 
 def _by_logarithm(groups: Array, variances: Array) -> Array:
     """Derivatives (2 g, 2 m) of all variances (m, 2) by the logarithms of each group's."""
-    derivatives: Array = np.einsum("gm,mc,cd->gcmd", groups, variances, np.eye(2))
-    return derivatives.reshape(2 * len(groups), -1)
+    derivatives: Array = np.einsum("gm,mc,cd->gcmd", groups, variances, np.eye(2)).reshape(2 * len(groups), -1)
+    return derivatives
 
 
 def _unit(scale: Array) -> Array:
     """The units (m, 2) of the variances: a translation's is the metric variance times the sensor's scale squared."""
-    return np.c_[np.ones(len(scale)), scale**2]
+    unit: Array = np.c_[np.ones(len(scale)), scale**2]
+    return unit
 
 
 def found_variances(

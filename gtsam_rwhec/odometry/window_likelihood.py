@@ -144,9 +144,21 @@ def covariances(windows: WindowMotions, rotation: Array, translation: Array) -> 
 
 def predicted(state: State) -> Array:
     """The motions (m, n, 4, 4) that the sensors should measure."""
-    M = se3.inverse(state.T)[:, None] @ state.motion @ state.T[:, None]
+    M = _true_motions(state)
     M[..., :3, 3] *= state.scale[:, None, None]
     return M
+
+
+def _true_motions(state: State) -> Array:
+    """The motions (m, n, 4, 4) in true lengths."""
+    motions: Array = se3.inverse(state.T)[:, None] @ state.motion @ state.T[:, None]
+    return motions
+
+
+def _back(true: Array) -> Array:
+    """Ad(M^-1) (m, n, 6, 6) of true motions."""
+    m, n = true.shape[:2]
+    return se3.adjoint(se3.inverse(true.reshape(m * n, 4, 4))).reshape(m, n, 6, 6)
 
 
 def linearised(windows: WindowMotions, state: State) -> Linear:
@@ -155,10 +167,8 @@ def linearised(windows: WindowMotions, state: State) -> Linear:
     M = predicted(state)
     r = se3.logmap((se3.inverse(M) @ windows.M).reshape(m * n, 4, 4)).reshape(m, n, 6)
     r = r + windows.by_offset * state.offset[:, None, None]
-    true = M.copy()
-    true[..., :3, 3] /= state.scale[:, None, None]
     J = np.zeros((m, n, 6, 8))
-    J[..., :6] = np.eye(6) - se3.adjoint(se3.inverse(true.reshape(m * n, 4, 4))).reshape(m, n, 6, 6)
+    J[..., :6] = np.eye(6) - _back(_true_motions(state))
     B = np.broadcast_to(se3.adjoint(se3.inverse(state.T))[:, None], (m, n, 6, 6)).copy()
     for each in (J, B):
         each[..., 3:, :] *= state.scale[:, None, None, None]
@@ -194,10 +204,8 @@ def covariance_of_motions(linear: Linear, W: Array, D: Array, V: Array) -> Array
 def information_of_noise(linear: Linear, W: Array, layout: Layout, state: State, D: Array, of_motion: Array) -> Array:
     """N (p, p): the part of H that comes only from the estimated motions' noise, of covariance ``of_motion``."""
     m, n = W.shape[:2]
-    M = predicted(state)
-    true = M.copy()
-    true[..., :3, 3] /= state.scale[:, None, None]
-    back = se3.adjoint(se3.inverse(true.reshape(m * n, 4, 4))).reshape(m, n, 6, 6)
+    true = _true_motions(state)
+    back = _back(true)
     # The columns of a square root of the motions' covariance, in each sensor's frame.
     root = np.linalg.cholesky(of_motion)
     twists = np.einsum("mij,nja->mnia", se3.adjoint(se3.inverse(state.T)), root)

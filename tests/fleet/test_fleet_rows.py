@@ -13,7 +13,7 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
-from gtsam_rwhec.fleet.fleet_parquet import COLUMNS
+from gtsam_rwhec.fleet.fleet_rows import COLUMNS
 
 
 def row() -> fleet.RobotRow:

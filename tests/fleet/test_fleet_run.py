@@ -13,9 +13,8 @@ from fleets import MadeFleet, write_fleet
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
 from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.fleet.fleet_parquet import read_parquet
 from gtsam_rwhec.fleet.fleet_report import remarks_of
-from gtsam_rwhec.fleet.fleet_rows import PARQUET_FILE
+from gtsam_rwhec.fleet.fleet_rows import PARQUET_FILE, read_parquet
 from gtsam_rwhec.fleet.fleet_run import planned_logs
 from gtsam_rwhec.fleet.tasks import InProcess
 from gtsam_rwhec.geometry.pose_covariances import error_of

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gtsam_rwhec.errors import StoreError, StoreInterruptedError
-from gtsam_rwhec.fleet import store_requests, stores
+from gtsam_rwhec.fleet import stores
 from gtsam_rwhec.fleet.stores import counted_bytes
 
 CONTENT = bytes(range(256)) * 16
@@ -127,7 +127,7 @@ class Faulty(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setattr(store_requests, "PAUSE_S", 0.001)
+    monkeypatch.setattr(stores, "PAUSE_S", 0.001)
     monkeypatch.setattr(Faulty, "asked", [])
     httpd = ThreadingHTTPServer(("127.0.0.1", 0), Faulty)
     thread = threading.Thread(target=httpd.serve_forever, args=(0.01,))

@@ -15,7 +15,7 @@ from mixed_log import TOPICS, write_mixed_log
 from s3_server import BUCKET, KEY, SECRET, S3Server, forget_stores, s3_server
 
 from gtsam_rwhec.errors import LogWarning, StoreError, StoreInterruptedError
-from gtsam_rwhec.fleet import store_requests, stores, topic_copy
+from gtsam_rwhec.fleet import stores, topic_copy
 from gtsam_rwhec.fleet.stores import counted_bytes
 from gtsam_rwhec.fleet.topic_copy import Needed, local_copy_of_topics, needed_of
 from gtsam_rwhec.logs import Log, open_log
@@ -39,7 +39,7 @@ def log(tmp_path_factory: pytest.TempPathFactory, server: S3Server) -> Path:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_requests, "PAUSE_S", 0.001)
+    monkeypatch.setattr(stores, "PAUSE_S", 0.001)
 
 
 def messages_of(path: Path, topics: tuple[str, ...]) -> list[tuple[str, int, bytes]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gtsam_rwhec.fleet.store_requests import shown, without_secrets
+from gtsam_rwhec.fleet.stores import shown, without_secrets
 
 
 @pytest.mark.parametrize(
