@@ -52,14 +52,14 @@ class Slots:
         """Values of the pairs' variables (k, 25), summed by numbers (k, 28)."""
         k = len(values)
         index = self.place[at] + 28 * np.arange(k)[:, None]
-        return np.bincount(index.ravel(), values.ravel(), minlength=28 * k).reshape(k, 28)
+        return np.asarray(np.bincount(index.ravel(), values.ravel(), 28 * k), dtype=np.float64).reshape(k, 28)
 
     def forms(self, own: Array, at: slice) -> Array:
         """Forms over the pairs' variables (k, 25, 25) as forms over their numbers (k, 28, 28)."""
         place, factor, k = self.place[at].astype(int), self.factor[at], len(own)
         index = 28 * place[:, :, None] + place[:, None, :] + 784 * np.arange(k)[:, None, None]
         values = own * factor[:, :, None] * factor[:, None, :]
-        return np.bincount(index.ravel(), values.ravel(), minlength=784 * k).reshape(k, 28, 28)
+        return np.asarray(np.bincount(index.ravel(), values.ravel(), 784 * k), dtype=np.float64).reshape(k, 28, 28)
 
 
 def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:

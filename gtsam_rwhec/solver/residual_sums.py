@@ -181,7 +181,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
     for stack in stacks_of(measured):
         number += 1
         of_A_and_B = slice(None, None, -1 if measured.is_swapped else 1)
-        r, low = _residuals(stack.pairs, *(stack.A, stack.B)[of_A_and_B], coefficients, exact=exact)
+        front, back = (stack.A, stack.B)[of_A_and_B]
+        r, low = _residuals(stack.pairs, front, back, coefficients, exact=exact)
         A, off = _centred(stack, measured)
         k, m = stack.weight.shape
         residuals, weights = r.reshape(k, m, D, 12), np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
