@@ -122,7 +122,9 @@ class Sorted:
         """The moments of every pair; a PoseError names the first pose of a block that is not valid."""
         result = MomentStack.nothing(self.motion, with_R_B=with_R_B)
         for group in self.groups(np.arange(len(self.pairs))):
-            for begin in range(0, int(self.counts[group[0]]), BLOCK):  # more than a block has only a pair that is alone
+            for begin in range(
+                0, int(self.counts[group[0]]), SUMMED_AT_ONCE
+            ):  # more than a block has only a pair that is alone
                 result.add_to(group, self._summed(group, begin, gauge, with_R_B=with_R_B))
         return result
 
@@ -133,7 +135,7 @@ class Sorted:
 
     def _summed(self, group: np.ndarray, begin: int, gauge: Gauge, *, with_R_B: bool) -> MomentStack:
         """The moments of a block of measurements of some pairs."""
-        places, valid = self.padded(group, begin, BLOCK)
+        places, valid = self.padded(group, begin, SUMMED_AT_ONCE)
         result = MomentStack.nothing(self.motion[group], with_R_B=with_R_B)
         result.count[:] = valid.sum(axis=1)
         p, k = places.shape
