@@ -122,9 +122,8 @@ class Sorted:
         """The moments of every pair; a PoseError names the first pose of a block that is not valid."""
         result = MomentStack.nothing(self.motion, with_R_B=with_R_B)
         for group in self.groups(np.arange(len(self.pairs))):
-            for begin in range(
-                0, int(self.counts[group[0]]), SUMMED_AT_ONCE
-            ):  # more than a block has only a pair that is alone
+            # Only a pair that is alone has more than a block.
+            for begin in range(0, int(self.counts[group[0]]), SUMMED_AT_ONCE):
                 result.add_to(group, self._summed(group, begin, gauge, with_R_B=with_R_B))
         return result
 
