@@ -97,7 +97,7 @@ class Accumulator:
         """What is held, and the moments of some pairs added to it; ``fresh`` is changed."""
         known = np.flatnonzero([pair in self._held for pair in pairs])
         if len(known):
-            fresh.add_to(known, self.stack([pairs[i] for i in known]))
+            fresh.add_to(known, self.stack([pairs[i] for i in known.tolist()]))
         return self._held | {pair: Row(fresh, i) for i, pair in enumerate(pairs)}
 
     def _has_targets(self) -> bool:

@@ -122,7 +122,8 @@ class Sorted:
         """The moments of every pair; a PoseError names the first pose of a block that is not valid."""
         result = MomentStack.nothing(self.motion, with_R_B=with_R_B)
         for group in self.groups(np.arange(len(self.pairs))):
-            for begin in range(0, int(self.counts[group[0]]), BLOCK):  # more than a block has only a pair that is alone
+            # Only a pair that is alone has more than a block.
+            for begin in range(0, int(self.counts[group[0]]), SUMMED_AT_ONCE):
                 result.add_to(group, self._summed(group, begin, gauge, with_R_B=with_R_B))
         return result
 
@@ -133,7 +134,7 @@ class Sorted:
 
     def _summed(self, group: np.ndarray, begin: int, gauge: Gauge, *, with_R_B: bool) -> MomentStack:
         """The moments of a block of measurements of some pairs."""
-        places, valid = self.padded(group, begin, BLOCK)
+        places, valid = self.padded(group, begin, SUMMED_AT_ONCE)
         result = MomentStack.nothing(self.motion[group], with_R_B=with_R_B)
         result.count[:] = valid.sum(axis=1)
         p, k = places.shape
@@ -217,8 +218,9 @@ class Section:
             np.broadcast_to(value, at.stop - at.start) if value.ndim == 0 else value[at]
             for value in (many.sigma, many.kappa)
         )
-        options = (many.stamps_ns, many.covariances, many.pixels)
-        return Measurements(many.A[at], many.B[at], sigma, kappa, *(None if x is None else x[at] for x in options))
+        of_all = many.stamps_ns, many.covariances, many.pixels
+        stamps, covariances, pixels = (None if each is None else each[at] for each in of_all)
+        return Measurements(many.A[at], many.B[at], sigma, kappa, stamps, covariances, pixels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +248,10 @@ class KeptMeasurements:
         batches = self.batches
         stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
         return Measurements(
-            *(np.concatenate([getattr(b, name) for b in batches]) for name in ("A", "B", "sigma", "kappa")),
+            np.concatenate([b.A for b in batches]),
+            np.concatenate([b.B for b in batches]),
+            np.concatenate([b.sigma for b in batches]),
+            np.concatenate([b.kappa for b in batches]),
             np.concatenate(stamps) if len(stamps) == len(batches) else None,
             np.concatenate([b.covariance_of_B() for b in batches]) if self.has_covariances else None,
             self._pixels(),
@@ -302,11 +307,14 @@ class GivenMany:
         result = Sorted(
             pairs,
             np.r_[0, np.cumsum(number)],
-            *(chosen(x) if x.ndim else x for x in (raw.A, raw.B, raw.sigma, raw.kappa)),
-            given=order,
-            source=f" ({given.source})" if given.source else "",
-            stamps_ns=None if stamps is None else chosen(stamps),
-            covariances=None if raw.covariances is None else chosen(raw.covariances),
+            chosen(raw.A),
+            chosen(raw.B),
+            chosen(raw.sigma) if raw.sigma.ndim else raw.sigma,
+            chosen(raw.kappa) if raw.kappa.ndim else raw.kappa,
+            order,
+            f" ({given.source})" if given.source else "",
+            None if stamps is None else chosen(stamps),
+            None if raw.covariances is None else chosen(raw.covariances),
         )
         if result.stamps_ns is not None:
             back = np.flatnonzero((np.diff(result.stamps_ns) < 0) & (np.diff(of_pairs) == 0))

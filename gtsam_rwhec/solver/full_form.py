@@ -52,14 +52,16 @@ class Slots:
         """Values of the pairs' variables (k, 25), summed by numbers (k, 28)."""
         k = len(values)
         index = self.place[at] + 28 * np.arange(k)[:, None]
-        return np.bincount(index.ravel(), values.ravel(), minlength=28 * k).reshape(k, 28)
+        return np.asarray(np.bincount(index.ravel(), values.ravel(), 28 * k), dtype=np.float64).reshape(k, 28)
 
-    def forms(self, own: Array, at: slice) -> Array:
+    def forms(self, at: slice, *several: Array) -> list[Array]:
         """Forms over the pairs' variables (k, 25, 25) as forms over their numbers (k, 28, 28)."""
-        place, factor, k = self.place[at].astype(int), self.factor[at], len(own)
-        index = 28 * place[:, :, None] + place[:, None, :] + 784 * np.arange(k)[:, None, None]
-        values = own * factor[:, :, None] * factor[:, None, :]
-        return np.bincount(index.ravel(), values.ravel(), minlength=784 * k).reshape(k, 28, 28)
+        place, factor = self.place[at].astype(int), self.factor[at]
+        k = len(place)
+        index = (28 * place[:, :, None] + place[:, None, :] + 784 * np.arange(k)[:, None, None]).ravel()
+        factors = factor[:, :, None] * factor[:, None, :]
+        sums = (np.bincount(index, (own * factors).ravel(), 784 * k) for own in several)
+        return [np.asarray(each, dtype=np.float64).reshape(k, 28, 28) for each in sums]
 
 
 def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
@@ -85,8 +87,9 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
             rotation = rotation.transpose(0, 2, 1)
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
         has_both, frames = coupled[at], slots.frames[at].T
-        for form, own in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
-            m, numbers = form.frames.shape[1], slots.forms(own, at)
+        of_both = of_translations + of_rotations
+        for form, numbers in zip(forms, slots.forms(at, of_both, of_rotations), strict=True):
+            m = form.frames.shape[1]
             one, two, tail = slice(13 - m, 13), slice(26 - m, 26), slice(26, 28)
             for index, side in zip(frames, (one, two), strict=True):
                 has = index < n

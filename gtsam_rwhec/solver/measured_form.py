@@ -51,9 +51,10 @@ class MeasuredPriors:
 
         def off(i: int, prior: Prior) -> Array:
             t_0 = prior.transform[:3, 3]
-            if self.part.kind == "direct":
-                return difference(t[i], t_0).value
-            return turned(R[None, i].transpose(0, 2, 1), _row(difference(t_0, t[i]))).value[0]
+            residual: Array = difference(t[i], t_0).value
+            if self.part.kind == "inverse":
+                residual = turned(R[None, i].transpose(0, 2, 1), _row(difference(t_0, t[i]))).value[0]
+            return residual
 
         return self._evaluated(R if self.part.kind == "direct" else R.transpose(0, 2, 1), off)
 
@@ -63,9 +64,10 @@ class MeasuredPriors:
 
         def off(i: int, prior: Prior) -> Array:
             t, about = Doubled.of(point.numbers[i, :3]), self._about_gauge(i, prior)
-            if self.part.kind == "direct":
-                return t.minus(about).value
-            return turned(R[None, i], _row(about)).plus(_row(t)).value[0]
+            residual: Array = t.minus(about).value
+            if self.part.kind == "inverse":
+                residual = turned(R[None, i], _row(about)).plus(_row(t)).value[0]
+            return residual
 
         return self._evaluated(R, off)
 
@@ -362,9 +364,9 @@ class MeasuredForm:
         result, bound = np.zeros((size, D)), np.zeros((size, D))
         for d in directions:
             at = slice(12 * d, 12 * d + 12)
-            value = _by_pair(*(each[..., at] for each in sums.by_features), 1.0)
+            value = _by_pair([each[..., at] for each in sums.by_features], 1.0)
             bounds = zip(sums.by_features, sums.by_features_error, strict=True)
-            error = _by_pair(*(bound[..., at] + gamma(8) * np.abs(of[..., at]) for of, bound in bounds), -1.0)
+            error = _by_pair([bound[..., at] + gamma(8) * np.abs(of[..., at]) for of, bound in bounds], -1.0)
             shares = 0.5 * self.slots.summed(value * factor, at_pairs)
             slack = 0.5 * self.slots.summed((error + gamma(E + 40) * np.abs(value)) * np.abs(factor), at_pairs)
             of_fixed = self._of_fixed[at_pairs]
@@ -377,8 +379,9 @@ class MeasuredForm:
         return result, bound * (1.0 + 1e-9)
 
 
-def _by_pair(front: Array, back: Array, one: Array, minus: float) -> Array:
+def _by_pair(by_features: list[Array], minus: float) -> Array:
     """Derivatives (E, 25) by [t_X, t_Y, alpha, vec R_X, vec R_Y]; minus = -1 for sums of absolute values."""
+    front, back, one = by_features
     E = len(one)
     F, K, of_one = front.reshape(E, 3, 4, 12), back.reshape(E, 3, 4, 12), one[:, 9:]
     by_R1, by_R2, by_u, by_s = np.zeros((E, 3, 3)), np.empty((E, 3, 3)), np.zeros((E, 3)), np.zeros(E)

@@ -20,10 +20,10 @@ from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.solver.block_matrix import sum_into
 from gtsam_rwhec.solver.parts import SMALL, Shared
 
-#: This many measurements are evaluated at once: the slices of a block stay in the processor's cache.
+#: This many measurements are evaluated exactly at once: the slices of a block stay in the processor's cache.
 BLOCK = 1024
-#: A stack of small batches has about this many measurements: for small batches the calls take longer than the
-#: arithmetic.
+#: A stack of small batches has about this many measurements, and a block in plain doubles: for fewer the calls take
+#: longer than the arithmetic.
 STACK = 4096
 #: Batches in one stack have at least this part of its longest batch, so that little is padding.
 FULL = 0.6
@@ -108,14 +108,14 @@ class Sums:
     by_features_error: list[Array]
 
 
-def stacks_of(measured: Measured) -> Iterator[Stack]:
-    """The measurements in stacks."""
+def stacks_of(measured: Measured, block: int = BLOCK) -> Iterator[Stack]:
+    """The measurements in stacks, those of long batches in blocks."""
     yield from small_stacks(measured)
     for pair, raw in measured.batches:
         if len(raw.A) <= SMALL:
             continue
-        for first in range(0, len(raw.A), BLOCK):
-            part = slice(first, first + BLOCK)
+        for first in range(0, len(raw.A), block):
+            part = slice(first, first + block)
             weight = 1.0 / raw.sigma[None, part] ** 2
             yield Stack(
                 np.array([pair]), _rows(raw.A[part])[None], _rows(raw.B[part])[None], weight, raw.kappa[None, part]
@@ -178,10 +178,11 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
     shapes = (pairs, 1, 1, 12) if D == 1 else (1, D, D, 1), (pairs, 12, outputs), (pairs, 12, outputs), (pairs, outputs)
     tables, errors, sizes = ([np.zeros(shape) for shape in shapes] for _ in range(3))
     number = 0
-    for stack in stacks_of(measured):
+    for stack in stacks_of(measured, BLOCK if exact else STACK):
         number += 1
         of_A_and_B = slice(None, None, -1 if measured.is_swapped else 1)
-        r, low = _residuals(stack.pairs, *(stack.A, stack.B)[of_A_and_B], coefficients, exact=exact)
+        front, back = (stack.A, stack.B)[of_A_and_B]
+        r, low = _residuals(stack.pairs, front, back, coefficients, exact=exact)
         A, off = _centred(stack, measured)
         k, m = stack.weight.shape
         residuals, weights = r.reshape(k, m, D, 12), np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
