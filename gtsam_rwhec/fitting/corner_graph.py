@@ -128,7 +128,8 @@ class CornerGraph:
                 self.graph.add(gtsam.PriorFactorPose3(key_of("a", i), gtsam.Pose3(T), noise))
         for at, (mean, deviation) in model.priors(self.start).items():
             # an infinite deviation is a weight of zero
-            self.graph.add(gtsam.PriorFactorVector(self.keys[at], mean, gtsam.noiseModel.Diagonal.Sigmas(deviation)))
+            noise = gtsam.noiseModel.Diagonal.Precisions(deviation**-2.0)  # small deviations are no constraints either
+            self.graph.add(gtsam.PriorFactorVector(self.keys[at], mean, noise))
 
     def _variables_of(self, s: int) -> dict[str, tuple[str, str]]:
         """The letters and names of a stack's variables by their names in `Model`, without A."""

@@ -137,9 +137,10 @@ class Model:
         deviations |= {("t", name): in_s for name, in_s in self.offset_priors.items()}
         deviations |= {("p", name): in_m for name, in_m in self.corner_priors.items()}
         deviations |= {("b", name): of[self.free_shape(name)] for name, of in self.shape_priors.items()}
-        priors = {at: (np.zeros(len(of)), deviations.get(at, 0.0)) for at, of in self.vectors(point).items()}
-        priors |= {("k", name): prior for name, prior in self.camera_priors.items()}
-        return {at: (mean, np.broadcast_to(deviation, mean.shape)) for at, (mean, deviation) in priors.items()}
+        found: dict[tuple[str, str], tuple[Array, Array]] = {("k", name): of for name, of in self.camera_priors.items()}
+        vectors = self.vectors(point)
+        found |= {at: (np.zeros(len(vectors[at])), of * np.ones(len(vectors[at]))) for at, of in deviations.items()}
+        return {at: found[at] for at in vectors}
 
     def free_shape(self, target: str) -> np.ndarray:
         """Which of the three numbers of a board's shape are free."""

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from one_pair import X, noisy, poses, problem_of
+from board_by_camera import X, noisy, poses, problem_of
 from refinement_problems import KAPPA, SIGMA_M, copied, rig
 from rwhec_factors import se3
 from said import choice

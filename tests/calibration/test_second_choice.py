@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from one_pair import poses, problem_of
+from board_by_camera import poses, problem_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.outliers import more_consistent

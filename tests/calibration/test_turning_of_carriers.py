@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from one_pair import problem_of
+from board_by_camera import problem_of
 from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw

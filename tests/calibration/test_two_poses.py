@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from one_pair import poses, problem_of
+from board_by_camera import poses, problem_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
