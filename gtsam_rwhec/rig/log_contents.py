@@ -55,7 +55,6 @@ class ImageTopic:
     undecoded: str = ""
     tags: dict[str, Tags] = field(default_factory=dict)
     wanted: frozenset[int] = frozenset()
-    passed: int = 0
     pictures: list[Gray] = field(default_factory=list)
     places: list[int] = field(default_factory=list)
     seen: list[list[SeenTag]] = field(default_factory=list)
@@ -138,7 +137,6 @@ class LogContents:
 
     topics: tuple[Topic, ...]
     images: dict[str, ImageTopic] = field(default_factory=dict)
-    intrinsics: dict[str, str] = field(default_factory=dict)
     drivers: dict[str, DriverTopic] = field(default_factory=dict)
     cameras: dict[str, IntrinsicsRecord] = field(default_factory=dict)
     poses: dict[tuple[str, str, str], PoseTopic] = field(default_factory=dict)
@@ -166,7 +164,6 @@ def read_contents(log: Log) -> LogContents:
         elif isinstance(record, ImageRecord):
             _look_at(contents.images[record.topic], record)
         elif isinstance(record, IntrinsicsRecord):
-            contents.intrinsics.setdefault(record.topic, record.frame)
             contents.cameras.setdefault(record.topic, record)
         elif isinstance(record, DetectionRecord):
             _take_detection(contents.drivers.setdefault(record.topic, DriverTopic(record.topic)), record)
@@ -175,9 +172,8 @@ def read_contents(log: Log) -> LogContents:
 
 def _look_at(images: ImageTopic, record: ImageRecord) -> None:
     images.frame = images.frame or record.frame
-    place, images.passed = images.passed, images.passed + 1
     images.stamps_ns.append(record.stamp_ns)
-    if place not in images.wanted:
+    if len(images.stamps_ns) - 1 not in images.wanted:
         return
     try:
         gray = decode_gray(record)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.logs import Log
+from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.rig.carrier_roles import Origin, RoleEvidence, evidence_of_log, first_time_offset
 from gtsam_rwhec.rig.guessed_boards import STATED
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
@@ -147,7 +147,7 @@ def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
 
     def add(source: ImageTopic | DriverTopic, key: str, sources: int, missing: str) -> str:
         """Add a sensor, with the comment `missing` if the log lacks the intrinsics that it needs; return its name."""
-        intrinsics, remark = _intrinsics(source.topic, source.frame, contents.intrinsics, sources)
+        intrinsics, remark = _intrinsics(source.topic, source.frame, contents.cameras, sources)
         if intrinsics is None and missing:
             intrinsics, remark = _NO_INTRINSICS, missing
         name = free_name(camera_name(source.topic, source.frame), taken)
@@ -187,9 +187,11 @@ def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]
     return sorted(best.values(), key=lambda images: images.topic)
 
 
-def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> tuple[Intrinsics | None, str]:
+def _intrinsics(
+    topic: str, frame: str, known: Mapping[str, IntrinsicsRecord], sensors: int
+) -> tuple[Intrinsics | None, str]:
     """The intrinsics for a topic, from a topic with the same frame or with a name that begins in the same way."""
-    same_frame = [name for name, its_frame in known.items() if frame and its_frame == frame]
+    same_frame = [name for name, record in known.items() if frame and record.frame == frame]
     candidates = same_frame or list(known)
     shared = {name: _shared(topic, name) for name in candidates}
     most = max(shared.values(), default=0)

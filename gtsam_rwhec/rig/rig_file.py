@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -168,9 +168,9 @@ def _about(key: str, field: FieldInfo) -> str:
 
 
 def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
-    """The section at a place."""
+    """The section at a place; None where there is none."""
     model: type[BaseModel] | None = RigFile
-    models: list[type[BaseModel]] = [RigFile]
+    models: list[type[BaseModel]] = []
     for key in path:
         try:
             data = data[key]
@@ -179,11 +179,17 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
         field = keys_of(model).get(str(key)) if model else None
         if field is not None:  # else the key is the name or the number of an item
             models = models_in(field.annotation)
-        keys = data if isinstance(data, dict) else {}
-        fitting = [each for each in models if ("odometry" in keys) == ("odometry" in keys_of(each))]
-        kinds = [each for each in models if KINDS.get(str(keys.get("type"))) is each]
-        model = next(iter(kinds or ([] if models == [*KINDS.values()] else fitting or models)), None)
+        holds_items = field is not None and get_origin(field.annotation) in (dict, tuple)
+        model = None if holds_items else _meant(models, data if isinstance(data, dict) else {})
     return model
+
+
+def _meant(models: list[type[BaseModel]], given: dict[str, Any]) -> type[BaseModel] | None:
+    """Of the sections that may stand at a place, the one that these keys mean."""
+    if models == [*KINDS.values()]:
+        return KINDS.get(str(given.get("type")))
+    fitting = [each for each in models if ("odometry" in given) == ("odometry" in keys_of(each))]
+    return next(iter(fitting or models), None)
 
 
 #: The mark in a comment.

@@ -149,6 +149,7 @@ def test_every_fault_has_its_line(old: str, new: str, line: int, words: str) -> 
         ("sensors: !!python/name:os.system {}", "the tag '!!python/name:os.system'"),
         (MINIMAL.replace("{cam: {detections: /tags}}", "{}"), "line 2: sensors: none; give at least one"),
         (MINIMAL.replace("{cam: {detections: /tags}}", ""), "line 2: sensors: empty; give a section"),
+        (MINIMAL.replace("cam: {detections", "images: {detection"), "sensors.images.detection: unknown key; did"),
         (MINIMAL.replace("{cam: {detections: /tags}}", "{cam: }"), "line 2: sensors.cam: empty; give a section with"),
         (MINIMAL.replace("{tag: {type: tag, family: tag36h11, id: 3, size_m: 0.1}}", "{}"), "line 3: targets: none"),
         (MINIMAL.replace("{type: tag, family: tag36h11, id: 3, size_m: 0.1}", "3"), "line 3: targets.tag: 3; give a"),
