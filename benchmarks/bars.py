@@ -222,7 +222,7 @@ def in_words(seconds: float) -> str:
 
 def utias_folder() -> Path:
     """The RWHEC paper's real dataset: the folder that GTSAM_RWHEC_UTIAS names, or the one beside the checkout."""
-    folder = Path(os.environ.get("GTSAM_RWHEC_UTIAS", TESTS.parents[1] / "shared" / "data" / "utias"))
+    folder = Path(os.environ.get("GTSAM_RWHEC_UTIAS", SHARED / "utias"))
     if not folder.is_dir():
         raise SystemExit(f"{folder} does not exist: run `gtsam-rwhec fetch utias DEST`, set GTSAM_RWHEC_UTIAS=DEST")
     return folder
