@@ -52,7 +52,7 @@ def benchmark_parser(description: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
-def given_options(**defaults: Any) -> dict[str, Any]:
+def given_options(**defaults: Any) -> argparse.Namespace:
     """The command line's values of options that are stated by their defaults, and described in the script's docstring.
 
     False makes a flag, a tuple one or more of these words, a type an option without a default, any other value one of
@@ -68,12 +68,12 @@ def given_options(**defaults: Any) -> dict[str, Any]:
         elif isinstance(default, type):
             kind = {"type": default}
         parser.add_argument(f"--{name.replace('_', '-')}", **kind)
-    return vars(parser.parse_args())
+    return parser.parse_args()
 
 
 def run_script(title: str, rows: Callable[..., list[Row]], /, **defaults: Any) -> NoReturn:
     """Print the table of ``rows`` with the given options; exit with 1 if a bar is missed. The title may name one."""
-    given = given_options(**defaults)
+    given = vars(given_options(**defaults))
     sys.exit(print_rows(title.format(**given), rows(**given)))
 
 
@@ -222,7 +222,7 @@ def in_words(seconds: float) -> str:
 
 def utias_folder() -> Path:
     """The RWHEC paper's real dataset: the folder that GTSAM_RWHEC_UTIAS names, or the one beside the checkout."""
-    folder = Path(os.environ.get("GTSAM_RWHEC_UTIAS", TESTS.parents[1] / "shared" / "data" / "utias"))
+    folder = Path(os.environ.get("GTSAM_RWHEC_UTIAS", SHARED / "utias"))
     if not folder.is_dir():
         raise SystemExit(f"{folder} does not exist: run `gtsam-rwhec fetch utias DEST`, set GTSAM_RWHEC_UTIAS=DEST")
     return folder

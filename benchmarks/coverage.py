@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from bars import Row, benchmark_parser, each_done, print_rows, wide_console
+from bars import Row, each_done, given_options, print_rows, wide_console
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -291,13 +291,7 @@ def joined(outcomes: list[Outcome]) -> Outcome:
 
 def main() -> int:
     """Run both; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=1000, help="of each case (default: 1000)")
-    parser.add_argument("--efficiency-runs", type=int, default=4000, help="of each scale mode (default: 4000)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write coverage.png there")
-    arguments = parser.parse_args()
+    arguments = given_options(runs=1000, efficiency_runs=4000, workers=os.cpu_count() or 1, seed=0, plot=Path)
     console = wide_console()
     begin = time.perf_counter()
     status = 0

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bars import Row, Share, benchmark_parser, keep_line, kept_lines, print_rows
+from bars import Row, Share, given_options, keep_line, kept_lines, print_rows
 from changes import log_of
 from numpy.typing import NDArray
 from rwhec_factors import se3
@@ -169,7 +169,7 @@ def fleets_of(kind: str, robots: int) -> int:
 def campaign(given: Any) -> Iterator[dict[str, Any]]:
     """What the file has, and what it lacks."""
     done = {(one["kind"], one["number"], one["seed"]): one for one in kept_lines(given.keep)}
-    jobs = [(kind, number) for kind in given.only or KINDS for number in range(fleets_of(kind, given.robots))]
+    jobs = [(kind, number) for kind in given.only for number in range(fleets_of(kind, given.robots))]
     jobs += [("moved" if number % 2 else "still", number) for number in range(given.calibrations)]
     for kind, number in jobs:
         one = done.get((kind, number, given.seed))
@@ -237,13 +237,7 @@ def pooled(found: list[dict[str, Any]]) -> list[Row]:
 
 def main() -> int:
     """Run it; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--robots", type=int, default=1000, help="of each kind (default: 1000)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, metavar="FILE", help="JSON lines, to go on from")
-    parser.add_argument("--only", action="append", choices=KINDS, help="this kind alone; may be repeated")
-    parser.add_argument("--calibrations", type=int, default=0, help="robots whose nights are calibrated")
-    given = parser.parse_args()
+    given = given_options(robots=1000, seed=0, keep=Path, only=KINDS, calibrations=0)
     title = f"Drift of fleets, {given.robots} robots of each kind"
     found = list(campaign(given))
     return print_rows(title, pooled(found) + table(found))

@@ -7,13 +7,13 @@ the arm each. So X and Y are known: they are those of the real camera's calibrat
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from bars import SHARED
 from loky import ProcessPoolExecutor
 from numpy.typing import NDArray
 from rwhec_factors.se3 import expmap, inverse
@@ -53,8 +53,7 @@ class Cell:
 
 def workcell() -> Path:
     """The folder with the real images."""
-    shared = Path(__file__).resolve().parents[2] / "shared" / "data"
-    return Path(os.environ.get("GTSAM_RWHEC_DATA", shared)) / "workcell_camera2"
+    return SHARED / "workcell_camera2"
 
 
 def rig_text(cameras: tuple[str, ...], prefix: bool) -> str:

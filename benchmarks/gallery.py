@@ -1,6 +1,6 @@
 """The gallery of failures: is each fault named, and is no good run accused?
 
-    python benchmarks/gallery.py --runs 10 [--seed 1] [--faults board_moved,...] [--workers 2] [--out FOLDER]
+    python benchmarks/gallery.py --runs 10 [--seed 1] [--faults board_moved ...] [--workers 2] [--out FOLDER]
 
 Each run renders a folder of images with poses beside them, with a fault of `gallery_faults.FAULTS`, and calibrates it
 as `gtsam-rwhec calibrate` does. A fault counts as named where all of its words are in the verdict or in what to do
@@ -23,7 +23,7 @@ from pathlib import Path
 
 import gallery_scene as scene
 import numpy as np
-from bars import Row, benchmark_parser, each_done, print_rows
+from bars import Row, each_done, given_options, print_rows
 from gallery_faults import FAULTS, Fault
 from rich.console import Console
 
@@ -147,27 +147,14 @@ def rows(found: list[Outcome]) -> list[Row]:
 
 def main() -> int:
     """Run it; 0 if the bars are met."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--runs", type=int, default=10, help="seeds of each fault (default: 10)")
-    parser.add_argument("--seed", type=int, default=1, help="the first seed (default: 1)")
-    parser.add_argument("--faults", help="names, with commas between them (default: all)")
-    parser.add_argument("--only", choices=["bad", "good"], help="only runs with faults, or only runs without")
-    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: one for each core)")
-    parser.add_argument("--out", type=Path, help="keep each run's outcome here, and go on with those that are there")
-    given = parser.parse_args()
-    names = given.faults.split(",") if given.faults else [fault.name for fault in FAULTS]
-    if unknown := set(names) - {fault.name for fault in FAULTS}:
-        parser.error(f"there is no fault {', '.join(sorted(unknown))}; there are {', '.join(f.name for f in FAULTS)}")
+    names = tuple(fault.name for fault in FAULTS)
+    workers = os.cpu_count() or 1
+    given = given_options(runs=10, seed=1, faults=names, only=("bad", "good"), workers=workers, out=Path)
     if given.out is not None:
         given.out.mkdir(parents=True, exist_ok=True)
-    kinds = {"bad": [False], "good": [True], None: [False, True]}[given.only]
-    found = outcomes(
-        [fault for fault in FAULTS if fault.name in names],
-        list(range(given.seed, given.seed + given.runs)),
-        given.workers,
-        given.out,
-        kinds,
-    )
+    faults = [fault for fault in FAULTS if fault.name in given.faults]
+    seeds = list(range(given.seed, given.seed + given.runs))
+    found = outcomes(faults, seeds, given.workers, given.out, [kind == "good" for kind in given.only])
     return print_rows(f"Gallery of failures, {given.runs} seeds from {given.seed}", rows(found))
 
 

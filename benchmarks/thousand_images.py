@@ -21,7 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from bars import Row, benchmark_parser, print_rows
+from bars import Row, given_options, print_rows
 from four_cameras import CAMERAS, Cell, made_cell
 from rwhec_factors.se3 import inverse
 
@@ -115,10 +115,7 @@ def classic_s(cell: Cell) -> float:
 
 def main() -> int:
     """Make the folder, run, print."""
-    parser = benchmark_parser(__doc__)
-    parser.add_argument("--folder", type=Path, help="where the images are kept; by default they are removed at the end")
-    parser.add_argument("--each", type=int, default=251, help="images a camera")
-    given = parser.parse_args()
+    given = given_options(folder=Path, each=251)
     with tempfile.TemporaryDirectory() as temporary:
         place = given.folder or Path(temporary) / "cell"
         cell = made_cell(place, given.each)

@@ -138,9 +138,10 @@ def calibrate_odometries(
             break
     assert answer is not None
     _check_agreement(answer, names)
+    begins = origin + np.round(windows.start * 1e9).astype(np.int64)
     removed = {
-        name: gate.removed + _outlying(answer, windows, k, origin)
-        for k, (name, gate) in enumerate(zip(names, gates, strict=True))
+        name: gate.removed + _outlying(begins, left_out)
+        for name, gate, left_out in zip(names, gates, answer.left_out, strict=True)
     }
     tell("gathering")
     return calibration_of(answer, task, tracks, reference, offsets, clocks, removed, origin)
@@ -228,8 +229,6 @@ def _check_agreement(answer: Answer, names: tuple[str, ...]) -> None:
             )
 
 
-def _outlying(answer: Answer, windows: WindowMotions, k: int, origin: int) -> tuple[Removed, ...]:
-    return tuple(
-        Removed(RemovalReason.OUTLIER, i, origin + round(float(windows.start[i]) * 1e9), 1.0, 1.0)
-        for i in np.flatnonzero(answer.left_out[k]).tolist()
-    )
+def _outlying(begins_ns: np.ndarray, left_out: np.ndarray) -> tuple[Removed, ...]:
+    at = np.flatnonzero(left_out).tolist()
+    return tuple(Removed(RemovalReason.OUTLIER, i, int(begins_ns[i]), 1.0, 1.0) for i in at)

@@ -254,7 +254,7 @@ def is_odometry_result(content: bytes) -> bool:
 
 def _sensor(found: OdometryCalibration, name: str, frames: Mapping[str, str]) -> SensorRecord:
     T, covariance = found.T_reference_sensor[name], found.covariance_of(name)
-    sigma = [_finite(float(x)) for x in np.sqrt(np.diagonal(covariance))]
+    sigma = np.sqrt(np.diagonal(covariance))
     q = of_rotations(T[None, :3, :3])[0].tolist()  # x, y, z, w
     scale_sigma = None
     if name in found.scales:
@@ -267,9 +267,9 @@ def _sensor(found: OdometryCalibration, name: str, frames: Mapping[str, str]) ->
         translation_m=tuple(T[:3, 3].tolist()),
         quaternion_wxyz=(q[3], q[0], q[1], q[2]),
         T_parent_child=_rows(T),  # type: ignore[arg-type]
-        standard_deviations_deg=tuple(None if x is None else float(np.degrees(x)) for x in sigma[:3]),  # type: ignore[arg-type]
-        standard_deviations_mm=tuple(None if x is None else 1e3 * x for x in sigma[3:]),  # type: ignore[arg-type]
-        covariance=tuple(tuple(_finite(x) for x in row) for row in covariance.tolist()),
+        standard_deviations_deg=_finites(np.degrees(sigma[:3])),  # type: ignore[arg-type]
+        standard_deviations_mm=_finites(1e3 * sigma[3:]),  # type: ignore[arg-type]
+        covariance=tuple(map(_finites, covariance)),
         scale=found.scales.get(name),
         scale_sigma=scale_sigma,
         time_offset_s=found.time_offsets_s.get(name, 0.0),
@@ -295,6 +295,10 @@ def _track(found: OdometryCalibration, name: str) -> TrackRecord:
 
 def _rows(T: Array) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in T.tolist())
+
+
+def _finites(numbers: Array) -> tuple[float | None, ...]:
+    return tuple(map(_finite, numbers.tolist()))
 
 
 def _finite(number: float) -> float | None:
