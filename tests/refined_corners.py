@@ -34,7 +34,7 @@ def two_cameras() -> tuple[Cell, rw.CornersRefined, Refined]:
         base = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     options = rw.CornerOptions(size_share=0.05, warp_m=1e-3)
     corners = rw.refine_corners(given.observations, base.X, base.Y, options)
-    held_out = held_out_errors(given.observations, corners, options, folds=2)
+    held_out = held_out_errors(corners, folds=2)
     intrinsics = intrinsics_of(corners, dict.fromkeys(corners.Y, "nominal"))
     found = numbers_of(given.observations, corners, options, held_out, TRIED)
     return given, corners, as_refined(base, corners, found, intrinsics)

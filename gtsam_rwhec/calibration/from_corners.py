@@ -100,7 +100,7 @@ def chosen_model(
     def scored(of: CornerOptions, refined: CornersRefined | None = None) -> tuple[CornerOptions, Score, LeftOut]:
         refined = refined or refine_corners(some, X, Y, of, tell)
         folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
-        found = left_out(some, refined, of, folds=folds, progress=tell)
+        found = left_out(refined, folds=folds, progress=tell)
         errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.errors.values()])
         weights = np.array([one.corners for one in found.errors.values()], dtype=float)
         return of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found

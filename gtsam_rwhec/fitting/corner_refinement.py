@@ -47,8 +47,9 @@ from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3
-#: With outliers in the fit, which only tells which corners they are, steps end where the cost falls by this share.
-ROUGHLY = 1e-2
+#: Steps end where the cost falls by less than this share; with outliers in the fit, which only tells which corners they
+#: are, by less than ``ROUGHLY``.
+EXACTLY, ROUGHLY = 1e-9, 1e-2
 #: Doubted priors are widened at most so many times.
 WIDENINGS = 6
 #: Deviations at the start: of a corner (pixels) and of the carriers' poses (rad, m).
@@ -216,15 +217,8 @@ def _settled(
     for number in range(ROUNDS):
         tell(f"refining from corners: round {number + 1} of at most {ROUNDS}")
         has_outliers = options.outliers and number == 0 and is_first
-        graph = CornerGraph(model, point)
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(options.max_iterations)
-        parameters.setRelativeErrorTol(ROUGHLY if has_outliers else 1e-9)
-        parameters.setAbsoluteErrorTol(1e-7)
-        optimiser = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.values(point), parameters)
-        with told_where_it_fails(model, point):
-            values = optimiser.optimize()
-        point, iterations = graph.point(values), iterations + optimiser.iterations()
+        graph, values, steps = optimum(model, point, options.max_iterations, ROUGHLY if has_outliers else EXACTLY)
+        point, iterations = graph.point(values), iterations + steps
         before = noise
         if has_outliers:  # the noise is that of the corners that agree
             model = replace(model, weights=weights_of(model, point, noise.corner_px, first=True))
@@ -246,6 +240,21 @@ def _settled(
     check_determined(model, start, point, joint, reduced.slots)
     freedom = degrees_of_freedom(reduced, noise, carrier=options.carrier_noise == "estimate")
     return _Settled(model, point, noise, graph, joint, reduced.slots, freedom, iterations, last_step)
+
+
+def optimum(
+    model: Model, start: Point, most: int = CornerOptions.max_iterations, tolerance: float = EXACTLY
+) -> tuple[CornerGraph, gtsam.Values, int]:
+    """The graph of a model, its optimum from a start, and how many steps it took."""
+    graph = CornerGraph(model, start)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(most)
+    parameters.setRelativeErrorTol(tolerance)
+    parameters.setAbsoluteErrorTol(1e-7)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.values(start), parameters)
+    with told_where_it_fails(model, start):
+        values = optimiser.optimize()
+    return graph, values, optimiser.iterations()
 
 
 def _check_start(model: Model, point: Point) -> None:

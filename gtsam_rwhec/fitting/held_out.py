@@ -18,11 +18,10 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, OptionError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.fitting.corner_refinement import refine_corners
-from gtsam_rwhec.fitting.corner_residuals import Stack, stacks_of
+from gtsam_rwhec.fitting.corner_checks import check_determined, told_where_it_fails
+from gtsam_rwhec.fitting.corner_refinement import optimum
+from gtsam_rwhec.fitting.corner_residuals import Stack
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
-from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_whole
@@ -55,35 +54,20 @@ class LeftOut:
     spread: dict[tuple[str, str], float]
 
 
-def held_out_errors(
-    observations: Observations,
-    refined: CornersRefined,
-    options: CornerOptions | None = None,
-    *,
-    folds: int = 5,
-    progress: Progress | None = None,
-) -> dict[str, HeldOut]:
+def held_out_errors(refined: CornersRefined, *, folds: int = 5, progress: Progress | None = None) -> dict[str, HeldOut]:
     """Errors of corners in images that were left out, by sensor: `left_out` without the spread."""
-    return left_out(observations, refined, options, folds=folds, progress=progress).errors
+    return left_out(refined, folds=folds, progress=progress).errors
 
 
 @one_blas_thread()
-def left_out(
-    observations: Observations,
-    refined: CornersRefined,
-    options: CornerOptions | None = None,
-    *,
-    folds: int = 5,
-    progress: Progress | None = None,
-) -> LeftOut:
+def left_out(refined: CornersRefined, *, folds: int = 5, progress: Progress | None = None) -> LeftOut:
     """Leave images out in blocks: their corners' errors, and how much the estimates differ.
 
     Parameters
     ----------
-    observations, options
-        Those that `refined` was made from.
     refined : CornersRefined
-        Its poses are the start, and its noise of A is given; corners that it left out do not count.
+        From all images. It is the start; its noise and its priors hold for each part, and corners that it left out do
+        not count.
     folds : int
         Blocks of instants that are left out in turns, at least two.
 
@@ -92,38 +76,70 @@ def left_out(
     OptionError
         `folds` is not a whole number of 2 or more.
     CountError
-        There are fewer instants than folds; without a block a frame has no image left; or the observations are others.
+        There are fewer instants than folds, or without a block a frame has no image left.
+    UnderdeterminedError
+        Without a block the images leave a frame's pose free.
     """
-    options, tell = options or CornerOptions(), progress or silent
+    tell = progress or silent
     if not is_whole(folds, 2):
         raise OptionError(f"folds={brief(folds)}; give a whole number from 2")
-    counted = _without(observations, refined)
-    stacks, A = stacks_of(counted)
-    if len(A) < folds:
-        raise CountError(f"{len(A)} instants cannot be left out in {folds} blocks; give folds={len(A)} or less")
-    noise = refined.noise.carrier
-    told = replace(options, carrier_noise="exact", outliers=False)
-    if noise is not None:
-        about = refined.graph.model.about
-        told = replace(told, carrier_noise=CarrierNoise(float(noise[0]), float(noise[3]), about=about))
-    block = _blocks(stacks, len(A), folds)
-    found: dict[str, list[tuple[Array, Array, Array, Array]]] = {name: [] for name in observations.sensors}
+    model = refined.graph.model
+    if len(model.A) < folds:
+        raise CountError(
+            f"{len(model.A)} instants cannot be left out in {folds} blocks; give folds={len(model.A)} or less"
+        )
+    stacks = tuple(
+        replace(stack, known=stack.known & (weights > 0.0))
+        for stack, weights in zip(model.stacks, model.weights, strict=True)
+    )
+    block = _blocks(stacks, len(model.A), folds)
+    found: dict[str, list[tuple[Array, Array, Array, Array]]] = {name: [] for name in model.sensors}
     parts = []
     for fold in range(folds):
         tell(f"predicting images that were left out: block {fold + 1} of {folds}")
-        rest = _some(counted, stacks, block != fold)
-        again = refine_corners(rest, refined.X, refined.Y, told)
-        parts.append(again)
+        parts.append(_refined_from(refined, block != fold))
         for stack in stacks:
             if (seen := block[stack.instant] == fold).any():
-                found[stack.sensor].append(_predicted(stack.selected(seen), A, again))
+                found[stack.sensor].append(_predicted(stack.selected(seen), model.A, parts[-1]))
     errors = {
         name: _of_sensor(
-            *(np.concatenate(values) for values in zip(*each, strict=True)), camera=observations.cameras[name]
+            *(np.concatenate(values) for values in zip(*each, strict=True)), camera=refined.intrinsics[name].camera
         )
         for name, each in found.items()
     }
     return LeftOut(errors, spread_over_claims(refined, parts))
+
+
+def _refined_from(refined: CornersRefined, kept: np.ndarray) -> CornersRefined:
+    """The optimum of the images of some instants (I,) under the noise and the priors of all."""
+    model, slots = refined.graph.model, refined.slots
+    there = [kept[stack.instant] for stack in model.stacks]
+    rest = replace(
+        model,
+        stacks=tuple(stack.selected(at) for stack, at in zip(model.stacks, there, strict=True) if at.any()),
+        weights=tuple(weights[at] for weights, at in zip(model.weights, there, strict=True) if at.any()),
+    )
+    gone = [("target", name) for name in model.targets if name not in rest.targets]
+    gone += [("sensor", name) for name in model.sensors if name not in rest.sensors]
+    for what, name in gone:
+        raise CountError(f"{what} {name} has all its images in one block; give more folds")
+    graph, values, _ = optimum(rest, refined.point)
+    point = graph.point(values)
+    with told_where_it_fails(rest, point):
+        joint, _ = graph.covariance(values, slots)
+    check_determined(rest, refined.point, point, joint, slots)
+    return replace(
+        refined,
+        X={name: gtsam.Pose3(T) for name, T in point.X.items()},
+        Y={name: gtsam.Pose3(T) for name, T in point.Y.items()},
+        intrinsics={
+            name: replace(one, camera=one.camera.with_parameters(point.cameras[rest.camera_of[name]]))
+            for name, one in refined.intrinsics.items()
+        },
+        joint=joint,
+        graph=graph,
+        point=point,
+    )
 
 
 def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, Array, Array, Array]:
@@ -194,37 +210,6 @@ def _of_sensor(length: Array, on_target: Array, expected: Array, pixels: Array, 
         float(np.sqrt(expected.mean())),
         rms_by_region(camera, pixels, length),
     )
-
-
-def _without(observations: Observations, refined: CornersRefined) -> Observations:
-    """The observations without the corners that were left out."""
-    for pair, view in observations.views.items():
-        if pair not in refined.left_out or refined.left_out[pair].shape != view.pixels.shape[:2]:
-            raise CountError(
-                f"the images of {pair[0]} by {pair[1]} are not those that the refinement is from; give its observations"
-            )
-    views = {
-        pair: replace(view, pixels=np.where(refined.left_out[pair][..., None], np.nan, view.pixels))
-        for pair, view in observations.views.items()
-    }
-    return replace(observations, views=views)
-
-
-def _some(observations: Observations, stacks: tuple[Stack, ...], instants: np.ndarray) -> Observations:
-    """The images of some instants; `CountError` if a frame has none left."""
-    views: dict[tuple[str, str], Views] = {}
-    for stack in stacks:
-        kept = instants[stack.instant]
-        if kept.any():
-            views[stack.target, stack.sensor] = observations.views[stack.target, stack.sensor].selected(kept)
-    some = replace(observations, views=views)
-    for what, every, left in (
-        ("target", observations.targets, some.targets), ("sensor", observations.sensors, some.sensors),
-    ):  # fmt: skip
-        gone = [name for name in every if name not in left]
-        if gone:
-            raise CountError(f"{what} {gone[0]} has all its images in one block; give more folds")
-    return some
 
 
 def spread_over_claims(refined: CornersRefined, parts: Sequence[CornersRefined]) -> dict[tuple[str, str], float]:

@@ -117,10 +117,10 @@ def test_offsets_are_found_with_everything_else(late: Cell, noise: rw.fitting.Ca
         error = se3.logmap((se3.inverse(pose.matrix()) @ truth)[None])[0]
         assert error @ np.linalg.solve(refined.covariance(name), error) < 22.5
     # without the offsets the corners are off
-    assert held_out_errors(late.observations, refined, options, folds=2)["cam_0"].rms_px < 0.16
+    assert held_out_errors(refined, folds=2)["cam_0"].rms_px < 0.16
     kept = replace(options, time_offsets=())
     without = rw.refine_corners(late.observations, X, Y, kept)
-    assert held_out_errors(late.observations, without, kept, folds=2)["cam_0"].rms_px > 0.5
+    assert held_out_errors(without, folds=2)["cam_0"].rms_px > 0.5
 
 
 def test_errors_of_offsets_are_as_large_as_their_deviations() -> None:

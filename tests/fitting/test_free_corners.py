@@ -99,7 +99,7 @@ def test_images_that_were_left_out_are_predicted_better() -> None:
     for corners_m in (0.0, MISPRINT_M):
         options = replace(OPTIONS, corners_m=corners_m, carrier_noise="exact")
         refined = rw.refine_corners(given.observations, X, Y, options)
-        error = held_out_errors(given.observations, refined, options, folds=3)["cam_0"]
+        error = held_out_errors(refined, folds=3)["cam_0"]
         rms.append(error.rms_px)
     assert rms[1] < 0.7 * rms[0]
     # the target's pose and its corners' places are off together

@@ -44,4 +44,4 @@ def test_the_shipped_log_is_solved_by_one_calibration(tmp_path: Path) -> None:
         sys.setprofile(before)
     assert count["calibrations"] == 1
     assert 0 < count["problems"] <= 20
-    assert 0 < count["refinements from corners"] <= 11
+    assert 0 < count["refinements from corners"] <= 5

@@ -60,7 +60,7 @@ def test_a_workcell_of_other_people(workcell_log: Path) -> None:
     # its simulator has the principal point half a pixel or a pixel from where it is stated
     assert refined.intrinsics["camera2"].camera.K[0, 2] == pytest.approx(959.5, abs=4.0)
     assert refined.noise.carrier_m < 1e-4
-    assert held_out_errors(found.observations, refined)["camera2"].rms_mm < 0.2
+    assert held_out_errors(refined)["camera2"].rms_mm < 0.2
 
 
 def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_log: Path) -> None:
@@ -133,7 +133,7 @@ def test_nominal_intrinsics_of_other_people(circles_log: Path) -> None:
     camera = found.refined.intrinsics["camera"].camera
     assert camera.K[0, 0] == pytest.approx(530.0, abs=20.0)
     assert found.refined.shapes["grid"][0] == pytest.approx(-0.02, abs=0.01)
-    assert held_out_errors(found.observations, found.refined, options)["camera"].rms_mm < 0.7 * 4.6
+    assert held_out_errors(found.refined)["camera"].rms_mm < 0.7 * 4.6
 
 
 def test_the_log_road_chooses_what_predicts_left_out_images_of_other_people(circles_log: Path) -> None:
