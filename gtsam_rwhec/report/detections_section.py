@@ -285,8 +285,9 @@ def _parts(shape: tuple[int, ...]) -> dict[str, tuple[slice, slice]]:
     """Halves, then quarters, which are not named again where halves are."""
     i, j = (round(0.5 * n) for n in shape)
     down, across = {"upper": np.s_[:i], "lower": np.s_[i:]}, {"left": np.s_[:j], "right": np.s_[j:]}
-    halves = {f"{x} half": (np.s_[:], columns) for x, columns in across.items()}
-    halves |= {f"{y} half": (rows, np.s_[:]) for y, rows in down.items()}
+    every = slice(None)
+    halves: dict[str, tuple[slice, slice]] = {f"{x} half": (every, columns) for x, columns in across.items()}
+    halves |= {f"{y} half": (rows, every) for y, rows in down.items()}
     return halves | {f"{y} {x} quarter": (down[y], across[x]) for y in down for x in across}
 
 

@@ -255,7 +255,9 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     named = {f.name: at for f, at in zip(scene.frames, places, strict=True)} if len(scene.frames) <= MOST_NAMES else {}
     for words, colour in ((named, INK), (said, PURPLE)):
         for name, at in words.items():
-            axes.annotate(shortened(name), at, (8, 9), textcoords="offset points", size=8.5, color=colour, zorder=7)
+            axes.annotate(
+                shortened(name), tuple(at), (8, 9), textcoords="offset points", size=8.5, color=colour, zorder=7
+            )
     corners = np.array(np.meshgrid(*zip(scene.low, scene.high, strict=True))).reshape(3, -1).T @ P.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))

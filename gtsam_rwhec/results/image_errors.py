@@ -241,7 +241,7 @@ def cells_with_corners(pixels: Array, size: tuple[int, int]) -> np.ndarray:
     columns, rows = CELLS if size[0] >= size[1] else CELLS[::-1]
     good = np.clip(pixels[np.isfinite(pixels).all(axis=1)] + 0.5, 0.0, size)
     cells, *_ = np.histogram2d(good[:, 1], good[:, 0], (rows, columns), ((0.0, size[1]), (0.0, size[0])))
-    return cells.astype(int)
+    return np.asarray(cells, dtype=int)
 
 
 def worst_views(rated: Iterable[RatedView], most: int = MOST_WORST) -> list[RatedView]:
