@@ -64,5 +64,5 @@ def compare(
             rw.methods.write_comparison(comparison, output)
             say(f"Written to {shown_path(output)}.", to_errors=True)
     finally:
-        rw.report.print_comparison(comparison)
+        rw.methods.print_comparison(comparison)
     return ExitStatus.NOT_CERTIFIED if comparison.solution is None else exit_status(rw.judge(comparison.solution))

@@ -4,6 +4,7 @@ from .comparison import Compared as Compared
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .comparison import write_comparison as write_comparison
+from .comparison_report import print_comparison as print_comparison
 from .registry import METHODS as METHODS
 from .registry import cost_of_answer as cost_of_answer
 from .registry import run as run

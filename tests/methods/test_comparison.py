@@ -17,8 +17,8 @@ from gtsam_rwhec.errors import CountError, FileFormatError, OptionError, Underde
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.methods import METHODS, compare, run
 from gtsam_rwhec.methods.comparison import PAIR_SOLVERS, Comparison, chained, comparison_fields, write_comparison
+from gtsam_rwhec.methods.comparison_report import print_comparison
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.report.comparison_report import print_comparison
 from gtsam_rwhec.simulate import Noise, general
 
 QUICK = ("shah2013", "wang2022", "dornaika1998", "lom", "certified", "zhuang1994")
