@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -73,9 +72,8 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
             "estimate in the rig file. Wrong intrinsics show like this, too."
         )
     grounds = () if judgement is None else judgement.grounds
-    said = judgement is not None and bool(SIZES.intersection(grounds))
     if Ground.INTRINSICS_DOUBTED not in grounds:  # with wrong focal lengths sizes say nothing
-        advice += _sizes(log, judgement.reason if judgement is not None and said else "")
+        advice += _sizes(log, are_said=bool(SIZES.intersection(grounds)))
     advice += log.detection.remarks
     if log.detection.strangers:
         names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
@@ -83,13 +81,13 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
     return advice
 
 
-def _sizes(log: LogFields, reason: str) -> list[str]:
-    """Stated sizes that do not fit the motion, or that the motion does not check; not those that ``reason`` names."""
+def _sizes(log: LogFields, *, are_said: bool) -> list[str]:
+    """Stated sizes that do not fit the motion, or that it does not check; not the doubted ones where these are said."""
     advice = []
     free = [size for size in log.sizes if size.is_free]
     doubted = [size for size in log.sizes if size.is_doubted and not size.is_free]
     for size in free + doubted:
-        if re.search(rf"(?<!\w){re.escape(size.target)}(?!\w)", reason):
+        if are_said and size.is_doubted:
             continue
         off = size.percent_too_large
         fact = (
