@@ -442,7 +442,8 @@ def with_scales_of_targets_alone(
 def truncated_weights(d2: Array, mu: float, c2: float) -> Array:
     """Weights of the graduated truncated squares, eq. 14: 1 at first, then c / d sqrt(mu (mu + 1)) - mu, then 0."""
     with np.errstate(divide="ignore"):
-        return np.clip(np.sqrt(c2 * mu * (mu + 1.0) / d2) - mu, 0.0, 1.0)
+        weights: Array = np.clip(np.sqrt(c2 * mu * (mu + 1.0) / d2) - mu, 0.0, 1.0)
+    return weights
 
 
 def inlier_count(name: str, inliers: Inliers) -> tuple[int, int]:
