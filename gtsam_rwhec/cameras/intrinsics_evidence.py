@@ -115,7 +115,7 @@ def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsE
         again = _fitted(camera, near.T, p, u, known, free=WIDER)
         found = found if again is None else _compared(camera, stated, again, known, reach)
     lens = _with_distortion(camera)
-    start = _far_start(lens, p, u, known)
+    start = _far_start(lens, views)
     far = None if start is None else _fitted(lens, start[1], p, u, known, free=WIDER, lens=start[0])
     elsewhere = None if far is None else _compared(lens, stated, far, known, reach)
     if elsewhere is None or (found is not None and not elsewhere.contradicts):
@@ -144,17 +144,12 @@ def _with_distortion(camera: Camera) -> Camera:
     return replace(camera, model="radtan", D=np.zeros(4)) if camera.model == "pinhole" else camera
 
 
-def _far_start(camera: Camera, p: Array, u: Array, known: np.ndarray) -> tuple[Camera, Array] | None:
+def _far_start(camera: Camera, views: Sequence[View]) -> tuple[Camera, Array] | None:
     """Intrinsics and poses by OpenCV, which finds them from far away; None for a fisheye, or if it finds none."""
     if camera.model != "radtan":
         return None
-    found = fitted_to_planes(
-        [q[k] for q, k in zip(p, known, strict=True)],
-        [q[k] for q, k in zip(u, known, strict=True)],
-        (camera.width, camera.height),
-        "radial",
-        camera.K,
-    )
+    corners, pixels = [view.corners_m for view in views], [view.corners_px for view in views]
+    found = fitted_to_planes(corners, pixels, (camera.width, camera.height), "radial", camera.K)
     if found is None:
         return None
     K = found.K
