@@ -161,8 +161,8 @@ FOLDERS = {
         CELL.replace("0.03}", "0.0309}"), 6,
         ("the stated size of board is 3", "% too large", "line 5", "measure the named targets again"),
     ),
-    "columns and rows of before": Mistake(
-        CELL.replace("inner_corners: [5, 4]", "columns: 5, rows: 4"), 2, ("is now inner_corners: [5, 4]",),
+    "columns and rows": Mistake(
+        CELL.replace("inner_corners: [5, 4]", "columns: 5, rows: 4"), 2, ("inner_corners: is missing: [across, down]",),
     ),
     "a key that is misspelt": Mistake(
         CELL.replace("intrinsics:", "intrinsic:"), 2, ("line 3: sensors.left.intrinsic: unknown key; did you mean",),
