@@ -200,12 +200,6 @@ def test_nodes_of_the_launch_file_have_names_that_ros_takes(monkeypatch: pytest.
     assert all(name.isidentifier() and name.isascii() for name in names)
 
 
-def test_a_launch_file_without_frames_is_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = static_tf_launch(RigFrames("hand", "base", {}, {}))
-    ast.parse(text)
-    assert launched(text, monkeypatch) == []
-
-
 # tf YAML
 
 
@@ -230,10 +224,6 @@ def test_names_stay_names_in_yaml(name: str) -> None:
     entry = yaml.safe_load(tf_yaml(frames))["transforms"][0]
     assert (entry["header"]["frame_id"], entry["child_frame_id"]) == ("hand", name)
     assert "cam0" in yaml.safe_load(camchain_yaml(frames))
-
-
-def test_tf_yaml_without_frames_is_a_message() -> None:
-    assert yaml.safe_load(tf_yaml(RigFrames("hand", "base", {}, {}))) == {"transforms": []}
 
 
 # URDF

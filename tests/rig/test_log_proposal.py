@@ -242,9 +242,7 @@ def test_topics_that_are_left_out(scene: Scene) -> None:
     left_out = [note for note in notes if note.startswith("not used")]
     assert any("/cam/image/compressed, of the same camera as /cam/image" in note for note in left_out)
     assert any("/cam/depth/image, depth" in note for note in left_out)
-    assert any(
-        "/broken/image, topic /broken/image, image at 1 ns" in note or "/broken/image, " in note for note in left_out
-    )
+    assert any("/broken/image, " in note for note in left_out)
 
 
 def test_no_tags_leave_an_example(scene: Scene) -> None:
@@ -275,11 +273,6 @@ def test_nothing_moves(scene: Scene, still: str) -> None:
     elif still == "standing":
         scene.moving("base", "hand", reach=0.001)
     with pytest.raises(RigError, match=r"no poses of anything that moves.*/cam/image \(foxglove.CompressedImage, 2"):
-        scene.first()
-
-
-def test_an_empty_log(scene: Scene) -> None:
-    with pytest.raises(RigError, match="topics: none"):
         scene.first()
 
 
