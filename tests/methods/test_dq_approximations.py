@@ -60,6 +60,31 @@ def test_the_recursion_gives_the_eigenvalue_and_its_vector(relaxed: RelaxedCost)
             assert small < large * 0.5 ** (order + 1) * 1.3 + 1e-13
 
 
+def _lambda_series(relaxed: RelaxedCost, sign: float) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """mu_1, mu_2, q_1, q_2 of eq. 35 with ``sign`` before Z2: +1 as printed, -1 corrected."""
+    Z1, Z2 = relaxed.Z1, relaxed.Z2
+    gap = relaxed.values[0] - relaxed.values[1:]
+    mu1 = 1.0 / Z1[0, 0]
+    q1 = np.append(0.0, mu1 * Z1[1:, 0] / gap)
+    mu2 = -(mu1 * Z1[0] @ q1 + sign * mu1**2 * Z2[0, 0]) / Z1[0, 0]
+    q2 = np.append(-0.5 * q1 @ q1, (Z1[1:] @ (mu1 * q1) + mu2 * Z1[1:, 0] + sign * mu1**2 * Z2[1:, 0] - q1[1:]) / gap)
+    return mu1, mu2, q1, q2
+
+
+@pytest.mark.parametrize(("sign", "order"), [(-1.0, 3), (1.0, 2)])
+def test_eq_35_solves_eq_12_to_second_order_only_with_the_other_sign_of_Z2(
+    relaxed: RelaxedCost, sign: float, order: int
+) -> None:
+    mu1, mu2, q1, q2 = _lambda_series(relaxed, sign)
+    size = 1e-3 / max(abs(mu2 / mu1), np.abs(q1).max(), np.sqrt(np.abs(q2).max()))
+    residuals = []
+    for change in (size, size / 2):
+        mu = mu1 * change + mu2 * change**2
+        q = np.array([1.0, 0, 0, 0]) + q1 * change + q2 * change**2
+        residuals.append(np.linalg.norm(Z(relaxed, mu) @ q - (relaxed.values[0] + change) * q))
+    assert np.log2(residuals[0] / residuals[1]) == pytest.approx(order, abs=0.1)
+
+
 def test_the_lambda_expansion_meets_the_constraint_better_than_the_relaxation(relaxed: RelaxedCost) -> None:
     def violation(q: np.ndarray) -> float:
         """How far the best mu of q (eq. 14) is from making q an eigenvector (eq. 12)."""
