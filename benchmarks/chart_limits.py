@@ -1,4 +1,4 @@
-"""The limits of the control chart, by Monte Carlo: writes ``gtsam_rwhec/results_changes/chart_limits.json``.
+"""The limits of the control chart, by Monte Carlo: writes ``gtsam_rwhec/results/chart_limits.json``.
 
 Every path is a robot that nothing happens to: nights of independent standard normal numbers, some groups of equal
 size. Its statistic of each night is the smallest chance over moments and groups (`gtsam_rwhec.results.control_chart`).
@@ -18,7 +18,7 @@ from scipy.special import chdtrc
 
 from gtsam_rwhec.results.control_chart import OF_ALL
 
-TABLE = Path(__file__).parents[1] / "gtsam_rwhec/results_changes/chart_limits.json"
+TABLE = Path(__file__).parents[1] / "gtsam_rwhec/results/chart_limits.json"
 NIGHTS = 61
 #: Kept nights: the limits change slowly after the first ones.
 KEPT = (2, 3, 4, 5, 6, 8, 10, 13, 17, 22, 28, 36, 46, 61)

@@ -145,20 +145,17 @@ def test_another_checksum_is_refused_and_nothing_is_written(spoilt: tuple[Server
     assert sorted(path.name for path in destination.iterdir()) == sorted(file.name for file in utias_files()[:5])
 
 
-def test_a_truncated_file_is_refused(spoilt: tuple[Server, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kept_bytes", "words"), [(-10, r"\d+ bytes"), (None, r"not found \(404\)")])
+def test_a_truncated_and_a_missing_file_are_refused(
+    spoilt: tuple[Server, Path], kept_bytes: int | None, words: str, tmp_path: Path
+) -> None:
     server, folder = spoilt
-    name = utias_files()[0].name
-    (folder / name).write_bytes((folder / name).read_bytes()[:-10])
-    with pytest.raises(FetchError, match=rf"{name}: \d+ bytes"):
-        fetch_utias(tmp_path / "utias", server.url)
-    assert list((tmp_path / "utias").iterdir()) == []
-
-
-def test_a_missing_file_on_the_server(spoilt: tuple[Server, Path], tmp_path: Path) -> None:
-    server, folder = spoilt
-    name = utias_files()[3].name
-    (folder / name).unlink()
-    with pytest.raises(FetchError, match=rf"{name}: not found \(404\)"):
+    file = folder / utias_files()[3].name
+    if kept_bytes is None:
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:kept_bytes])
+    with pytest.raises(FetchError, match=rf"{file.name}: {words}"):
         fetch_utias(tmp_path / "utias", server.url)
     assert len(list((tmp_path / "utias").iterdir())) == 3
 
@@ -175,12 +172,14 @@ def test_a_server_that_stays_out_of_order(server: Server, tmp_path: Path) -> Non
         fetch_utias(tmp_path, server.url)
 
 
-def test_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_network_and_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))  # bound and not listening: a connection is refused
         with pytest.raises(FetchError, match="Is there a network"):
             fetch_utias(tmp_path, f"http://127.0.0.1:{unused.getsockname()[1]}/")
+    with pytest.raises(FetchError, match="cannot be downloaded"):
+        fetch_utias(tmp_path, "not-an-address")
 
 
 def test_the_users_own_file_is_never_overwritten(server: Server, tmp_path: Path) -> None:
@@ -196,11 +195,6 @@ def test_a_destination_that_is_a_file(server: Server, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(FetchError, match="cannot be made a folder"):
         fetch_utias(tmp_path / "file", server.url)
-
-
-def test_an_invalid_address_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FetchError, match="cannot be downloaded"):
-        fetch_utias(tmp_path, "not-an-address")
 
 
 @pytest.fixture(scope="module")

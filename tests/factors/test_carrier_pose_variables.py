@@ -133,26 +133,18 @@ def test_pose_hand_eye_is_hand_eye_between_the_poses() -> None:
 
 
 @pytest.mark.parametrize("name", FACTORS)
-def test_a_missing_key_is_named_and_what_it_should_be(name: str) -> None:
+def test_a_missing_key_and_a_wrong_type_are_named_and_what_it_should_be(name: str) -> None:
     factor, values, _ = setting(name, 9, 1.0, "geodesic", scaled=True)
     for key in list(factor.keys()):
-        incomplete = gtsam.Values(values)
+        incomplete, named = gtsam.Values(values), gtsam.DefaultKeyFormatter(key)
         incomplete.erase(key)
         what = "1-vector" if key == S(0) else "T_.*Pose3"
-        with pytest.raises(KeyError, match=rf"{gtsam.DefaultKeyFormatter(key)} is not in the values.*{what}"):
+        with pytest.raises(KeyError, match=rf"{named} is not in the values.*{what}"):
             factor.error(incomplete)
-
-
-@pytest.mark.parametrize("name", FACTORS)
-def test_a_wrong_type_is_named_and_what_it_should_be(name: str) -> None:
-    factor, values, _ = setting(name, 10, 1.0, "geodesic", scaled=True)
-    for key in list(factor.keys()):
         for wrong in (np.zeros(3), 1.5, gtsam.Pose2()):
-            mixed = gtsam.Values(values)
-            mixed.erase(key)
+            mixed = gtsam.Values(incomplete)
             mixed.insert(key, wrong)
-            what = "1-vector" if key == S(0) else "T_.*Pose3"
-            with pytest.raises(TypeError, match=rf"{gtsam.DefaultKeyFormatter(key)} should be .*{what}"):
+            with pytest.raises(TypeError, match=rf"{named} should be .*{what}"):
                 factor.linearize(mixed)
 
 
@@ -162,12 +154,6 @@ def test_noise_that_these_factors_cannot_hold_is_refused(name: str) -> None:
     sigmas = np.array([0.1, 0.2, 0.1, 0.3, 0.3, 0.3])
     with pytest.raises(ValueError, match="dimension 3"):
         make(gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(3, 1.0))
-    with pytest.raises(ValueError, match="zero"):
-        make(gtsam.Pose3(), gtsam.noiseModel.Constrained.All(6))
-    with pytest.raises(ValueError, match="singular"):
-        make(gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(np.r_[sigmas[:5], np.inf]))
-    with pytest.raises(TypeError, match="ndarray"):
-        make(gtsam.Pose3(), np.eye(6))
     with pytest.raises(ValueError, match="geodesic"):
         make(gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(sigmas), residual="chordal")
     with pytest.raises(ValueError, match="'chorda'"):

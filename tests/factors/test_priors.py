@@ -72,28 +72,15 @@ def with_angle(seed: int, angle_rad: float) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3.Expmap(angle_rad * omega / np.linalg.norm(omega)), pose(seed + 100).translation())
 
 
-@pytest.mark.parametrize("size", [1.0, 0.1, 1e-6, 0.0])
+@pytest.mark.parametrize("size", [1.0, 0.1, 1e-6, 0.0, None], ids=str)
 @pytest.mark.parametrize("name", PRIORS)
-def test_jacobians_are_the_numeric_ones(name: str, size: float) -> None:
+def test_jacobians_are_the_numeric_ones(name: str, size: float | None) -> None:
+    """None: almost half a turn away."""
     make, sigmas = PRIORS[name]
     for seed in range(6):
         T_0 = pose(seed)
-        T = T_0.compose(pose(seed + 50, 0.7 * size))
-        check_jacobians(make(T_0), values_of({X(0): T}), sigmas)
-
-
-@pytest.mark.parametrize("name", PRIORS)
-def test_jacobians_far_from_the_prior(name: str) -> None:
-    make, sigmas = PRIORS[name]
-    for seed in range(6):
-        T_0 = pose(seed)
-        check_jacobians(make(T_0), values_of({X(0): T_0.compose(with_angle(seed, 3.0))}), sigmas, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", PRIORS)
-def test_the_error_at_the_prior_is_zero(name: str) -> None:
-    T_0 = pose(1)
-    assert PRIORS[name][0](T_0).error(values_of({X(0): T_0})) < 1e-20
+        T = T_0.compose(with_angle(seed, 3.0) if size is None else pose(seed + 50, 0.7 * size))
+        check_jacobians(make(T_0), values_of({X(0): T}), sigmas, **({"atol": 1e-6} if size is None else {}))
 
 
 @pytest.mark.parametrize("name", PRIORS)
@@ -279,12 +266,6 @@ def test_a_known_rotation_determines_what_a_cartesian_robot_leaves_free() -> Non
     result = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     assert result.atPose3(Y(0)).equals(MOUNTING, 1e-6)
     assert result.atPose3(X(0)).equals(T_target, 1e-6)
-
-
-def test_a_known_tilt_leaves_one_turn() -> None:
-    J = PRIORS["direction"][0](pose(18)).linearize(values_of({X(0): pose(18)})).jacobian()[0]
-    assert np.linalg.matrix_rank(J) == 2
-    np.testing.assert_allclose(J @ np.r_[AXIS, 0.0, 0.0, 0.0], 0.0, atol=1e-12)
 
 
 def test_arguments_that_are_not_valid_are_refused() -> None:

@@ -1,26 +1,21 @@
 """Fleets of made-up robots, each with a hand that carries cameras over tags, and logs of a driver's detections.
 
-    made = write_fleet(tmp_path, robots=3, logs=2)
-    fleet.run(fleet.read_manifest(made.manifest), ...)
-
-A log takes a few milliseconds: all its poses are computed at once.
+written = write_fleet(tmp_path, robots=3, logs=2)
+fleet.run(fleet.read_manifest(written.manifest), ...)
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
+import synthetic_logs as made
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs.mcap_writer import json_schema
 
 #: 2026-11-01 02:00 UTC; each log is a night later.
 BEGIN_NS = 1_793_498_400_000_000_000
@@ -149,14 +144,10 @@ def write_log(path: Path, Y: list[Array], X: list[Array], images: int, night: in
     phase = rng.uniform(0.0, 2.0 * np.pi, 6)
     begin = BEGIN_NS + night * NIGHT_NS
     t_tf = np.arange(int(np.ceil(images / CAMERA_HZ * TF_HZ)) + 2) / TF_HZ
-    messages: list[tuple[int, str, str, dict[str, object]]] = []
-    for t, (position, orientation) in zip(t_tf, _parts(hand_at(t_tf, phase)), strict=True):
-        stamp = begin + round(1e9 * t)
-        moved = {
-            "timestamp": _time(stamp), "parent_frame_id": "base", "child_frame_id": "hand",
-            "translation": position, "rotation": orientation,
-        }  # fmt: skip
-        messages.append((stamp, "/tf", "foxglove.FrameTransforms", {"transforms": [moved]}))
+    messages = [
+        made.transform(begin + round(1e9 * t), "base", "hand", T)
+        for t, T in zip(t_tf, hand_at(t_tf, phase), strict=True)
+    ]
     # Half-way between stamps of tf nothing would be exact: images are taken at some of them.
     t_images = np.arange(images) / CAMERA_HZ
     for number, camera in enumerate(Y):
@@ -165,32 +156,12 @@ def write_log(path: Path, Y: list[Array], X: list[Array], images: int, night: in
         pixels = corners[..., :2] / corners[..., 2:] * FOCAL + np.array(CENTRE)
         pixels += rng.normal(0.0, 0.1, pixels.shape)
         xi = rng.normal(0.0, 1.0, (T[..., 0, 0].size, 6)) * np.repeat([np.radians(0.1), 1e-3], 3)
-        seen = _parts(T.reshape(-1, 4, 4) @ se3.expmap(xi))
+        seen = (T.reshape(-1, 4, 4) @ se3.expmap(xi)).reshape(T.shape)
         for i, t in enumerate(t_images):
-            stamp = begin + round(1e9 * t)
-            found = [
-                {
-                    "family": "tag36h11", "id": str(j), "size_m": SIZE_M,
-                    "pose": {"position": seen[i * len(X) + j][0], "orientation": seen[i * len(X) + j][1]},
-                    "corners_px": [{"x": x, "y": y} for x, y in pixels[i, j].tolist()],
-                }
-                for j in range(len(X))
-            ]  # fmt: skip
+            found = [made.tag(j, seen[i, j], size_m=SIZE_M, corners_px=pixels[i, j]) for j in range(len(X))]
             name = f"cam_{number}"
-            content: dict[str, object] = {"timestamp": _time(stamp), "frame_id": name, "detections": found}
-            messages.append((stamp, f"/{name}/tags", "gtsam_rwhec.TagDetections", content))
-    messages.sort(key=lambda message: message[:2])
-    with open(path, "wb") as stream:
-        writer = McapWriter(stream, chunk_size=1 << 16, compression=CompressionType.ZSTD)
-        writer.start()
-        channels: dict[str, int] = {}
-        for stamp, topic, schema, content in messages:
-            if topic not in channels:
-                known = writer.register_schema(schema, "jsonschema", json_schema(schema))
-                channels[topic] = writer.register_channel(topic, "json", known)
-            writer.add_message(channels[topic], stamp, json.dumps(content).encode(), stamp)
-        writer.finish()
-    return path
+            messages.append(made.detections(f"/{name}/tags", begin + round(1e9 * t), name, found))
+    return made.write(path, sorted(messages, key=lambda message: (message.logged_ns, message.topic)))
 
 
 def _tags(count: int, rng: np.random.Generator) -> list[Array]:
@@ -209,16 +180,3 @@ def _cameras(count: int, rng: np.random.Generator) -> list[Array]:
     ).as_matrix()
     T[:, :3, 3] = rng.uniform(-0.06, 0.06, (count, 3))
     return list(T)
-
-
-def _parts(T: Array) -> list[tuple[dict[str, float], dict[str, float]]]:
-    """Positions and quaternions, as messages have them."""
-    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat().tolist()
-    return [
-        (dict(zip("xyz", t, strict=True)), dict(zip("xyzw", q, strict=True)))
-        for t, q in zip(T[:, :3, 3].tolist(), quaternions, strict=True)
-    ]
-
-
-def _time(stamp_ns: int) -> dict[str, int]:
-    return {"sec": stamp_ns // 10**9, "nsec": stamp_ns % 10**9}

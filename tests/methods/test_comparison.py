@@ -83,16 +83,18 @@ def test_residuals_are_pooled_over_measurements() -> None:
 
 
 def test_without_a_certified_answer_there_is_no_gap_and_the_reason_is_said() -> None:
-    """A and B inverted by mistake: the scale comes out negative, or all is free."""
-    simulation = one_pair(monocular=True)
-    raw = simulation.problem.measurements("camera", "marker")
-    planar = rw.Problem("shared")
-    planar.add("camera", "marker", raw.A[:4], np.linalg.inv(raw.B[:4]), 0.01, 125.0)
-    result = compare(planar, methods=["lom", "certified"])
-    if result.solution is None:
-        assert all(result.gap(row) is None for row in result.rows)
-        assert str(result.error) in printed(result)
-        assert comparison_fields(result)["lower_bound"] is None
+    """Lengths of the wrong sign: the scale comes out negative."""
+    raw = one_pair(monocular=True).problem.measurements("camera", "marker")
+    B = raw.B.copy()
+    B[:, :3, 3] *= -1.0
+    mirrored = rw.Problem("shared")
+    mirrored.add("camera", "marker", raw.A, B, 0.01, 125.0)
+    result = compare(mirrored, methods=["lom", "certified"])
+    assert result.solution is None
+    assert all(result.gap(row) is None for row in result.rows)
+    assert "scale" in str(result.error)
+    assert " ".join(str(result.error).split()) in " ".join(printed(result).split())
+    assert comparison_fields(result)["lower_bound"] is None
     json.dumps(comparison_fields(result), allow_nan=False)
 
 
@@ -106,7 +108,7 @@ def test_report_has_a_line_for_each(tmp_path: object) -> None:
     assert "Started from wang2022's linear systems, with the scale: lom." in text
 
 
-@pytest.mark.parametrize("width", [40, 80, 200])
+@pytest.mark.parametrize("width", [40, 80])
 def test_report_fits_terminals(width: int) -> None:
     result = compare(general_pair().problem, methods=QUICK)
     console = Console(file=io.StringIO(), width=width, force_terminal=True, highlight=False, color_system=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from method_problems import exchanged, four_targets, largest_errors, one_pair
+from method_problems import exchanged, four_targets, one_pair
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
@@ -152,13 +152,6 @@ def test_a_cost_that_changes_with_the_origin() -> None:
     moved.add("camera", "marker", A, raw.B)
     X, X_moved = run("horn2023", simulation.problem).X["camera"], run("horn2023", moved).X["camera"]
     assert np.abs(X.matrix() - X_moved.matrix()).max() > 1e-3
-
-
-def test_sensible_noise_gives_sensible_answers() -> None:
-    simulation = four_targets()
-    metres, radians = largest_errors(simulation, run("horn2023", simulation.problem))
-    assert metres < 0.02
-    assert radians < 0.03
 
 
 def test_other_signs_are_refused_by_name() -> None:

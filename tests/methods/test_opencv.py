@@ -91,8 +91,8 @@ def test_the_certified_answer_is_that_of_solve_with_the_true_noise():
     assert np.median(errors["certified"]) < 0.3 * np.median(errors["park"])
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-def test_translations_scale_with_their_unit(method):
+@pytest.mark.parametrize("method", (METHODS | OURS).values(), ids=METHODS | OURS)
+def test_translations_scale_with_their_unit(method, recwarn):
     gripper, seen, _, _ = stations(15, 5)
     metres = opencv.calibrateHandEye(*parts(gripper, seen), method=method)
     gripper[:, :3, 3] *= 1000.0
@@ -101,8 +101,10 @@ def test_translations_scale_with_their_unit(method):
     if method in (opencv.CALIB_HAND_EYE_ANDREFF, opencv.CALIB_HAND_EYE_DANIILIDIS):  # weigh rotation by the unit
         np.testing.assert_allclose(millimetres[0], metres[0], atol=0.02)
     else:
-        np.testing.assert_allclose(millimetres[0], metres[0], atol=1e-12)
-        np.testing.assert_allclose(millimetres[1], 1000.0 * metres[1], rtol=1e-9, atol=1e-9)
+        exact = method not in OURS.values()  # a closed form
+        np.testing.assert_allclose(millimetres[0], metres[0], atol=1e-12 if exact else 1e-8)
+        np.testing.assert_allclose(millimetres[1], 1000.0 * metres[1], rtol=1e-9, atol=1e-9 if exact else 1e-5)
+    assert not recwarn.list
 
 
 def test_blocks_of_pairs_change_nothing(monkeypatch):
@@ -111,18 +113,6 @@ def test_blocks_of_pairs_change_nothing(monkeypatch):
     monkeypatch.setattr("gtsam_rwhec.methods.opencv_methods.BLOCK_PAIRS", 100)
     for method, expected in zip(METHODS.values(), whole, strict=True):
         assert largest_difference(opencv.calibrateHandEye(*parts(gripper, seen), method=method), expected) < 1e-12
-
-
-def test_our_answers_are_nearer_to_the_truth_than_the_median_method():
-    errors = {name: [] for name in METHODS | OURS}
-    for seed in range(20):
-        gripper, seen, camera, _ = stations(30, seed, 0.02, 0.01)
-        for name, method in (METHODS | OURS).items():
-            _, t = opencv.calibrateHandEye(*parts(gripper, seen), method=method)
-            errors[name].append(np.linalg.norm(t[:, 0] - camera[:3, 3]))
-    medians = {name: np.median(values) for name, values in errors.items()}
-    for name in OURS:
-        assert medians[name] <= np.median([medians[other] for other in METHODS])
 
 
 @pytest.mark.parametrize("shape", [(3,), (3, 1), (1, 3)])
@@ -171,6 +161,7 @@ def bad_calls():
     yield "not a number", (R_G, t_G, R_C, [np.full(3, np.nan), *t_C[1:]]), PoseError, "t_target2cam: measurement 0"
     yield "no rotation", ([2.0 * R_G[0], *R_G[1:]], t_G, R_C, t_C), PoseError, "measurement 0 is off by 3"
     yield "left-handed", ([*R_G[:5], R_G[5] @ mirror], t_G, R_C, t_C), PoseError, "measurement 5 is left-handed"
+    yield "complex", (np.array(R_G) * 1j, t_G, R_C, t_C), PoseError, "complex"
     yield "words", (["a"] * 6, t_G, R_C, t_C), PoseError, "R_gripper2base"
     yield "one rotation only", ([R_G[0]] * 6, t_G, [R_C[0]] * 6, t_C), UnderdeterminedError, "no motion rotates"
     about_z = list(Rotation.from_rotvec(np.outer(np.arange(6.0), [0, 0, 0.3])).as_matrix())
@@ -231,19 +222,6 @@ def test_dqopt_over_all_pairs_is_solve_of_all_pairs():
     np.testing.assert_allclose(t[:, 0], X[:3, 3], atol=1e-5)
 
 
-def test_dqopt_and_the_certified_answer_do_not_depend_on_the_unit(recwarn):
-    gripper, seen, _, _ = stations(15, 13)
-    for method in OURS.values():
-        metres = opencv.calibrateHandEye(*parts(gripper, seen), method=method)
-        larger = [T.copy() for T in (gripper, seen)]
-        for T in larger:
-            T[:, :3, 3] *= 1000.0
-        millimetres = opencv.calibrateHandEye(*parts(*larger), method=method)
-        np.testing.assert_allclose(millimetres[0], metres[0], atol=1e-8)
-        np.testing.assert_allclose(millimetres[1], 1000.0 * metres[1], atol=1e-5)
-    assert not recwarn.list
-
-
 def test_integers_and_lists_of_lists_are_numbers():
     gripper, seen, _, _ = stations(6, 14)
     R_G, t_G, R_C, t_C = parts(gripper, seen)
@@ -288,9 +266,3 @@ def test_tsai_refuses_one_axis_among_the_motions_that_it_uses() -> None:
     turns = np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 0], [2.8, 0, 0]])
     with pytest.raises(UnderdeterminedError, match="rotate about one axis"):
         opencv.calibrateHandEye(*poses_of(turns, PLACES[:4]), method=opencv.CALIB_HAND_EYE_TSAI)
-
-
-def test_complex_numbers() -> None:
-    R_G, t_G, R_C, t_C = poses_of(TURNS, PLACES)
-    with pytest.raises(PoseError, match="complex"):
-        opencv.calibrateHandEye(R_G * 1j, t_G, R_C, t_C)

@@ -15,7 +15,6 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.methods import MethodOptions, compare, run
 from gtsam_rwhec.methods import reprojection as methods
-from gtsam_rwhec.methods.corner_methods import Corners
 from gtsam_rwhec.simulate.simulation import frame_distance
 
 
@@ -66,18 +65,6 @@ def test_corners_that_a_problem_holds_are_solved_beside_methods_on_poses() -> No
     problem.add("board", "left", np.eye(4)[None], np.eye(4)[None])
     with pytest.raises(CountError, match="measurements without corners"):
         run("tabb2017_rp1", problem)
-
-
-def test_the_minimum_is_one() -> None:
-    observations, _, _ = seen(0.3, 4)
-    answer = methods.run("tabb2017_rp1", observations)
-    corners = Corners.of(observations)
-    frames = np.array([pose.matrix() for pose in [*answer.X.values(), *answer.Y.values()]])
-    assert corners.cost(frames) == answer.reprojection_cost
-    generator = np.random.default_rng(0)
-    for size in (1e-2, 1e-4):
-        for _ in range(5):
-            assert corners.cost(frames @ se3.expmap(size * generator.standard_normal((4, 6)))) > answer.cost
 
 
 def test_corners_know_more_than_the_poses_that_they_give() -> None:

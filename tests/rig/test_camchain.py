@@ -100,10 +100,6 @@ def test_distortion_that_kalibr_lacks_is_left_out_and_said(model: str, D: tuple[
     assert "T_cn_cnm1" not in chain["cam0"]
 
 
-def test_a_camchain_without_cameras_is_yaml() -> None:
-    assert yaml.safe_load(camchain_yaml(RigFrames("hand", "base", {"cam": np.eye(4)}, {}))) == {}
-
-
 def test_overlaps_are_of_cameras_that_can_see_the_same() -> None:
     """Three in a ring: the first two look the same way, the third backwards."""
     backwards = np.diag([-1.0, 1.0, -1.0, 1.0])

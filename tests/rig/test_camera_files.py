@@ -16,7 +16,16 @@ from hypothesis import given, settings
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_calibration_yaml, read_cameras, read_colmap_cameras
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.rig import RigFrames, camchain_yaml, camera_info_yaml, colmap_cameras_txt, export_all, opencv_yaml
+from gtsam_rwhec.rig import (
+    RigFrames,
+    camchain_yaml,
+    camera_info_yaml,
+    colmap_cameras_txt,
+    export_all,
+    opencv_yaml,
+    static_tf_launch,
+    tf_yaml,
+)
 
 #: Every lens model, with as many coefficients as it may have; numbers with all their digits.
 LENSES = {
@@ -147,8 +156,12 @@ def test_names_that_become_one_are_told_apart() -> None:
     assert [node.getNode("name").string() for node in nodes] == list(sensors)
 
 
-def test_files_without_cameras_are_files(tmp_path: Path) -> None:
+def test_files_without_cameras_and_targets_are_files(tmp_path: Path) -> None:
     export_all(RigFrames("hand", "base", {"lidar": np.eye(4)}, {}), tmp_path)
+    assert yaml.safe_load((tmp_path / "camchain.yaml").read_text()) == {}
+    empty = RigFrames("hand", "base", {}, {})
+    assert yaml.safe_load(tf_yaml(empty)) == {"transforms": []}
+    compile(static_tf_launch(empty), "static_tf.launch.py", "exec")
     assert not (tmp_path / "camera_info").exists()
     storage = cv2.FileStorage(str(tmp_path / "cameras.opencv.yaml"), cv2.FILE_STORAGE_READ)
     assert storage.getNode("carrier").string() == "hand"

@@ -102,7 +102,8 @@ def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 @on_random_poses
-def test_the_launch_file_publishes_every_frame(frames: RigFrames) -> None:
+def test_the_launch_file_and_tf_yaml_have_every_frame(frames: RigFrames) -> None:
+    assert_same(of_tf_yaml(frames), expected(frames))
     with pytest.MonkeyPatch.context() as monkeypatch:
         nodes = launched(static_tf_launch(frames), monkeypatch)
     found = {}
@@ -173,11 +174,7 @@ def test_links_take_the_place_of_optical_frames_and_compose_to_them(frames: RigF
     for of, T in published.items():
         np.testing.assert_allclose(transforms[of], T, rtol=0.0, atol=1e-12)
 
-    of_yaml = {}
-    for entry in yaml.safe_load(tf_yaml(frames))["transforms"]:
-        at = entry["transform"]
-        T = composed([at["translation"][key] for key in "xyz"], [at["rotation"][key] for key in "xyzw"])
-        of_yaml[entry["header"]["frame_id"], entry["child_frame_id"]] = T
+    of_yaml = of_tf_yaml(frames)
     assert set(of_yaml) == {of for of in transforms if of[1] not in added}
     for name, T in with_optical_frames(of_yaml, frames).items():
         np.testing.assert_allclose(T, wanted[name], rtol=0.0, atol=1e-12)
@@ -200,17 +197,10 @@ def test_nodes_of_the_launch_file_have_names_that_ros_takes(monkeypatch: pytest.
     assert all(name.isidentifier() and name.isascii() for name in names)
 
 
-def test_a_launch_file_without_frames_is_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = static_tf_launch(RigFrames("hand", "base", {}, {}))
-    ast.parse(text)
-    assert launched(text, monkeypatch) == []
-
-
 # tf YAML
 
 
-@on_random_poses
-def test_tf_yaml_has_every_frame(frames: RigFrames) -> None:
+def of_tf_yaml(frames: RigFrames) -> dict[tuple[str, str], np.ndarray]:
     message = yaml.safe_load(tf_yaml(frames))
     assert list(message) == ["transforms"]
     found = {}
@@ -219,7 +209,7 @@ def test_tf_yaml_has_every_frame(frames: RigFrames) -> None:
         translation, rotation = entry["transform"]["translation"], entry["transform"]["rotation"]
         T = composed([translation[key] for key in "xyz"], [rotation[key] for key in "xyzw"])
         found[entry["header"]["frame_id"], entry["child_frame_id"]] = T
-    assert_same(found, expected(frames))
+    return found
 
 
 @pytest.mark.parametrize("name", ["no", "null", "true", "y", "e5", "On"])
@@ -230,10 +220,6 @@ def test_names_stay_names_in_yaml(name: str) -> None:
     entry = yaml.safe_load(tf_yaml(frames))["transforms"][0]
     assert (entry["header"]["frame_id"], entry["child_frame_id"]) == ("hand", name)
     assert "cam0" in yaml.safe_load(camchain_yaml(frames))
-
-
-def test_tf_yaml_without_frames_is_a_message() -> None:
-    assert yaml.safe_load(tf_yaml(RigFrames("hand", "base", {}, {}))) == {"transforms": []}
 
 
 # URDF

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import synthetic_logs as made
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from gtsam_rwhec.detect.tags import dictionary, tags_in_image
 from gtsam_rwhec.errors import RigError
@@ -56,7 +55,7 @@ class Scene:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.out = LogWriter(folder / "run.mcap")
-        self.others: list[tuple[str, str, dict[str, Any]]] = []
+        self.others: list[made.Message] = []
 
     def moving(self, parent: str, child: str, topic: str = "/tf", reach: float = 0.5) -> Scene:
         for i in range(POSES):
@@ -73,34 +72,17 @@ class Scene:
         return self
 
     def calibration(self, topic: str, frame: str) -> Scene:
-        message = {
-            "timestamp": {"sec": 0, "nsec": 1}, "frame_id": frame, "width": 320, "height": 240,
-            "distortion_model": "plumb_bob", "D": [], "K": [300, 0, 160, 0, 300, 120, 0, 0, 1],
-            "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [300, 0, 160, 0, 0, 300, 120, 0, 0, 0, 1, 0],
-        }  # fmt: skip
-        self.others.append((topic, "foxglove.CameraCalibration", message))
+        self.others.append(replace(made.camera_info(frame, 1, width=320, height=240), topic=topic))
         return self
 
     def stamped_poses(self, topic: str, frame: str) -> Scene:
-        for i in range(POSES):
-            message = {
-                "timestamp": {"sec": i, "nsec": 0}, "frame_id": frame,
-                "pose": {"position": {"x": i, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}},
-            }  # fmt: skip
-            self.others.append((topic, "foxglove.PoseInFrame", message))
+        self.others += [made.pose_in_frame(10**9 * i, frame, pose(i), topic) for i in range(POSES)]
         return self
 
     def first(self) -> tuple[Rig, str, tuple[str, ...]]:
         self.out.__exit__(None, None, None)
-        with open(self.folder / "others.mcap", "wb") as stream:
-            writer = Writer(stream)
-            writer.start()
-            for i, (topic, schema, message) in enumerate(self.others):
-                schema_id = writer.register_schema(schema, "jsonschema", b"{}")
-                channel = writer.register_channel(topic, "json", schema_id)
-                writer.add_message(channel, i, json.dumps(message).encode(), i)
-            writer.finish()
-        with open_log([self.folder / "run.mcap", self.folder / "others.mcap"]) as log:
+        others = made.write(self.folder / "others.mcap", self.others)
+        with open_log([self.folder / "run.mcap", others]) as log:
             text, notes = propose_rig(log, self.folder / "rig.yaml")
         return parse_rig(text, "rig.yaml"), text, notes
 
@@ -242,9 +224,7 @@ def test_topics_that_are_left_out(scene: Scene) -> None:
     left_out = [note for note in notes if note.startswith("not used")]
     assert any("/cam/image/compressed, of the same camera as /cam/image" in note for note in left_out)
     assert any("/cam/depth/image, depth" in note for note in left_out)
-    assert any(
-        "/broken/image, topic /broken/image, image at 1 ns" in note or "/broken/image, " in note for note in left_out
-    )
+    assert any("/broken/image, " in note for note in left_out)
 
 
 def test_no_tags_leave_an_example(scene: Scene) -> None:
@@ -275,11 +255,6 @@ def test_nothing_moves(scene: Scene, still: str) -> None:
     elif still == "standing":
         scene.moving("base", "hand", reach=0.001)
     with pytest.raises(RigError, match=r"no poses of anything that moves.*/cam/image \(foxglove.CompressedImage, 2"):
-        scene.first()
-
-
-def test_an_empty_log(scene: Scene) -> None:
-    with pytest.raises(RigError, match="topics: none"):
         scene.first()
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import jsonschema
 import pytest
 from rig_texts import MINIMAL
+from test_rig_reference import faults
 
 from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.files.yaml_lines import parse_yaml
-from gtsam_rwhec.rig import GivenDistance, OdometryNoiseSection, parse_rig, rig_file_schema, rig_text
+from gtsam_rwhec.rig import GivenDistance, OdometryNoiseSection, parse_rig, rig_text
 
 VEHICLE = """\
 reference: lidar_front
@@ -29,17 +26,6 @@ given:
     - {between: [lidar_front, lidar_rear], distance_m: 2.41}
 """
 MIXED = MINIMAL.replace("sensors: {", "sensors: {wheels: {odometry: {topic: /odom}}, ")
-VALIDATOR = jsonschema.Draft7Validator(rig_file_schema())
-
-
-def lists(node: Any) -> Any:
-    if isinstance(node, dict):
-        return {key: lists(value) for key, value in node.items()}
-    return [lists(value) for value in node] if isinstance(node, tuple) else node
-
-
-def schema_faults(text: str) -> list[str]:
-    return [error.message for error in VALIDATOR.iter_errors(lists(parse_yaml(text, "rig.yaml").data))]
 
 
 def test_the_reference_carries_the_others() -> None:
@@ -62,8 +48,7 @@ def test_the_reference_carries_the_others() -> None:
 def test_what_is_written_reads_back_equal_and_the_schema_takes_it(text: str) -> None:
     rig = parse_rig(text, "rig.yaml")
     assert parse_rig(rig_text(rig), "written") == rig
-    assert schema_faults(text) == []
-    assert schema_faults(rig_text(rig)) == []
+    assert faults(text) == faults(rig_text(rig)) == []
 
 
 def test_a_reference_of_tf_names_both_frames() -> None:

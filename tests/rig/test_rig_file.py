@@ -117,17 +117,6 @@ def test_poses_of_a_topic_in_either_direction() -> None:
     )
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(RigError, match=r"none\.yaml cannot be read: No such file"):
-        read_rig(tmp_path / "none.yaml")
-    (tmp_path / "rig.yaml").write_bytes(b"\xff")
-    with pytest.raises(RigError, match="not a text file in UTF-8"):
-        read_rig(tmp_path / "rig.yaml")
-    (tmp_path / "rig.yaml").write_bytes(b"a: 1\n" * 300_000)
-    with pytest.raises(RigError, match="larger than"):
-        read_rig(tmp_path / "rig.yaml")
-
-
 @pytest.mark.parametrize(
     "source",
     ["file: left.yaml", "kalibr: camchain.yaml, camera: cam0", "topic: /camera_info", "K: [9, 9, 4, 4], size: [9, 9]"],

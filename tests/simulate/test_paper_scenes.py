@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rwhec_factors.se3 import inverse
 
 from gtsam_rwhec import solve
-from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, Simulation, cameras, sphere
 from gtsam_rwhec.simulate.paper_scenes import (
@@ -132,15 +132,6 @@ def test_the_marker_visits_the_grid_at_four_orientations() -> None:
         assert np.all(np.sum(np.cross(z, line) * y, axis=1) > 0.0)
 
 
-def test_all_cameras_see_one_motion_of_the_hand() -> None:
-    problem = cameras(None, 5).problem
-    assert problem.targets == ("camera0", "camera1", "camera2", "camera3")
-    assert problem.sensors == ("marker",)
-    assert problem.number_of_measurements == 432
-    A = [problem.measurements(name, "marker").A for name in problem.targets]
-    assert all(np.array_equal(A[0], other) for other in A)
-
-
 @pytest.mark.parametrize("model", ["stated", "released"])
 def test_noise_is_on_B_and_its_size_is_the_weight(model: str) -> None:
     noise = Noise(0.05, 12.0, model)  # type: ignore[arg-type]
@@ -204,13 +195,6 @@ def test_seeds_repeat_and_differ() -> None:
     assert not np.array_equal(measured(8), measured(9))
     generator = np.random.default_rng(8)
     assert not np.array_equal(measured(generator), measured(generator))
-
-
-@pytest.mark.parametrize("simulate", [sphere, cameras])
-def test_measurements_need_not_be_kept(simulate: Callable[..., Simulation]) -> None:
-    problem = simulate(None, 10, keep_measurements=False).problem
-    with pytest.raises(MeasurementsNotKeptError):
-        problem.measurements(*problem.pairs[0])
 
 
 def test_bad_options_are_refused() -> None:
