@@ -193,10 +193,11 @@ class MomentStack:
             return G
         a = np.broadcast_to(self.a, (len(G), 3))
         c = np.where(self.motion[index][:, None], a, self.c)
-        k, width, _ = G.shape
-        rows = np.einsum("ei,eimj->emj", c, G[:, R_A].reshape(k, 3, 3, width))
+        rows = G[:, 0:3] * c[:, 0, None, None] + G[:, 3:6] * c[:, 1, None, None] + G[:, 6:9] * c[:, 2, None, None]
         G[:, T_A] += rows - a[:, :, None] * G[:, one, None, :]
-        columns = np.einsum("ei,ejim->ejm", c, G[:, :, R_A].reshape(k, width, 3, 3))
+        columns = G[:, :, 0:3] * c[:, None, 0, None]
+        columns += G[:, :, 3:6] * c[:, None, 1, None]
+        columns += G[:, :, 6:9] * c[:, None, 2, None]
         G[:, :, T_A] += columns - G[:, :, one, None] * a[:, None, :]
         return G
 

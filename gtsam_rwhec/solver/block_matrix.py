@@ -23,7 +23,7 @@ from gtsam_rwhec.solver.elimination import Elimination, Group
 AT_ONCE = 1_000_000
 #: Up to this many numbers are summed one by one.
 FEW_NUMBERS = 4096
-#: Of up to this many rows it is asked whether each is named once.
+#: Of up to this many rows it is asked whether each is named once; a matrix of so many is multiplied as one array.
 FEW_ROWS = 64
 #: `AT_ONCE` for frames with the same neighbours: these numbers fit in the processor's cache.
 ALIKE_AT_ONCE = 100_000
@@ -102,7 +102,7 @@ class BlockMatrix:
         def of(blocks: Array) -> Array:
             return (np.abs(blocks) if absolute else blocks).astype(v.dtype, copy=False)
 
-        if self.order.is_dense:
+        if self.order.is_dense and self.size <= FEW_ROWS:
             return np.asarray(of(self._whole) @ v)
         n, m, _ = self.tails.shape
         columns, D = (v[:, None], 1) if v.ndim == 1 else (v, v.shape[1])

@@ -76,7 +76,7 @@ class Elimination:
 
     @property
     def is_dense(self) -> bool:
-        """Whether the few frames are all in the dense rest: products with the whole matrix take one call then."""
+        """Whether the few frames are all in the dense rest: the factor is one of LAPACK then."""
         return 0 < self.n <= FEW and not self.groups
 
     @cached_property
