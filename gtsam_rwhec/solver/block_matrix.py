@@ -138,8 +138,9 @@ class BlockMatrix:
     def factor(self) -> BlockFactor | None:
         """The Cholesky factor; None when a pivot is not a positive, finite number."""
         if self.order.is_dense:
+            n, m, q = self.tails.shape
             rest = dense_factor(self.dense().T)
-            return None if rest is None else BlockFactor(self.order, self.tails.shape, [], [], rest)
+            return None if rest is None else BlockFactor(self.order, (n, m, q), [], [], rest)
         factorisation = _Factorisation(self)
         rest = factorisation.run(keep=True)
         if rest is None:
