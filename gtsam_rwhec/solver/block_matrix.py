@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -22,7 +23,7 @@ from gtsam_rwhec.solver.elimination import Elimination, Group
 AT_ONCE = 1_000_000
 #: Up to this many numbers are summed one by one.
 FEW_NUMBERS = 4096
-#: Of up to this many rows it is asked whether each is named once.
+#: Of up to this many rows it is asked whether each is named once; a matrix of so many is multiplied as one array.
 FEW_ROWS = 64
 #: `AT_ONCE` for frames with the same neighbours: these numbers fit in the processor's cache.
 ALIKE_AT_ONCE = 100_000
@@ -101,6 +102,8 @@ class BlockMatrix:
         def of(blocks: Array) -> Array:
             return (np.abs(blocks) if absolute else blocks).astype(v.dtype, copy=False)
 
+        if self.order.is_dense and self.size <= FEW_ROWS:
+            return np.asarray(of(self._whole) @ v)
         n, m, _ = self.tails.shape
         columns, D = (v[:, None], 1) if v.ndim == 1 else (v, v.shape[1])
         of_frames, of_tail, tails = columns[: n * m].reshape(n, m, D), columns[n * m :], of(self.tails)
@@ -112,6 +115,11 @@ class BlockMatrix:
             sum_into(result, first[at], np.matmul(blocks, of_frames[second[at]]))
             sum_into(result, second[at], np.matmul(blocks.transpose(0, 2, 1), of_frames[first[at]]))
         return np.concatenate([result.reshape(n * m, D), last]).reshape(v.shape)
+
+    @cached_property
+    def _whole(self) -> Array:
+        """`dense`, for products with several vectors."""
+        return self.dense()
 
     def dense(self) -> Array:
         """As one array; for small matrices."""
@@ -129,6 +137,10 @@ class BlockMatrix:
 
     def factor(self) -> BlockFactor | None:
         """The Cholesky factor; None when a pivot is not a positive, finite number."""
+        if self.order.is_dense:
+            n, m, q = self.tails.shape
+            rest = dense_factor(self.dense().T)
+            return None if rest is None else BlockFactor(self.order, (n, m, q), [], [], rest)
         factorisation = _Factorisation(self)
         rest = factorisation.run(keep=True)
         if rest is None:
@@ -168,6 +180,8 @@ class BlockFactor:
 
     def solve(self, v: Array) -> Array:
         """Solve for columns (n m + q, c)."""
+        if self.order.is_dense:
+            return np.asarray(scipy.linalg.lapack.dpotrs(self.rest, v, lower=1)[0])
         n, m, q = self.shape
         c = v.shape[1]
         x = np.zeros((n + 1, m, c))
@@ -231,15 +245,9 @@ class _Factorisation:
                     self.rows.append(of_group)
             rest = self._dense_rest()
             del self.changes, self.frames
-            # LAPACK's own routine, in place; its upper triangle is zero afterwards.
-            factor, failed = scipy.linalg.lapack.dpotrf(rest, lower=1, clean=1, overwrite_a=1)
         except np.linalg.LinAlgError:
             return None
-        # LAPACK may let NaN and infinity pass as pivots; the diagonal then has them.
-        if failed or not np.isfinite(np.diagonal(factor)).all():
-            return None
-        result: Array = factor
-        return result
+        return dense_factor(rest)
 
     def _blocks(self, edges: np.ndarray) -> Array:
         """Couplings (k,) as they are now, (k, m, m); one past the last for none."""
@@ -300,6 +308,13 @@ class _Factorisation:
         full[: r * m, r * m :] = self.tails[rest].reshape(r * m, q)
         full[r * m :, r * m :] = self.tail
         return full.T  # only the lower triangle of this is read
+
+
+def dense_factor(matrix: Array) -> Array | None:
+    """The Cholesky factor of a matrix in Fortran's order, in its place; None where a pivot is not positive, finite."""
+    factor, failed = scipy.linalg.lapack.dpotrf(matrix, lower=1, clean=1, overwrite_a=1)
+    # LAPACK may let NaN and infinity pass as pivots; the diagonal then has them.
+    return None if failed or not np.isfinite(np.diagonal(factor)).all() else np.asarray(factor)
 
 
 def _portions(group: Group, width: int) -> Iterator[slice]:

@@ -229,7 +229,7 @@ class _Lagrangian:
         value_error = evaluation.cost_error + gamma(20 * n + 8) * float(np.abs(multipliers * constraints).sum())
         value_error += gamma(8) * (abs(evaluation.cost) + abs(linear) + abs(value))
         Lambda, size = multiplier_blocks(multipliers)
-        r = np.c_[point.numbers[:, 4:], np.ones(n)]
+        r = np.concatenate([point.numbers[:, 4:], np.ones((n, 1))], axis=1)
         g, g_error = evaluation.gradient.copy(), evaluation.gradient_error.copy()
         of_numbers, of_errors = g[:-1].reshape(n, 13), g_error[:-1].reshape(n, 13)
         of_numbers[:, 4:] -= np.einsum("nij,nj->ni", Lambda[:, :9], r)

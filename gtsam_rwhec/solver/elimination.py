@@ -69,7 +69,15 @@ class Elimination:
 
         When at most ``few`` frames are left, they are one dense matrix.
         """
-        return _Ordering(n, np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)).run(few)
+        first, second = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
+        if n <= few:
+            return Elimination(n, first, second, len(first), np.full(len(first), len(first)), (), np.arange(n))
+        return _Ordering(n, first, second).run(few)
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether the few frames are all in the dense rest: the factor is one of LAPACK then."""
+        return 0 < self.n <= FEW and not self.groups
 
     @cached_property
     def number_changed(self) -> int:
@@ -79,7 +87,7 @@ class Elimination:
     @cached_property
     def neighbours(self) -> np.ndarray:
         """The number of frames that each frame is coupled with before the elimination, (n,)."""
-        return np.bincount(np.r_[self.first[: self.given], self.second[: self.given]], minlength=self.n)
+        return np.bincount(np.concatenate([self.first[: self.given], self.second[: self.given]]), minlength=self.n)
 
     @cached_property
     def eliminated(self) -> int:

@@ -170,6 +170,8 @@ def free_directions_of(
 
     ``reasons``: the reason of each frame, from ``reason_for``.
     """
+    if basis.shape[1] == 0:
+        return ()
     weighed = basis / _units(len(names), length_m)[:, None]
     return tuple(_record(names, column, length_m, reasons) for column in weighed.T)
 

@@ -370,7 +370,7 @@ class MeasuredForm:
             shares = 0.5 * self.slots.summed(value * factor, at_pairs)
             slack = 0.5 * self.slots.summed((error + gamma(E + 40) * np.abs(value)) * np.abs(factor), at_pairs)
             of_fixed = self._of_fixed[at_pairs]
-            slack[:, ALPHA] += 0.5 * np.einsum("esk,esk->e", of_fixed, np.abs(value[:, :6]).reshape(k, 2, 3))
+            slack[:, ALPHA] += 0.5 * (of_fixed.reshape(k, 6) * np.abs(value[:, :6])).sum(axis=1)
             for of_pairs, out in ((shares, result), (slack, bound)):
                 frames = np.zeros((n, 13))
                 for index, side in zip(self.slots.frames[at_pairs].T, SIDES, strict=True):

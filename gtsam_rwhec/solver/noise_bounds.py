@@ -114,8 +114,7 @@ def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]
     values, vectors = np.linalg.eigh(I_R + I_t)
     known = values > ROUNDING * values.max(initial=0.0)
     root = vectors[:, known] / np.sqrt(values[known])
-    by_translations = float(np.einsum("ik,ij,jk->", root, I_t, root))
-    by_rotations = float(np.einsum("ik,ij,jk->", root, I_R, root))
+    by_translations, by_rotations = (float((root * (info @ root)).sum()) for info in (I_t, I_R))
     return max(3 * N - by_translations, 0.0), max(3 * N - by_rotations, 0.0)
 
 

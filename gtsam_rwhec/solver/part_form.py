@@ -34,9 +34,8 @@ def is_worth_a_step(curvature: Curvature, evaluation: Evaluation) -> bool:
     g = _tangent_gradient(evaluation)
     scale = np.abs(curvature.diagonal)
     frames = scale[:-1].reshape(-1, 13)
-    by_tangent = np.append(
-        np.c_[frames[:, :4], np.repeat(frames[:, 4:].mean(axis=1)[:, None], 3, axis=1)].ravel(), scale[-1]
-    )
+    of_turns = np.repeat(frames[:, 4:].mean(axis=1, keepdims=True), 3, axis=1)
+    by_tangent = np.append(np.concatenate([frames[:, :4], of_turns], axis=1).ravel(), scale[-1])
     gain = float((g**2 / np.maximum(by_tangent, 1e-290)).sum())
     return gain > WORTH * evaluation.cost
 
@@ -76,7 +75,7 @@ def _tangent_gradient(evaluation: Evaluation) -> Array:
     n = len(point.numbers)
     gradient = evaluation.gradient[:-1].reshape(n, 13)
     turning = np.matmul(tangent_basis(point.rotations).transpose(0, 2, 1), gradient[:, 4:, None])[:, :, 0]
-    return np.append(np.c_[gradient[:, :4], turning].ravel(), evaluation.gradient[-1])
+    return np.append(np.concatenate([gradient[:, :4], turning], axis=1).ravel(), evaluation.gradient[-1])
 
 
 #: Up to this many frames, the search uses Q' as one matrix.

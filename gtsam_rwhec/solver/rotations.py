@@ -67,7 +67,7 @@ WITH_CONSTANT = CONSTRAINTS[:, 9, 9] != 0.0
 
 def constraint_values(R: Array) -> Array:
     """y'A y of the 20 constraints at stored rotations (n, 20): rounding errors of R, right to their last digit."""
-    y = np.c_[vec(R), np.ones(len(R))]
+    y = np.concatenate([vec(R), np.ones((len(R), 1))], axis=1)
     p, q, factor = _TERMS
     exact = product(y[:, p], y[:, q])
     result: Array = Doubled(exact.hi * factor, exact.lo * factor).summed(axis=2).value
@@ -104,11 +104,9 @@ def tangent_curvature(R: Array, q: Array) -> Array:
 
 def retract(R: Array, w: Array) -> Array:
     """R exp(w^); one Newton-Schulz step brings it back to SO(3), so that rounding does not add up."""
-    theta2 = (w * w).sum(axis=1)[:, None, None]
-    theta = np.sqrt(theta2)
+    half = np.maximum(0.5 * np.sqrt((w * w).sum(axis=1)), 1e-100)[:, None, None]
     W = np.einsum("nk,kij->nij", w, HATS)
-    first = np.sinc(theta / np.pi)
-    second = 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
+    first, second = 0.5 * np.sin(2.0 * half) / half, 0.5 * (np.sin(half) / half) ** 2
     S = R @ (np.eye(3) + first * W + second * (W @ W))
     result: Array = 1.5 * S - 0.5 * S @ (S.transpose(0, 2, 1) @ S)
     return result
