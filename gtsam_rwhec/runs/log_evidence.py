@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import decode_gray
 from gtsam_rwhec.detect.pictures import draw_errors, jpeg_of
@@ -54,7 +53,7 @@ from gtsam_rwhec.results.proof_spectrum import proof_of
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.residual_evidence import residuals_of
 from gtsam_rwhec.results.result_judgement import shortage
-from gtsam_rwhec.results.scene_evidence import SceneEvidence, scene_of
+from gtsam_rwhec.results.scene_evidence import scene_of
 from gtsam_rwhec.results.weak_poses import weak_directions
 from gtsam_rwhec.rig import CameraLink, Rig, RigFrames, rig_text
 from gtsam_rwhec.rig.exported_files import copied_texts
@@ -153,12 +152,6 @@ def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
     return dict(seen)
 
 
-def camera_of(solved: Solved, sensor: str) -> Camera:
-    """A sensor's camera: with the intrinsics that were estimated, where they were."""
-    found = solved.refined.intrinsics.get(sensor)
-    return solved.cameras[sensor] if found is None else found.camera
-
-
 #: Width in pixels of the page's contact sheet, and the most bytes of the sheet and of each picture of an image.
 SHEET_WIDTH, SHEET_BYTES, PICTURE_BYTES = 1200, 500_000, 90_000
 #: Bytes. If images are not found by their stamps, a log of at most this size is read through for them.
@@ -185,7 +178,8 @@ def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvid
     """The evidence of what a cleaned log's sensors saw; without `pictures` it has neither images nor their names."""
     views = seen_views(solved, log)
     found = solved.refined.reprojection
-    cameras = {sensor: camera_of(solved, sensor) for sensor in views}
+    estimated = {name: one.camera for name, one in solved.refined.intrinsics.items()}
+    cameras = {sensor: estimated.get(sensor, solved.cameras[sensor]) for sensor in views}
     of_tracks = solved.log.detection.corner_px
     rated = rated_views(
         views,
@@ -213,7 +207,7 @@ def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvid
         removed_list=removed_list(solved.pairs, name_of),
         cameras=seen_cameras(rated, cameras, found),
         worst=tuple(_drawn(one, name_of(one.sensor, one.view.stamp_ns), images) for one in worst),
-        sheet=_sheet(pictures),
+        sheet=small_sheet(pictures.sheet) if pictures and pictures.may_show and pictures.sheet else None,
         no_pictures=why_not,
     )
 
@@ -299,12 +293,6 @@ def _drawn(one: RatedView, name: str, images: Mapping[tuple[str, int], ImageReco
     return record.model_copy(update={"magnified": drawn.magnified, "picture": jpeg_of(drawn.picture, PICTURE_BYTES)})
 
 
-def _sheet(pictures: Pictures | None) -> bytes | None:
-    if pictures is None or pictures.sheet is None or not pictures.may_show:
-        return None
-    return small_sheet(pictures.sheet)
-
-
 def small_sheet(path: Path) -> bytes | None:
     """The contact sheet for a page, as JPEG; None if there is no sheet."""
     if not path.is_file():
@@ -326,11 +314,14 @@ def evidence_of_log(
     The cleaned `log` has the corners, `sources` are the files that the measurements come from, and `pictures` is where
     images are; without it the evidence has none.
     """
+    rig = calibrated.rig
+    carriers = rig.carriers.sensors, rig.carriers.targets
+    targets = {target.name: target for target in rig.target_list}  # as the rig file states them
     inputs = Inputs(
         files=input_files(sources),
         command=_command(sources),
         versions=versions(),
-        rig_file=rig_text(calibrated.rig),
+        rig_file=rig_text(rig),
         copies=copied_texts(frames_of(calibrated)),
     )
     model = LinearModel.of(rows_of_log(by_estimated_intrinsics(calibrated, log)), calibrated.calibration)
@@ -338,20 +329,12 @@ def evidence_of_log(
         derived=derived_of(calibrated.calibration),
         proof=proof_of(calibrated.solution, calibrated.problem),
         weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
-        scene=_scene(calibrated),
+        scene=scene_of(calibrated.calibration, rows_of_log(calibrated), carriers, calibrated.cameras, targets),
         seen=seen_in_log(calibrated, log, pictures),
         residuals=None if model is None else residuals_of(model, calibrated.calibration),
         contribution=None if model is None else contribution_of(model),
         inputs=inputs.with_options(calibrated.calibration.options),
     )
-
-
-def _scene(calibrated: Calibrated) -> SceneEvidence | None:
-    """The rig in space, with its boards as the rig file states them."""
-    rig = calibrated.rig
-    names = rig.carriers.sensors, rig.carriers.targets
-    targets = {target.name: target for target in rig.target_list}
-    return scene_of(calibrated.calibration, rows_of_log(calibrated), names, calibrated.cameras, targets)
 
 
 def rows_of_log(calibrated: Solved) -> dict[Pair, MeasuredRows]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from rwhec_factors import se3
 
@@ -29,20 +27,6 @@ QUIETEST = OdometryNoise(1e-6, 1e-6)
 OF_MEDIAN = 1.4826
 
 
-@dataclass(frozen=True, eq=False)
-class OdometryWindows:
-    """Motions over successive windows of time."""
-
-    window_s: float
-    end_ns: np.ndarray  #: (N,): the ends of the windows, on the sensor's clock
-    #: A, B: (N, 4, 4): T_before_after of the carriers (metres), and of the sensor (in its own lengths)
-    A: Array
-    B: Array
-    covariance: Array  #: (N, 6, 6): of B, rotation first, right perturbation
-    noise: OdometryNoise  #: As stated, or found from what both motions must have in common
-    reasons: tuple[str, ...]  #: Why a window is not used; empty where it is
-
-
 def odometry_windows(
     track: OdometryTrack,
     path: Trajectory,
@@ -50,12 +34,12 @@ def odometry_windows(
     source: OdometrySource,
     cleaning: Cleaning,
     max_gap_s: float,
-) -> OdometryWindows:
-    """Windows of an odometry against the carriers' path (T_sensorcarrier_targetcarrier over time).
+) -> tuple[MeasuredPairs, float]:
+    """Motions over windows of an odometry, against the carriers' path (T_sensorcarrier_targetcarrier over time).
 
     The chosen length has the most information on the rotation: the sum over windows of |R - I|_F^2 / T, since the
     variance of a random walk grows with the window's length T. `offset_s` is added to the sensor's stamps to get the
-    carriers' stamps. `max_gap_s` limits gaps between the carriers' poses.
+    carriers' stamps. `max_gap_s` limits gaps between the carriers' poses. Returns the length too, seconds.
     """
     own = Trajectory(np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor), track.sensor)
     step = float(np.median(np.diff(own.stamps_ns))) * 1e-9
@@ -79,7 +63,8 @@ def odometry_windows(
     reasons = _reasons(own, path, edges_ns, edges_of_path_ns, A, chosen_s, source, cleaning, max_gap_s)
     used = np.array([not reason for reason in reasons], dtype=bool)
     noise = track.noise or found_noise(A[used], B[used], chosen_s, has_unknown_scale=track.has_unknown_scale)
-    return OdometryWindows(chosen_s, edges_ns[:, 1], A, B, covariances(B, chosen_s, noise), noise, reasons)
+    covariance = covariances(B, chosen_s, noise)
+    return MeasuredPairs(A, B, edges_ns[:, 1], covariance, reasons, track.sensor, track.sensor), chosen_s
 
 
 def covariances(B: Array, window_s: float, noise: OdometryNoise) -> Array:
@@ -213,23 +198,14 @@ def odometry_pairs(log: Log, rig: Rig, sensor: str, motion: CarrierMotion) -> tu
     track = read_odometry(log, rig, sensor)
     section = rig.odometries[sensor]
     offset_s, sigma_s = _time_offset(track, rig, motion.trajectory)
-    windows = odometry_windows(
+    pairs, window_s = odometry_windows(
         track, motion.trajectory, offset_s, section.odometry, rig.cleaning, rig.carriers.max_gap_s
-    )
-    pairs = MeasuredPairs(
-        target=sensor,
-        sensor=sensor,
-        stamps_ns=windows.end_ns,
-        B=windows.B,
-        covariance=windows.covariance,
-        reasons=windows.reasons,
-        A=windows.A,
     )
     if pairs.used.sum() < FEWEST_USED:
         removed = ", ".join(f"{why}: {count}" for why, count in pairs.count.removed.items()) or "none was removed"
         raise LogError(
             f"{rig.source.place(('sensors', sensor))}: {section.odometry.place} has {int(pairs.used.sum())} windows of "
-            f"{windows.window_s:g} s to compare with the carriers' motion, of {len(pairs.B)} ({removed}). Are both of "
+            f"{window_s:g} s to compare with the carriers' motion, of {len(pairs.B)} ({removed}). Are both of "
             "one drive and of one clock? Else leave the sensor out"
         )
     return pairs, offset_s, sigma_s

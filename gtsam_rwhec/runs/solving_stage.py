@@ -18,10 +18,10 @@ from gtsam_rwhec.calibration.stages import calibrate
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_evidence import IntrinsicsEvidence
-from gtsam_rwhec.errors import CameraError, LogError, RwhecWarning
+from gtsam_rwhec.errors import CameraError, LogError, RwhecError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.fit_options import CornerOptions, RefineOptions
-from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
+from gtsam_rwhec.fitting.refined import PairNoise, Refined, RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -36,7 +36,6 @@ from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_solving
 from gtsam_rwhec.runs.clocks_by_turning import late_clocks
-from gtsam_rwhec.runs.comparable_noise import with_comparable_noise
 from gtsam_rwhec.runs.doubted_statements import continued_boards, doubted_intrinsics, doubted_shapes, finding_against
 from gtsam_rwhec.runs.log_corners import LogCorners
 from gtsam_rwhec.runs.log_findings import (
@@ -242,6 +241,45 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
     return Calibrated(
         refined, refined.solution, measured, fields, dict(log.cameras), rig, calibration.judgement, calibration, counted
     )
+
+
+def with_comparable_noise(
+    pairs: Pairs, rig: Rig, motion: CarrierMotion, offsets_s: Mapping[str, float], tell: Progress
+) -> Pairs:
+    """The pairs, with covariances of the targets' poses that fit their residuals with the targets alone.
+
+    One variance factor is estimated for targets and motions together, so the ratios of their covariances must be right.
+
+    The pairs are unchanged if the rig file states the noise, if there is no odometry or no target, or if a calibration
+    with the targets alone fails.
+    """
+    targets = {pair: one for pair, one in pairs.items() if not pair.is_motion and one.used.any()}
+    if rig.noise != "estimate" or not targets or not any(pair.is_motion for pair in pairs):
+        return pairs
+    tell("finding the noise of the targets' poses")
+    problem = problem_of(targets, rig, offsets_s)
+    options = RefineOptions(
+        noise="estimate", robust=rig.cleaning.robust, carrier_noise=motion.noise, carrier_model="propagated"
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            noise = refine(problem, solve(problem), options, progress=tell).noise
+    except RwhecError:
+        return pairs  # all measurements together may have an answer, under weights that are guessed
+    return pairs | {pair: _with_noise(one, noise[pair]) for pair, one in targets.items() if pair in noise}
+
+
+def _with_noise(measured: MeasuredPairs, noise: PairNoise) -> MeasuredPairs:
+    """Scale the covariances so that their median is `noise`; without any, use `noise` for all measurements."""
+    variances = np.array([noise.rotation_rad**2] * 3 + [noise.translation_m**2] * 3)
+    if measured.covariance is None:
+        covariance = np.tile(np.diag(variances), (len(measured.B), 1, 1))
+        return replace(measured, covariance=covariance)
+    diagonal = np.diagonal(measured.covariance[measured.used], axis1=1, axis2=2)
+    stated = np.repeat(np.median(diagonal.reshape(-1, 2, 3).mean(axis=2), axis=0), 3)
+    by = np.sqrt(variances / stated)
+    return replace(measured, covariance=by[:, None] * measured.covariance * by)
 
 
 def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progress | None) -> Refined:

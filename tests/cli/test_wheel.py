@@ -25,9 +25,9 @@ CELL = REPOSITORY / "data" / "cell"
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with both sdists, and the wheels that are built of the sdists, not of the checkout."""
     folder = tmp_path_factory.mktemp("built")
-    for source in (REPOSITORY, REPOSITORY / "factors"):
-        command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)]
-        subprocess.run(command, capture_output=True, check=True)
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder)]
+    both = [subprocess.Popen([*command, str(source)]) for source in (REPOSITORY, REPOSITORY / "factors")]
+    assert [process.wait() for process in both] == [0, 0]
     return folder
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 import pytest
-from bad_logs import MOVING, RECORDED, WITH_IMAGES, calibrate, images, picture, refused, restamped, since_1970
-from synthetic_logs import BEGIN_NS
+from bad_logs import MOVING, RECORDED, WITH_IMAGES, images, picture, refused, restamped, since_1970
+from synthetic_logs import BEGIN_NS, rig_text, solved
 
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import LogWarning, StampError
@@ -57,7 +57,7 @@ def test_no_time_offset_joins_clocks_of_different_years(tmp_path: Path) -> None:
     """The other sensor keeps its answer."""
     messages = restamped(RECORDED, "/cam_1/tags", since_1970)
     with pytest.warns(LogWarning) as said:
-        calibrated = calibrate(tmp_path, messages, cam_1=ESTIMATED)
+        calibrated = solved(tmp_path, messages, rig_text(cam_1=ESTIMATED))
     (warning,) = [str(one.message) for one in said if issubclass(one.category, LogWarning)]
     for words in ("cam_1: no offset of up to 1 s", "1.220 to 4.820 s", "1700000000.000", "another clock?"):
         assert words in warning

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from ros2_twin import CELL, write_twins
+from typer.testing import CliRunner, Result
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.logs import ImageRecord, open_log
 
 IMAGES = 5
@@ -20,17 +19,11 @@ IMAGES = 5
 IMAGES_OF_INIT = 1
 
 
-def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
-    done = subprocess.run(
-        [sys.executable, "-m", "gtsam_rwhec", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
-    )
-    assert done.returncode == status, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
+def run(*arguments: object, status: int = 0) -> Result:
+    """Run the command to its end; other tests run it in a process of its own."""
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    assert done.exit_code == status, done.output
     return done
 
 

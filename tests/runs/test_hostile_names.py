@@ -1,7 +1,4 @@
-"""Names that mean harm, in folders and in logs: no text of a stranger steers the terminal, fills it, or ends a comment.
-
-The command runs as people run it, in a process of its own.
-"""
+"""Names that mean harm, in folders and logs: no text of a stranger steers the terminal, fills it, or ends a comment."""
 
 from __future__ import annotations
 
@@ -9,8 +6,6 @@ import ast
 import json
 import os
 import shutil
-import subprocess
-import sys
 import xml.dom.minidom
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +14,10 @@ import pytest
 import synthetic_logs as made
 import yaml
 from places import DEMO
+from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.rig import RigFrames
 from gtsam_rwhec.rig.exported_files import export_all
 from gtsam_rwhec.runs.output_folder import LIST_FILE
@@ -36,16 +33,12 @@ HOSTILE = STEERING + LINES + LONG
 FILE_NAMES = ((STEERING + LINES).replace("/", "|"), ".. [red] -rf")
 
 
-def run(*arguments: object, status: int, cwd: Path | None = None) -> str:
+def run(*arguments: object, status: int) -> str:
     """Run the command; what it prints can neither steer a terminal nor fill it."""
-    done = subprocess.run(
-        [sys.executable, "-m", "gtsam_rwhec", *map(str, arguments)],
-        capture_output=True,
-        cwd=cwd,
-        env={**os.environ, "PYTHONIOENCODING": "utf-8", "PYTHONUTF8": "1"},
-    )
-    text = done.stdout.decode() + done.stderr.decode()
-    assert done.returncode == status, text[:3000]
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    text = done.stdout + done.stderr
+    assert done.exit_code == status, text[:3000]
     assert "Traceback" not in text
     unprintable = {sign for sign in text if not sign.isprintable()} - {"\n"}
     assert unprintable == set()
@@ -110,9 +103,10 @@ def test_file_names_that_are_no_text(tmp_path: Path) -> None:
     ],
     ids=range(6),
 )
-def test_arguments(arguments: list[object], tmp_path: Path) -> None:
+def test_arguments(arguments: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A shell writes the names of files into a command line, so they may come from strangers too."""
-    run(*arguments, status=2, cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    run(*arguments, status=2)
 
 
 def hostile_log(path: Path) -> Path:

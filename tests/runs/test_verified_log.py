@@ -14,8 +14,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.failures import ExitStatus
 from gtsam_rwhec.errors import FrameError, LogError
-from gtsam_rwhec.runs.old_calibration import OldCalibration, with_cameras
-from gtsam_rwhec.runs.verified_log import verify_log
+from gtsam_rwhec.runs.verified_log import OldCalibration, verify_log, with_cameras
 
 #: Three of the old calibration's joint deviations and more: 4 mm and 0.3 degrees.
 KNOCK = se3.expmap(np.array([[0.0, 0.005, 0.0, 0.004, 0.0, 0.0]]))[0]
