@@ -19,12 +19,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 #: What the sources may weigh. Lower a number when they become lighter; raise it only with a reason in the commit.
 BUDGET = {
-    "lines": 85_300,
-    "code": 53_700,
-    "files": 370,
+    "lines": 82_300,
+    "code": 51_150,
+    "files": 364,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 64_900,
+    "lines of tests and benchmarks": 63_200,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
