@@ -6,7 +6,6 @@ until these stay the same. A wrong size makes outliers, and a late clock too: bo
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -32,6 +31,7 @@ from gtsam_rwhec.fitting.robust_solution import NoiseScale
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import summed_again
 from gtsam_rwhec.solver.solution import Solution, solve
 
 #: A is taken again at new offsets at most so many times.
@@ -188,7 +188,7 @@ def paired_again(problem: Problem, path: Trajectory, offsets_s: Mapping[str, flo
 def with_free_sizes(problem: Problem, targets: Collection[str]) -> Problem:
     """The problem with the sizes of some targets estimated, beside those that are already."""
     free = {*targets, *_estimated(problem)}
-    result = copy.copy(problem)  # the measurements are shared, what was stated is not
+    result = summed_again(problem)
     known = {pair.target: problem.fixed_scales.get(pair.target, 1.0) for pair in problem.pairs}
     result.scale = "per_target"
     result.fixed_scales = {name: scale for name, scale in known.items() if name not in free}

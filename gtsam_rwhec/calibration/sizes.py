@@ -8,7 +8,6 @@ is estimated again under the whole model of the noise; where there is none, bloc
 
 from __future__ import annotations
 
-import copy
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,7 @@ from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.problem.selection import selected, summed_again
 from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
@@ -150,7 +149,7 @@ def sizes(
     if problem.scale != "known" or not problem.has_measurements or not problem.pairs:
         return ()
     (progress or silent)("looking at the targets' sizes")
-    free = copy.copy(problem)  # the measurements are shared, what was stated is not
+    free = summed_again(problem)
     free.scale, free.fixed, free.priors = "per_target", dict(problem.fixed), dict(problem.priors)
     # Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are.
     for name in {pair.target for pair in free.pairs} & set(free.fixed):

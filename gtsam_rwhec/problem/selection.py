@@ -31,6 +31,11 @@ class VarianceFactors(NamedTuple):
 AS_STATED = VarianceFactors(1.0, 1.0)
 
 
+def summed_again(problem: Problem) -> Problem:
+    """A copy whose sums have B's rotations: an unknown size needs them, and with known sizes they may be left out."""
+    return problem.with_measurements({pair: problem.measurements(*pair) for pair in problem.pairs})
+
+
 def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
     """The problem with some of its measurements only.
 

@@ -36,6 +36,17 @@ def test_a_wrong_size_is_doubted_and_the_right_one_is_not() -> None:
     assert right.scale == pytest.approx(1.0, abs=0.005)
 
 
+def test_a_wrong_size_among_pairs_that_were_added_at_once_is_doubted() -> None:
+    """Their sums of B's rotations, which an unknown size needs, are not kept where sizes count as known."""
+    apart, together = with_wrong_size(1.03, 200), rw.Problem()
+    raw = [apart.measurements(*pair) for pair in apart.pairs]
+    A, B = (np.concatenate([getattr(one, name) for one in raw]) for name in "AB")
+    together.add_many(apart.pairs, np.repeat([0, 1], 200), A, B)
+    one, other = (rw.calibrate(problem, rw.CalibrateOptions(sizes="check")) for problem in (apart, together))
+    assert [size.target for size in other.sizes if size.is_doubted] == ["target0"]
+    assert [size.scale for size in other.sizes] == pytest.approx([size.scale for size in one.sizes], rel=1e-9)
+
+
 def test_right_sizes_are_not_doubted() -> None:
     assert [size.is_doubted for size in sizes(with_wrong_size(1.0))] == [False, False]
 
