@@ -184,7 +184,7 @@ def _factor_of_part(whole: _Whitened, rows: slice, effects: Mapping[int, ArrayLi
         raise ValueError(f"{rows} of {len(whole.whitening)} measurements holds none, or has a step; give slice(i, j)")
     keys, whitening, own = whole.keys, whole.whitening[rows], slice(6 * first, 6 * end)
     check_keys(keys + list(effects))
-    # Of x_k the residual is a linear function: one constant Jacobian of all, and the same by variable.
+    # The residual is linear in x_k: the Jacobian is constant, for all variables together and for each one.
     linear = [-_rows(whitening @ checked_effect(effect, key, end - first)) for key, effect in effects.items()]
     of_all = np.hstack(linear) if linear else np.zeros((len(whitening), 0))
     dimensions = {key: block.shape[1] for key, block in zip(effects, linear, strict=True)}

@@ -237,7 +237,7 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class LongTranslations:
-    """The median sizes of A's and B's translations in a batch (m) that are too long, by "A" and "B", and where.
+    """Which translations of a batch are too long: median size (m) by "A" and "B", and the batch's name.
 
     ``from_corners``: B was computed from corners, in the unit of their board.
     """
@@ -258,7 +258,7 @@ class LongTranslations:
 
 
 def warn_of_millimetres(found: Sequence[LongTranslations], stacklevel: int) -> None:
-    """Warn once of all batches whose translations look like millimetres."""
+    """One warning for all batches whose translations look like millimetres."""
     long = [each for each in found if each.sizes]
     if not long:
         return

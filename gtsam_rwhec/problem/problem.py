@@ -109,7 +109,7 @@ class Problem(Knowledge):
         self._kind: dict[str, Literal["target", "sensor"]] = {}
         self._kept: dict[Pair, KeptMeasurements] = {}
         self._accumulator = Accumulator()
-        self._long: frozenset[str] = frozenset()  # of "A" and "B", those whose millimetres were warned of
+        self._long: frozenset[str] = frozenset()  # which of "A" and "B" had the millimetre warning
 
     # -- measurements -------------------------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from gtsam_rwhec.solver.elimination import Elimination, Group
 AT_ONCE = 1_000_000
 #: Up to this many numbers are summed one by one.
 FEW_NUMBERS = 4096
-#: Of up to this many rows it is asked whether each is named once; a matrix of so many is multiplied as one array.
+#: At most this many indices are checked for repetition; a dense matrix up to this size is multiplied as one array.
 FEW_ROWS = 64
 #: `AT_ONCE` for frames with the same neighbours: these numbers fit in the processor's cache.
 ALIKE_AT_ONCE = 100_000
@@ -175,11 +175,11 @@ class BlockFactor:
         return whole
 
     def solve_vector(self, v: Array) -> Array:
-        """Solve for one vector (n m + q,)."""
+        """Solve L L' x = v (n m + q,)."""
         return self.solve(v[:, None])[:, 0]
 
     def solve(self, v: Array) -> Array:
-        """Solve for columns (n m + q, c)."""
+        """Solve L L' x = v (n m + q, c)."""
         if self.order.is_dense:
             return np.asarray(scipy.linalg.lapack.dpotrs(self.rest, v, lower=1)[0])
         n, m, q = self.shape

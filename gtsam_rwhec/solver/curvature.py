@@ -140,7 +140,7 @@ class Curvature:
 
             shift = max(up_to, 1e-12)
             factor = scaled.plus(np.full(self.size, shift)).factor()
-            if factor is None:  # a negative eigenvalue, which the caller has been told of by other means
+            if factor is None:  # a negative eigenvalue, which the caller knows already
                 return np.array([-np.inf]), np.zeros((self.size, 1))
             operator = LinearOperator((self.size, self.size), matvec=factor.solve_vector, dtype=np.float64)
             start = np.random.default_rng(0).standard_normal(self.size)

@@ -34,7 +34,7 @@ from gtsam_rwhec.solver.noise_bounds import (
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.weak_directions import ROUNDING, Weak, unit_of, weakest
 
-#: So many pairs are tested at once.
+#: At most this many pairs are tested at once.
 TESTED_AT_ONCE = 256
 
 

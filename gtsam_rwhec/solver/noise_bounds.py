@@ -20,12 +20,12 @@ LEAST_SPARE = 0.1
 
 
 def free_threshold(squares: Array | float, fitted: Array | float, spare: Array | float) -> Array:
-    """Information up to which a direction is free, in units of the information that noise alone would create in it.
+    """A direction with no more information is free. The unit is the information that noise alone would create in it.
 
-    The information sums ``squares`` squares of noise. The direction is the weakest, so its fit removes ``fitted`` of
-    them; at least one is left. ``spare`` is the number of redundant equations from which the noise is estimated. So
-    this is an F quantile, times the share of the squares that is left. Without redundant equations only the weights
-    give the noise, and it is the chi-square quantile over ``squares``.
+    Noise alone gives a sum of ``squares`` squares. The direction is the weakest, so its fit removes ``fitted`` of them;
+    at least one is left. With ``spare`` redundant equations, which estimate the noise, the threshold is an F quantile
+    times the share of the squares that is left. With none, the weights give the noise, and the threshold is the
+    chi-square quantile over ``squares``.
     """
     left = np.maximum(np.subtract(squares, fitted), 1.0)
     quantile = fdtri(left, np.maximum(spare, LEAST_SPARE), 1.0 - SIGNIFICANCE)
@@ -120,7 +120,7 @@ def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]
 
 @dataclass(frozen=True)
 class PairNoise:
-    """Of every pair: the information that noise alone would create, a diagonal (E, 15) for each kind of residual."""
+    """The information that noise alone would create in every pair: a diagonal (E, 15) for each kind of residual."""
 
     rotation: Array
     translation: Array

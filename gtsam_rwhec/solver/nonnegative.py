@@ -67,7 +67,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
     with search.stages.of("dual certificate"):
         bounds = _bounds(search, relaxation, at_zero[0].R, positive[0].R if positive else None)
-    # A bound on the problem without the constraint also holds with it.
+    # A lower bound without the constraint alpha >= 0 is also one with the constraint.
     bound = max([*bounds, found.bound], key=lambda each: each.lower_bound)
     lower = bound.lower_bound
     if not positive or positive[0].cost > at_zero[0].cost:

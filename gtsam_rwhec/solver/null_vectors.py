@@ -35,7 +35,7 @@ PREFERENCE = 1e3
 ROUNDING_OF_MOMENTS = 2.0**-44
 #: The vectors are corrected at most this many times, by their products computed from the raw measurements.
 CORRECTIONS = 8
-#: With more vectors than this, a correction takes long, and there is only one.
+#: With more vectors than this, a correction takes long, and only one is made.
 MANY = 16
 #: Corrections continue while each one makes the form's products with the vectors smaller by this factor.
 SMALLER = 0.3

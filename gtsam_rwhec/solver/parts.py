@@ -29,7 +29,7 @@ class Shared:
     pair: np.ndarray
 
     def of(self, begin: int, end: int) -> Shared | None:
-        """Those of the part's pairs from ``begin`` up to ``end``, counted from ``begin``; None where there are none."""
+        """The measurements of pairs ``begin`` up to ``end``, numbered from ``begin``; None if there are none."""
         inside = (self.pair >= begin) & (self.pair < end)
         return Shared(self.many, np.where(inside, self.pair - begin, -1)) if inside.any() else None
 

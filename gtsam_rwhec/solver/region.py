@@ -35,7 +35,7 @@ class Region:
     scale_factor: float
 
     def larger(self, times: float) -> Region:
-        """The region with so many times the radius and the factor."""
+        """The region with ``times`` the radius and ``times`` the factor."""
         return Region(times * self.radius_m, times * self.scale_factor)
 
     @staticmethod

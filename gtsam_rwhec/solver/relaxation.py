@@ -187,7 +187,7 @@ def _symmetric(M: Array) -> Array:
 
 
 def _step_length(S: Array, dS: Array, fraction: float) -> float:
-    """The longest step, up to 1, that keeps S + a dS positive definite, shortened by ``fraction``."""
+    """``fraction`` times the longest step a that keeps S + a dS positive definite; at most 1."""
     lower = np.linalg.cholesky(S + 1e-16 * np.trace(S) * np.eye(len(S)))
     half = scipy.linalg.solve_triangular(lower, dS, lower=True, check_finite=False)
     inner = scipy.linalg.solve_triangular(lower, half.T, lower=True, check_finite=False)

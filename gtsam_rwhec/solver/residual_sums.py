@@ -41,7 +41,7 @@ _KINDS = np.repeat(np.eye(2), (9, 3), axis=1)
 _T = slice(3, 12, 4)
 #: Operations of a residual in plain doubles: 24 products, a constant, and the low parts of its coefficients.
 OPERATIONS = 30
-#: From so many measurements on, sums of plain doubles are tried first: the exact ones take longer.
+#: From this many measurements on, sums of plain doubles are tried first: the exact ones take longer.
 MANY = 10_000
 #: Plain sums are used if the cost's relative error is below this: a hundredth of a percent of the tolerance.
 KNOWN = 1e-10

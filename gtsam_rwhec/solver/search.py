@@ -220,7 +220,7 @@ KNOWN = 1e-3
 #: At most this many local relaxations of a large part: each one starts from a lower answer than the one before.
 LOCAL_RELAXATIONS = 10
 #: Directions that only the noise of measured rotations determines are known from the raw measurements alone. The answer
-#: takes at most so many steps along them.
+#: takes at most this many steps along them.
 STEPS_ALONG_FREE_DIRECTIONS = 3
 
 
