@@ -21,26 +21,26 @@ from gtsam_rwhec.errors import BudgetError
 
 MIB = 1 << 20
 
-#: Bytes. A chunk of a log yields at most this much when it is opened. Recorders write chunks of 1 to 4 MiB, and larger
+#: Bytes. A chunk of a log has at most this much when decompressed. Recorders write chunks of 1 to 4 MiB, and larger
 #: ones only for larger messages, such as a raw image of 19 megapixels in colour.
 CHUNK = 56 * MIB
-#: A chunk may yield this share of the file's size more: large files may have large chunks.
+#: A chunk may have more than `CHUNK` by this share of the file's size: large files may have large chunks.
 CHUNK_SHARE = 0.25
-#: Bytes. Chunks that overlap in time are open together; they and what is decoded of them take at most this much.
+#: Bytes. Chunks that overlap in time are open together; they and their decoded messages take at most this much.
 OPEN = 96 * MIB
-#: Chunks that are open together may take this share of the file's size more.
+#: Chunks that are open together may take more than `OPEN` by this share of the file's size.
 OPEN_SHARE = 0.5
-#: Bytes. All chunks of a log yield at most this much, which takes less than a second to open.
+#: Bytes. All chunks of a log have at most this much when decompressed, which takes less than a second.
 OPENED = 768 * MIB
-#: Opened bytes for each byte of the file: twenty times what poses reach. Only logs of nothing but black raw images
-#: reach more, and those have the room above.
+#: Decompressed bytes for each byte of the file: twenty times what poses reach. Only logs of nothing but black raw
+#: images reach more; they have `OPENED` too.
 OPENED_FOR_A_BYTE = 1024
 #: Bytes. A message in JSON or protobuf has at most this much; decoding holds up to four copies of it.
 MESSAGE = 24 * MIB
-#: A message may have this share of the file's size more, as the bytes of real images are in the file itself.
+#: A message may have more than `MESSAGE` by this share of the file's size: the file has the bytes of real images.
 MESSAGE_SHARE = 0.25
 #: Parts of a log: records, messages, metadata entries, numbers and strings that are read one by one. Each takes one or
-#: two microseconds; slower and faster ones count as more or less, see below.
+#: two microseconds; slower parts count as several, faster ones as a fraction: see the constants below.
 PARTS = 300_000
 #: Parts for each byte of the file. Poses that never move, in JSON, reach 5.
 PARTS_FOR_A_BYTE = 6
@@ -48,7 +48,7 @@ PARTS_FOR_A_BYTE = 6
 PARTS_OF_A_WALK = 2
 #: This many numbers, strings and lists in JSON count as one part.
 JSON_OF_A_PART = 4
-#: A pose in JSON or protobuf counts as this many parts, in addition to those of its text.
+#: A pose in JSON or protobuf counts as this many parts, in addition to the parts of its text.
 PARTS_OF_A_POSE = 3
 #: Parts of one message. A board of 100 x 100 squares has 20,000 numbers for its corners, and as many again in JSON.
 PARTS_OF_A_MESSAGE = 100_000
@@ -56,7 +56,7 @@ PARTS_OF_A_MESSAGE = 100_000
 LEVELS = 16
 #: Bytes. One schema's definition is read only if it has at most this much; ROS's largest have 60 kB.
 SCHEMA = MIB // 2
-#: Bytes. The definitions that are read for a log have at most this much; a second's work. Robots have up to 1 MB.
+#: Bytes. All definitions that are read for a log have at most this much, a second's work. Robots have up to 1 MB.
 SCHEMAS_READ = 2 * MIB
 #: Bytes. All schemas of a log together, read or not.
 SCHEMAS = 16 * MIB
@@ -82,13 +82,13 @@ SCANS = 64
 
 
 class LogBudget:
-    """What a log of `size` bytes, of the file or of all files of a bag, may cost."""
+    """What reading a log may cost. `size` is the bytes of its file, or of all files of a bag."""
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self.chunk = CHUNK + int(CHUNK_SHARE * size)  #: bytes that one chunk may yield
+        self.chunk = CHUNK + int(CHUNK_SHARE * size)  #: decompressed bytes that one chunk may have
         self.open = OPEN + int(OPEN_SHARE * size)  #: bytes of chunks that are open together
-        self.opened = OPENED + OPENED_FOR_A_BYTE * size  #: bytes that all chunks may yield in one pass over the log
+        self.opened = OPENED + OPENED_FOR_A_BYTE * size  #: decompressed bytes of all chunks in one pass
         self.message = MESSAGE + int(MESSAGE_SHARE * size)  #: bytes of one message in JSON or protobuf
         self.parts = PARTS + PARTS_FOR_A_BYTE * size  #: parts that may be read in one pass over the log
 
@@ -118,12 +118,12 @@ class Spending:
             )
 
     def take_opened(self, count: int) -> None:
-        """Count bytes that a chunk yields, before it is opened."""
+        """Count the decompressed bytes of a chunk before it is opened."""
         self._opened += count
         self.check_opened(self._opened)
 
     def check_opened(self, total: int) -> None:
-        """Check the number of bytes that all chunks together yield."""
+        """Check the number of decompressed bytes of all chunks together."""
         if total > self.budget.opened:
             raise BudgetError(
                 f"{self.path}: its chunks yield {total} bytes or more, and those of a log of {self.budget.size} bytes "
@@ -141,6 +141,6 @@ class Spending:
 
 
 def pixel_budget(size: int, bytes_a_pixel: int) -> int:
-    """Pixels that a compressed image of `size` bytes may have, if decoding takes so many bytes for each of them."""
+    """Pixels that a compressed image of `size` bytes may have, if decoding takes `bytes_a_pixel` for each pixel."""
     by_memory = (DECODED + DECODED_FOR_A_BYTE * size) // bytes_a_pixel
     return min(PIXELS + PIXELS_FOR_A_BYTE * size, by_memory)

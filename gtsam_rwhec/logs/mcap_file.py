@@ -45,12 +45,12 @@ from gtsam_rwhec.files.whole_files import opened
 MAGIC = b"\x89MCAP0\r\n"
 #: Every record begins with its opcode and its length.
 RECORD = struct.Struct("<BQ")
-#: Reading a record raises these errors for bytes that are not one.
+#: Reading a record raises these errors if the bytes are no record.
 FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError)
 _FOOTER = struct.Struct("<BQQQI")
 #: A chunk's record begins with opcode, length, first and last log time, and the size that it states for its data.
 _CHUNK_HEAD = struct.Struct("<BQQQQ")
-#: The shortest record of a chunk has so many bytes.
+#: The shortest record of a chunk has this number of bytes.
 _SHORTEST_CHUNK = _CHUNK_HEAD.size + 4 + 4 + 8
 #: A message record begins with these fields.
 _MESSAGE_HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
@@ -364,7 +364,7 @@ class McapFile:
             at += RECORD.size + length
 
     def _stated_size(self, at: int) -> int:
-        """The size that a chunk states for its opened data; 0 if no chunk can be read there."""
+        """The size that a chunk states for its decompressed data; 0 if no chunk can be read there."""
         head = self._read(at, _CHUNK_HEAD.size)
         return int(_CHUNK_HEAD.unpack(head)[4]) if len(head) == _CHUNK_HEAD.size else 0
 

@@ -43,7 +43,7 @@ def open_log(path: str | Path | Iterable[str | Path]) -> Log:
     LogError
         A file cannot be read or is not MCAP, or there is none.
     FileFormatError
-        What is given is no path.
+        An argument is no path.
     BudgetError
         A file asks for more memory or work than one of its size may (``files/budgets.py``).
     """
@@ -183,7 +183,7 @@ class Log:
     def records_logged_at(self, topics: Iterable[str], logged_ns: Iterable[int]) -> Iterator[Record]:
         """The records of some topics whose log time is one of these, in any order: only their blocks are opened.
 
-        What cannot be read is left out without a word, since `records` names it. Raises a LogError as `records`.
+        Leaves out without a warning what cannot be read, since `records` names it. Raises a LogError as `records`.
         """
         wanted, bad = self._checked_topics(topics), _Bad("warn")
         times = np.unique(np.fromiter(logged_ns, dtype=np.uint64))

@@ -133,7 +133,7 @@ def _refuse_names(path: str, header: Sequence[str]) -> None:
 
 
 def _role(word: str) -> str:
-    """What a column is by its name: tx, qw, rz, m01, or the name itself."""
+    """The meaning of a column's name: tx, qw, rz, m01, or the name itself."""
     bare = re.sub(r"_?\[.*\]$", "", word.strip("\"' ").lower())
     bare = re.sub(r"_(mm|cm|m|deg|rad|degrees|radians)$", "", bare)
     turned = {"roll": "rx", "pitch": "ry", "yaw": "rz"}.get(re.split(r"[._/ ]", bare)[-1])
@@ -188,7 +188,7 @@ def _by_columns(
 
 
 def _seconds_and_nanoseconds(header: Sequence[str]) -> tuple[int, int] | None:
-    """The columns of a ROS stamp in two parts, such as ``secs`` and ``nsecs``; None without them."""
+    """The two columns of a ROS stamp, such as ``secs`` and ``nsecs``; None if the table lacks them."""
     words = [word.strip("\"' ").lower() for word in header]
     whole = next((i for i, word in enumerate(words) if re.search(r"(^|[._ ])secs?(onds)?$", word)), None)
     part = next((i for i, word in enumerate(words) if re.search(r"(^|[._ ])n(ano)?secs?(onds)?$", word)), None)

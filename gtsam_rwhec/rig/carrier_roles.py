@@ -43,9 +43,9 @@ LEAST_IMAGES = 6
 MOST_PAIRS = 12
 #: One role fits far better if the product of its rotation and translation residuals is smaller by this factor.
 FAR_BETTER = 9.0
-#: The better role must also have residuals below these: rotation (rad), translation (m).
+#: The better role's residuals must also be below these limits: rotation (rad), translation (m).
 EXPLAINED_RAD, EXPLAINED_M = math.radians(3.0), 0.05
-#: The assumed standard deviation of a corner, pixels, where nobody has measured it.
+#: The assumed standard deviation of a corner, pixels, if nobody has measured it.
 CORNER_PX = 0.3
 #: Images get stamps this far apart, nanoseconds; their own are not used.
 STEP_NS = 10**9
@@ -244,7 +244,7 @@ def _of_driver(sensor: str, driver: DriverTopic, path: Trajectory, targets: list
 
 
 def _camera(contents: LogContents, sensor: Sensor) -> Camera | None:
-    """The camera in the sensor's topic of intrinsics; None without one."""
+    """The camera in the sensor's topic of intrinsics; None if there is no such camera."""
     record = contents.cameras.get((sensor.intrinsics and sensor.intrinsics.topic) or "")
     if record is None:
         return None
@@ -260,7 +260,7 @@ ARM = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
 MOTION_CAPTURE = PoseNoise(rotation_deg=0.1, translation_mm=0.5)
 #: Visual or visual-inertial odometry over a room, without its drift.
 ODOMETRY = PoseNoise(rotation_deg=0.3, translation_mm=5.0)
-#: Words in names of frames and topics, by where poses come from; the first that fits counts.
+#: Words in names of frames and topics, by the source of poses that they suggest; the first word that fits counts.
 WORDS: tuple[tuple[str, PoseNoise, frozenset[str]], ...] = (
     ("motion capture", MOTION_CAPTURE, frozenset({
         "vicon", "optitrack", "mocap", "qualisys", "natnet", "phasespace", "vrpn", "motive", "rigidbody", "lighthouse",
@@ -283,9 +283,9 @@ LEAST_POSES, LEAST_HZ = 50, 15.0
 
 @dataclass(frozen=True)
 class Origin:
-    """Where poses come from, as a guess."""
+    """The guessed source of poses."""
 
-    noise: PoseNoise | None  #: A guess of their noise; None where nothing says what they come from
+    noise: PoseNoise | None  #: The guessed noise of the poses; None if their source is unknown
     words: str  #: The guess with its reasons
 
 

@@ -200,7 +200,7 @@ class PoseReading:
     """How the poses are read."""
 
     stated: PoseStatement  #: What the rig file must say
-    evidence: RoleEvidence  #: Of the poses that are read so
+    evidence: RoleEvidence  #: Evidence for this reading
     #: Evidence for the usual reading, if another reading explains the images far better
     otherwise: RoleEvidence | None
 

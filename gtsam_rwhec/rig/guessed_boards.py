@@ -28,7 +28,7 @@ from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.sections import Intrinsics
 
-#: The smallest board that is looked for, in corners or circles a side, and the largest.
+#: The smallest and the largest board that is looked for, in corners or circles a side.
 SMALLEST, LARGEST = 3, 30
 #: A board must pass in at least this number of images.
 LEAST_IMAGES = 2
@@ -43,9 +43,9 @@ Shape = Callable[[Array], tuple[int, int] | None]
 class BoardSeen:
     """A board that was found in the images."""
 
-    board: Checkerboard | CircleGrid  #: With 1 m for the length that is not known
+    board: Checkerboard | CircleGrid  #: The board, with 1 m for its unknown length
     images: tuple[int, ...]  #: The images in which it was found
-    corners_px: tuple[Array, ...]  #: tuple of (n, 2): Its corners or centres in each of them
+    corners_px: tuple[Array, ...]  #: tuple of (n, 2): The board's corners or centres in each image
     indices: tuple[np.ndarray, ...]  #: tuple of (n,): Their rows in ``board.corners()``.
 
     @property
@@ -163,11 +163,11 @@ def shifted_rows(cells: Array) -> tuple[int, int] | None:
 STATED = "stated: calibration if this camera was calibrated, with this lens and focus"
 #: A board's views determine a focal length with at least this number of images.
 LEAST_VIEWS = 6
-#: Focal lengths, over the images' width, that lenses on robots have.
+#: The focal lengths of lenses on robots, divided by the images' width.
 SHORTEST, LONGEST = 0.25, 6.0
 #: A fitted camera with a larger residual (pixels) is rejected.
 LARGEST_RMS_PX = 1.5
-#: The focal length over the width where it is unknown: about 60 degrees across.
+#: An unknown focal length, divided by the width, is assumed to be this: about 60 degrees across.
 USUAL = 0.87
 
 

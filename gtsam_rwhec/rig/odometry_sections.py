@@ -45,7 +45,7 @@ class OdometryNoiseSection(Section):
 
 
 class OdometrySource(Section):
-    """Where an odometry's poses are, in the frame in which it began, and what is known of them."""
+    """Where an odometry's poses (in the frame in which it began) are, and what is known of the poses."""
 
     model_config = one_of("topic", "tf", "file")
 

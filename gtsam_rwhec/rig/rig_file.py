@@ -185,7 +185,7 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
 
 
 def _meant(models: list[type[BaseModel]], given: dict[str, Any]) -> type[BaseModel] | None:
-    """Of the sections that may stand at a place, the one that these keys mean."""
+    """The section that these keys mean, among those that may stand at a place."""
     if models == [*KINDS.values()]:
         return KINDS.get(str(given.get("type")))
     fitting = [each for each in models if ("odometry" in given) == ("odometry" in keys_of(each))]

@@ -89,7 +89,7 @@ def number(value: float) -> str:
 
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
-    """The sections that a field's value, or an item of it, may be."""
+    """The section classes inside a field's annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in models_in(part)]
@@ -184,7 +184,7 @@ class Section(BaseModel):
 def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...] = ()) -> ConfigDict:
     """For the JSON Schema of a section: exactly one of these keys, or sets of keys, must be there.
 
-    Of each tuple in `together`, the first key needs the others.
+    In each tuple of `together`, the first key needs the others.
     """
     said: dict[str, Any] = {"oneOf": [{"required": [keys] if isinstance(keys, str) else [*keys]} for keys in choices]}
     if together:

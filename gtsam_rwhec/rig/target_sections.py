@@ -179,7 +179,7 @@ KINDS: dict[str, type[Section]] = {
 
 #: Kalibr detects this family on its AprilGrids.
 FAMILY = "tag36h11"
-#: Of each type: Kalibr's keys.
+#: Kalibr's keys of each type.
 _KEYS = {
     "aprilgrid": ("tagCols", "tagRows", "tagSize", "tagSpacing"),
     "checkerboard": ("targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters"),

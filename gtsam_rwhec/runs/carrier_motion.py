@@ -144,7 +144,7 @@ def poses_of_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
     in_order = [r.stamp_ns for r in log.records([topic]) if isinstance(r, PoseRecord)]
     check_order(np.array(in_order, dtype=np.int64), f"topic {topic}")
     series = log.poses(topic)
-    # Of several poses with the same stamp, the last one counts, as in tf.
+    # If several poses have the same stamp, the last one counts, as in tf.
     last = np.append(np.diff(series.stamps_ns) != 0, True)
     return series.stamps_ns[last], series.T[last]
 

@@ -91,8 +91,8 @@ def detect_log(
     OptionError
         `workers` or `draw` is given, and no sensor has images; or ``images="copy"``, and the log has none.
     CameraError
-        Intrinsics are to be estimated (``intrinsics: estimate``), and the images determine none.
-    LogError, StampError, TransformError, CameraError, FrameError
+        Intrinsics are to be estimated and the images determine none; or stated intrinsics cannot be used.
+    LogError, StampError, TransformError, FrameError
         The log lacks a topic of the rig file or the carriers' poses, or no target was detected.
     """
     check_writable(out_path)

@@ -24,8 +24,8 @@ from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import detections_topic, records_of
 
-#: If the ratios of fitted to stated numbers are all 0.5 or all 2 within this share, the stated ones are of another
-#: resolution.
+#: If all ratios of fitted to stated numbers differ from 0.5, or all from 2, by at most this share, the stated numbers
+#: are for another resolution.
 RESOLUTION_SHARE = 0.1
 
 

@@ -368,7 +368,7 @@ def write_report(
 
 
 def by_estimated_intrinsics(solved: Solved, log: Log) -> Solved:
-    """The same, with targets' poses computed again by the estimated intrinsics, if there are any."""
+    """The solved log, with targets' poses computed again by the estimated intrinsics, if there are any."""
     refined = solved.refined
     if refined.reprojection is None:
         return solved

@@ -61,7 +61,7 @@ def _exchange(rig: Rig) -> str:
 
 
 def _unless_carried(rig: Rig) -> str:
-    """The other cure: the carriers are as the rig file says, but their poses are the inverse of what it says."""
+    """The cure if the rig file has the right carriers: their poses are the inverse of what it says."""
     carriers, place = rig.carriers, rig.source.place
     parent, child = carriers.poses.parent_and_child
     if carriers.poses.frames is not None:

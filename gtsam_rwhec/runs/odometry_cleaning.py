@@ -29,7 +29,7 @@ LEAST_RAD_PER_S, LEAST_M_PER_S = 0.2, 0.5
 
 @dataclass(frozen=True)
 class Gates:
-    """Limits of a track's speed (m/s, rad/s): faster steps are not used, and, with `reject_jumps`, nor are jumps."""
+    """Limits of a track's speed (m/s, rad/s): faster steps are not used. `reject_jumps`: jumps are not used either."""
 
     max_speed_m_per_s: float
     max_turn_rad_per_s: float
@@ -109,14 +109,14 @@ def _smoothed(track: OdometryTrack, velocity: Array, dt: Array, good: np.ndarray
 
 
 def _off_neighbours(velocity: Array) -> Array:
-    """How far each velocity is from the mean of those before and after it."""
+    """How far each velocity is from the mean of the velocities before and after it."""
     padded = np.vstack([velocity[1:2], velocity, velocity[-2:-1]])
     off: Array = np.linalg.norm(velocity - 0.5 * (padded[:-2] + padded[2:]), axis=1)
     return off
 
 
 def _add(removed: dict[int, Removed], reason: RemovalReason, values: Array, limit: float, stamps: np.ndarray) -> None:
-    """Add the pose at the end of each step whose value exceeds the limit; one that is there keeps its first reason."""
+    """Add the pose at the end of each step whose value exceeds the limit. A pose added before keeps its reason."""
     for i in np.flatnonzero(values > limit).tolist():
         removed.setdefault(i + 1, Removed(reason, i + 1, int(stamps[i + 1]), float(values[i]), float(limit)))
 

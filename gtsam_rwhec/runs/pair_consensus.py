@@ -137,7 +137,7 @@ def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, A
 
 
 def _least_squares(rows: Array, right: Array) -> Array:
-    """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right sides (H, n, 3)."""
+    """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right-hand sides (H, n, 3)."""
     H, n, _, k = rows.shape
     inverse = np.linalg.pinv(rows.reshape(H, 3 * n, k), rcond=1e-6)
     solution: Array = np.einsum("hij,hj->hi", inverse, right.reshape(H, 3 * n))

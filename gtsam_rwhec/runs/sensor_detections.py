@@ -268,7 +268,7 @@ def detections_of_sensor(
 
 
 def _faults(log: Log, images: list[DetectedImage]) -> tuple[str, ...]:
-    """What is wrong with images; an image that was a file of a folder has its name in place of a stamp."""
+    """What is wrong with images. An image from a folder is named by its file, other images by their stamps."""
     names = log.metadata().get(IMAGES_METADATA, {})
     faulty = [image for image in images if image.found is None]
     stamped = [(image, f"topic {image.topic}, image at {image.stamp_ns} ns") for image in faulty]

@@ -29,9 +29,9 @@ READ = {
 def check_topics(log: Log, rig: Rig) -> None:
     """Check the topics that a rig file names, before anything is read.
 
-    Raises `LogError` for a topic that is not in the log, or whose type cannot be read, with the line that names it and
-    what can be read. Warns (`LogWarning`) of topics
-    whose messages are of the frame of another sensor of the rig file: then two topics were exchanged.
+    Raises `LogError` if the log lacks a topic or its type cannot be read; the message says which line of the rig file
+    names the topic, and what can be read. Warns (`LogWarning`) if the messages on a sensor's topic have the frame of
+    another sensor: the two topics may be exchanged.
     """
     there = {topic.name for topic in log.topics()}
     _check_types(log, rig)
@@ -56,7 +56,7 @@ def check_topics(log: Log, rig: Rig) -> None:
 
 
 def wanted_topics(rig: Rig) -> tuple[str, ...]:
-    """The topics that the stages read of a log, raw or with detections in it; those of tf under their usual names."""
+    """The topics that the stages read from a log, raw or with detections; tf topics have their usual names."""
     poses = rig.carriers.poses.topic
     own = (poses,) if poses is not None else tuple(f"/{name}" for name in TF_TOPICS)
     of_stage = (topic(sensor) for sensor in rig.sensors for topic in (detections_topic, pairs_topic))
@@ -100,11 +100,11 @@ def _named(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
 
 
 def _frame_of(log: Log, topic: str) -> str:
-    """The frame of the first message of a topic; empty where it has none, or cannot be read."""
+    """The frame of a topic's first message; empty if the topic has no message or cannot be read."""
     if any(each.name == topic and each.unreadable for each in log.topics()):
         return ""
     kinds = (ImageRecord, IntrinsicsRecord, DetectionRecord)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LogWarning)  # those who read all of the topic say it
+        warnings.simplefilter("ignore", LogWarning)  # the reader of the whole topic warns
         first = next((record for record in log.records([topic]) if isinstance(record, kinds)), None)
     return "" if first is None else first.frame
