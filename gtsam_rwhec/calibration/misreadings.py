@@ -287,7 +287,7 @@ def shares_of(residual: Spread, signal: Spread) -> tuple[float, float]:
 
 
 def _degrees_of_freedom(sampled: Sampled) -> int:
-    """Of the rotations alone, and of the translations alone."""
+    """Degrees of freedom of the rotations; the translations have as many."""
     return 3 * (sampled.count - sampled.unknown_poses)
 
 

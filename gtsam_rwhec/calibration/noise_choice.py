@@ -28,7 +28,7 @@ class NoiseFound:
     """The noise that a calibration assumes, one standard deviation per axis; ``str()`` is a sentence."""
 
     source: str  #: Where it comes from: "estimated from the residuals", "as given"
-    #: Of B, by pair: of the pair's median measurement, root mean square over axes
+    #: Noise of B at each pair's median measurement, root mean square over axes, by pair
     rotation_rad: dict[Pair, float]
     translation_m: dict[Pair, float]
     carriers: str  #: The noise of A, in words
@@ -73,9 +73,9 @@ def estimated(
 
     Inliers are chosen again under the noise that is found, until they stay the same.
 
-    ``inliers`` is empty where every measurement counts; ``solution`` is the certified one of the inliers. The one place
-    that decides by which model the noise is found: the whole model of ``noise_model``; where that has too few
-    measurements, or too many, or noise is given or wanted by groups, ``refine`` with the noise of B alone.
+    ``inliers`` is empty where every measurement counts; ``solution`` is the certified one of the inliers. This alone
+    decides by which model the noise is found: the whole one of ``noise_model``, or ``refine`` with the noise of B
+    alone, if noise is given, by groups, or A's with covariances, or if the whole model lacks measurements or fails.
 
     Raises
     ------

@@ -207,7 +207,7 @@ def _stated(sampled: Sampled) -> Array:
     return np.stack([rotation, np.concatenate([raw.sigma[chosen] for raw, chosen in rows])])
 
 
-#: The measurements that were left out are tested if they are at least this share of all, and so many.
+#: Measurements that were left out are tested if they are at least this share of all, and at least this many.
 SHARE_LEFT_OUT, FEWEST_LEFT_OUT = 0.25, 8
 #: The medians of its residuals, rotation times translation, are this many times smaller than those of what was kept.
 FAR_SMALLER = 25.0

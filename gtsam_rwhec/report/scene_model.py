@@ -272,9 +272,9 @@ def _pose(row: tuple[float, ...]) -> Array:
     return T
 
 
-#: A line has this share of the scene to each side, and its arrowheads and circles this one.
+#: Sizes as shares of the scene: a line to each side, and its arrowheads and circles.
 LENGTH, HEAD = 0.16, 0.022
-#: Of each direction so many frames are drawn, and of all so many lines.
+#: At most this many frames are drawn for each direction, and this many lines in all.
 MOST_FRAMES, MOST_LINES = 40, 200
 
 

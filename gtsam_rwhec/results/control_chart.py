@@ -337,7 +337,7 @@ def _fewest(
 
 
 def _variance(found: Shifts, ratio: float, spread: Spread) -> float:
-    """Of the nights beside the change, over what their covariances say."""
+    """The variance of the nights without the change, over what their covariances say."""
     if math.isinf(spread.freedom):
         return spread.variance
     left = spread.freedom * spread.variance + max(found.squares - ratio, 0.0)
@@ -373,7 +373,7 @@ class Chart:
     def next(
         self, day: float, x: Array, information: Array, spread: Spread, rate: float = RATE
     ) -> tuple[Chart, NightTest, Alarm | None]:
-        """The chart with one more night, what it says of it, and the alarm if there is one.
+        """The chart with one more night, that night's test, and the alarm if there is one.
 
         Parameters
         ----------
@@ -382,7 +382,7 @@ class Chart:
         x, information : (m,) and (m, m) arrays
             As in `Nights`.
         spread : Spread
-            What the nights before this one say.
+            How the nights before this one scatter.
         rate : float
             False alarms a night.
         """
