@@ -32,7 +32,7 @@ class NoiseFound:
     rotation_rad: dict[Pair, float]
     translation_m: dict[Pair, float]
     carriers: str  #: The noise of A, in words
-    #: All that the data say of their noise, of A's, in time and over the configuration; None where B's alone was
+    #: All that the data say about the noise of A and B, in time and over the configuration; None where B's alone was
     #: estimated, or noise was given
     model: NoiseInData | None = None
     simple: str = ""  #: Why B's alone was estimated; empty with a model

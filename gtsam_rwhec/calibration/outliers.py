@@ -160,12 +160,12 @@ def few_words(frame: str, number: int) -> str:
     return f"{frame} rests on {number} measurement{rest}"
 
 
-#: An error of so many medians is gross. Of Gaussian errors none is; of Student's t one in 4,000 with 5 degrees of
-#: freedom, one in 300 with 3.
+#: An error of this many medians is gross. No Gaussian error is; of Student's t errors, one in 4,000 with 5 degrees of
+#: freedom, and one in 300 with 3.
 GROSS = 8.0
 #: A pair with fewer rows has no median of its own; that of all pairs counts.
 FEWEST_ROWS_OF_MEDIAN = 10
-#: At most so many pairs and measurements are tested.
+#: At most this many pairs, and this many measurements, are tested.
 MOST_PAIRS_ASKED, MOST_ASKED = 200, 10_000
 #: With fewer measurements in all, a wrong one cannot be told from the others.
 FEWEST_ASKED = 8

@@ -42,7 +42,7 @@ NONE = "-"
 
 
 def corners_section(shown: ShownResult) -> Section:
-    """All of it; why it is missing where the answer is from poses."""
+    """The section; where the answer is from poses, why it is missing."""
     refined = None if shown.result is None else shown.result.refined
     if refined is None or refined.reprojection is None:
         why = "the answer is from the poses of targets: intrinsics by which these were measured count as exact."

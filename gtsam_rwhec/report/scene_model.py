@@ -79,8 +79,8 @@ class Scene:
     boards: tuple[PlacedBoard, ...]
     #: (n, 7): x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps
     path: Array
-    moving: str  #: Its name; empty where there is none
-    #: (3,): the box that holds all of it
+    moving: str  #: Name of the moving carrier; empty where there is none
+    #: (3,): corners of the box that holds the whole scene
     low: Array
     high: Array
     times: float  #: Ellipsoids are drawn so many times as large

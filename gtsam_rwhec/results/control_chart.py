@@ -35,7 +35,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 from gtsam_rwhec.results.nights import Nights, Spread, solved
 
-#: The share of false alarms that is left to "all of it moved"; the rest is for one frame alone, in equal parts.
+#: Share of the false alarms for the test that all frames moved; tests of one frame share the rest equally.
 OF_ALL = 0.1
 
 
@@ -263,8 +263,8 @@ BETTER = 2.0
 class ChangeFound:
     """What changed in a series of nights."""
 
-    #: Index of the first night after the change: it was between the night before and this one. Of a drift: the first
-    #: night that it moved.
+    #: Index of the first night after the change: it was between the night before and this one. With a drift: the
+    #: first night that it moved.
     first: int
     #: The same of the other moments that are hardly less likely
     earliest: int
