@@ -78,7 +78,7 @@ def reading_of(problem: Problem, solution: Solution | None, progress: Progress |
 
 #: Residuals are plainly those of a sensor if, as shares of the variation of B, their geometric mean is below this.
 PLAIN_SHARE = 0.025
-#: And neither share may be above this.
+#: Neither of the two shares may then be above this.
 LARGEST_PLAIN_SHARE = 0.04
 #: With a share above this the calibration explains so little that unusual mistakes are tried too.
 UNEXPLAINED_SHARE = 0.3
@@ -128,7 +128,7 @@ class Misreading:
 
     @staticmethod
     def of(reading: OtherReading, before: Spread, after: Spread, unit: WrongUnit | None = None) -> Misreading:
-        """The record of a reading with its residuals, and of a unit that is wrong too."""
+        """The record of a reading with its residuals, and of a wrong unit if there is one."""
         parts = [part for part in (reading if reading is not AS_READ else None, unit) if part]
         return Misreading(
             parts[0].mistake,
@@ -287,7 +287,7 @@ def shares_of(residual: Spread, signal: Spread) -> tuple[float, float]:
 
 
 def _degrees_of_freedom(sampled: Sampled) -> int:
-    """Of the rotations alone, and of the translations alone."""
+    """Degrees of freedom of the rotations; the translations have as many."""
     return 3 * (sampled.count - sampled.unknown_poses)
 
 

@@ -272,11 +272,11 @@ def _step(name: str, sample: Sample, cut: float, fit: TrialFit) -> TwoPoses | No
     return TwoPoses(name, first, second, angle, distance, from_row, any(name == pair.sensor for pair in sample))
 
 
-#: At least so many outliers, and this share of those of a frame, agree with one another.
+#: At least this many of a frame's outliers, and this share of them, agree with one another.
 FEWEST, MOST_OF_THEM = 4, 0.75
 #: They lie this many times their own spread from the answer, in rotation or in translation.
 OUTLIERS_APART = 8.0
-#: Those within so many times the spread of the measurements that were kept agree.
+#: Outliers agree within this many times the spread of the measurements that were kept.
 NEAR = 6.0
 #: The step of the frame that moved has a smaller spread (rotation times translation) than that of any other frame of
 #: its pairs, by this factor: else it is open which of the two moved.

@@ -28,11 +28,11 @@ class NoiseFound:
     """The noise that a calibration assumes, one standard deviation per axis; ``str()`` is a sentence."""
 
     source: str  #: Where it comes from: "estimated from the residuals", "as given"
-    #: Of B, by pair: of the pair's median measurement, root mean square over axes
+    #: Noise of B at each pair's median measurement, root mean square over axes, by pair
     rotation_rad: dict[Pair, float]
     translation_m: dict[Pair, float]
     carriers: str  #: The noise of A, in words
-    #: All that the data say of their noise, of A's, in time and over the configuration; None where B's alone was
+    #: All that the data say about the noise of A and B, in time and over the configuration; None where B's alone was
     #: estimated, or noise was given
     model: NoiseInData | None = None
     simple: str = ""  #: Why B's alone was estimated; empty with a model
@@ -73,9 +73,9 @@ def estimated(
 
     Inliers are chosen again under the noise that is found, until they stay the same.
 
-    ``inliers`` is empty where every measurement counts; ``solution`` is the certified one of the inliers. The one place
-    that decides by which model the noise is found: the whole model of ``noise_model``; where that has too few
-    measurements, or too many, or noise is given or wanted by groups, ``refine`` with the noise of B alone.
+    ``inliers`` is empty where every measurement counts; ``solution`` is the certified one of the inliers. This alone
+    decides by which model the noise is found: the whole one of ``noise_model``, or ``refine`` with the noise of B
+    alone, if noise is given, by groups, or A's with covariances, or if the whole model lacks measurements or fails.
 
     Raises
     ------

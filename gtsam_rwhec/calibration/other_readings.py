@@ -1,8 +1,8 @@
 """Readings: the ways in which a user's poses may have been misread, and how each is read right.
 
-Each reading changes A, B or their roles as its cure would. Some mistakes are one mistake to the data. A quaternion in
-the wrong order is the inverse rotation between two constant ones; a mirrored A is a mirrored B with other constants;
-names exchanged are both poses inverted. Where the residuals cannot tell two readings apart, both are named.
+Each reading changes A, B or their roles as its cure would. Some mistakes look alike in the data. Quaternions in the
+wrong order look like C1 R^-1 C2, with constant C1 and C2; a mirrored A like a mirrored B, with other constants;
+exchanged names like A and B inverted. Where the residuals cannot tell two readings apart, both are named.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ DOUBLE = tuple(_joined(first, second) for first in _QUATERNIONS for second in (A
 SMALL_RAD = np.pi / np.degrees(1.0)
 #: Three Euler angles may each be as large.
 SMALL_EULER_RAD = 1.8 * SMALL_RAD
-#: Fewer measurements of a pair do not determine the 18 unknowns of the axes' equations well.
+#: With fewer measurements, a pair's 18 unknowns of S P a = Q a are not well determined.
 FEWEST_AXES = 8
 
 

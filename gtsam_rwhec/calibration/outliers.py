@@ -160,12 +160,12 @@ def few_words(frame: str, number: int) -> str:
     return f"{frame} rests on {number} measurement{rest}"
 
 
-#: An error of so many medians is gross. Of Gaussian errors none is; of Student's t one in 4,000 with 5 degrees of
-#: freedom, one in 300 with 3.
+#: An error of this many medians is gross. No Gaussian error is; of Student's t errors, one in 4,000 with 5 degrees of
+#: freedom, and one in 300 with 3.
 GROSS = 8.0
 #: A pair with fewer rows has no median of its own; that of all pairs counts.
 FEWEST_ROWS_OF_MEDIAN = 10
-#: At most so many pairs and measurements are tested.
+#: At most this many pairs, and this many measurements, are tested.
 MOST_PAIRS_ASKED, MOST_ASKED = 200, 10_000
 #: With fewer measurements in all, a wrong one cannot be told from the others.
 FEWEST_ASKED = 8
@@ -207,7 +207,7 @@ def _stated(sampled: Sampled) -> Array:
     return np.stack([rotation, np.concatenate([raw.sigma[chosen] for raw, chosen in rows])])
 
 
-#: The measurements that were left out are tested if they are at least this share of all, and so many.
+#: Measurements that were left out are tested if they are at least this share of all, and at least this many.
 SHARE_LEFT_OUT, FEWEST_LEFT_OUT = 0.25, 8
 #: The medians of its residuals, rotation times translation, are this many times smaller than those of what was kept.
 FAR_SMALLER = 25.0

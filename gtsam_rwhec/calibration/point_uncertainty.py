@@ -364,8 +364,8 @@ def _measurement_mm(
 ) -> float | None:
     """The radius of the noise of one new measurement: of B, and of A where the point crosses from carrier to carrier.
 
-    An error [omega, v] of A moves the point by omega x l + v, in whichever frame; l is the point on the carrier whose
-    axes the noise has. None where nothing is measured, or its noise is not known.
+    An error [omega, v] of A moves the point by omega x l + v, in whichever frame; l is the point in
+    the axes of the carrier that the noise is about. None where nothing is measured, or its noise is not known.
     """
     if sigma_m is None:
         return None

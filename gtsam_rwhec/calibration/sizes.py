@@ -134,7 +134,7 @@ def sizes(
     options : RefineOptions, optional
         How the noise is taken; by default it is estimated from the residuals.
     like : NoiseInData, optional
-        The noise that was found with the sizes as stated: whose errors those of A are, and which drift there is, stay.
+        Noise found with the sizes as stated: the carrier that errors of A are about, and the drift, are kept from it.
     progress : callable, optional
 
     Returns

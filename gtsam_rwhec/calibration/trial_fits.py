@@ -39,7 +39,7 @@ ROUNDS = 5
 DEGREES_OF_T = 6.0
 #: Standard deviation of rotations before the first round (rad): the balance against translations.
 FIRST_RAD = 0.05
-#: Standard deviation of translations before the first round, as a share of the distances that B has.
+#: Standard deviation of translations before the first round, as a share of B's median distance.
 FIRST_SHARE = 0.05
 #: Weights use no rotation noise below this (rad), and no translation noise below this share of the distances.
 SMALLEST_SHARE = 1e-5
@@ -74,7 +74,7 @@ class TrialFit:
 
     @property
     def log_likelihoods(self) -> Array:
-        """Of each measurement (N,), up to a constant: Student's t in six dimensions, with the fit's own spreads."""
+        """One per measurement (N,), up to a constant: Student's t in six dimensions, with the fit's own spreads."""
         s_R, s_t = self.residual.rotation_rad, self.residual.translation_m
         squared = (self.errors[0] / s_R) ** 2 + (self.errors[1] / s_t) ** 2
         tails = 0.5 * (DEGREES_OF_T + 6.0) * np.log1p(MEDIAN_OF_CHI**2 * squared / DEGREES_OF_T)

@@ -42,7 +42,7 @@ NONE = "-"
 
 
 def corners_section(shown: ShownResult) -> Section:
-    """All of it; why it is missing where the answer is from poses."""
+    """The section; where the answer is from poses, why it is missing."""
     refined = None if shown.result is None else shown.result.refined
     if refined is None or refined.reprojection is None:
         why = "the answer is from the poses of targets: intrinsics by which these were measured count as exact."
@@ -110,7 +110,7 @@ def errors_table(found: Reprojection) -> Table:
 
 
 def unexpected_sentences(found: Reprojection) -> list[str]:
-    """Of sensors whose left-out images are predicted worse than the covariances expect: these are too small."""
+    """Name sensors whose left-out images are predicted worse than the covariances expect: these are too small."""
     return [
         f"{name}: images that were left out are predicted {rounded(of.held_out_px / of.expected_px)} times worse than "
         "expected. The arm's poses, the target or the lens have errors that the model lacks; the standard deviations "
@@ -121,7 +121,7 @@ def unexpected_sentences(found: Reprojection) -> list[str]:
 
 
 def intrinsics_sentences(refined: RefinedPoses) -> list[str]:
-    """Of each camera's intrinsics: how they were stated, whether the images agree, what they do not determine.
+    """For each camera's intrinsics: how they were stated, whether the images agree, what they do not determine.
 
     And where the camera was calibrated from a part of its image.
     """

@@ -302,11 +302,11 @@ OTHER = ("+", GREY)
 TICK, ABOVE = 0.28, 0.36
 #: So many cameras are drawn, in so many columns, each at most so high as wide.
 MOST_CAMERAS, COLUMNS, TALLEST = 12, 2, 1.4
-#: More signs than this in a row stand together, those of so many pieces as one.
+#: If a row has more signs than this, those within this many pieces next to each other become one.
 MOST_SIGNS, TOGETHER = 100, 4
 #: More corners than this have smaller marks.
 MANY_CORNERS = 1500
-#: A row's name has so many characters.
+#: A row's name has at most this many characters.
 LONGEST = 26
 
 

@@ -164,7 +164,7 @@ def _motions(shown: ShownResult) -> Iterator[Block]:
 
 
 NO_TURN = "No such turn would help clearly more than measuring on."
-#: A direction is called after a coordinate axis within 8 degrees of it.
+#: A direction within 8 degrees of a coordinate axis is named after this axis.
 AXIS_COSINE = np.cos(np.radians(8.0))
 NOT_KNOWN = (
     "Not shown: the least known directions beside those that are free. They need evidence.json beside the result, and "

@@ -17,7 +17,7 @@ from gtsam_rwhec.rig.rig_frames import RigFrames
 
 #: The kind of each text, before the name of its file.
 KINDS = {"static_tf.launch.py": "ROS 2 launch file", "rig.urdf.xacro": "URDF", "tf.yaml": "YAML", "poses.py": "Python"}
-#: Of more files a table is folded.
+#: A table of more files is folded.
 FEW_FILES = 12
 
 

@@ -38,7 +38,7 @@ ABOUT = (
     "It says nothing of the measurements: of wrong ones it proves the best answer to wrong measurements. The verdict "
     "judges those, and the standard deviations say how far off a pose may be."
 )
-#: Of what the proof is, where the poses are of another fit.
+#: Which answer the proof is about, where the poses shown are of another fit.
 OF_CERTIFIED = "This is about the certified answer, at which the refinement began. "
 ABSENT = "Not shown: the spectrum of Z"
 

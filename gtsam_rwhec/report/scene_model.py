@@ -79,8 +79,8 @@ class Scene:
     boards: tuple[PlacedBoard, ...]
     #: (n, 7): x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps
     path: Array
-    moving: str  #: Its name; empty where there is none
-    #: (3,): the box that holds all of it
+    moving: str  #: Name of the moving carrier; empty where there is none
+    #: (3,): corners of the box that holds the whole scene
     low: Array
     high: Array
     times: float  #: Ellipsoids are drawn so many times as large
@@ -272,9 +272,9 @@ def _pose(row: tuple[float, ...]) -> Array:
     return T
 
 
-#: A line has this share of the scene to each side, and its arrowheads and circles this one.
+#: Sizes as shares of the scene: a line to each side, and its arrowheads and circles.
 LENGTH, HEAD = 0.16, 0.022
-#: Of each direction so many frames are drawn, and of all so many lines.
+#: At most this many frames are drawn for each direction, and this many lines in all.
 MOST_FRAMES, MOST_LINES = 40, 200
 
 

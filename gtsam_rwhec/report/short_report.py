@@ -144,7 +144,7 @@ class _Room:
         self._width = console.width if console.is_terminal else min(console.width, NARROW)
 
     def lines_of(self, *things: RenderableType) -> int:
-        """Lines of sentences, and of tables; in a file, of what a narrow terminal shows of it."""
+        """Number of lines of sentences and tables; in a file, as on a narrow terminal."""
         return sum(map(self._height, things))
 
     def take(self, *things: RenderableType, more: int = 0) -> None:

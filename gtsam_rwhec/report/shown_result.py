@@ -38,7 +38,7 @@ class ShownResult:
 
     @staticmethod
     def of(content: bytes, evidence: Evidence | None, name: str = "result.json", *, images: bool = True) -> ShownResult:
-        """Of a result file's content; raises as `read_result`. A result without an answer is shown all the same."""
+        """From a result file's content; raises as `read_result`. A result without an answer is shown too."""
         tree = parse_tree(content, name)
         return ShownResult(tree, None if has_no_answer(tree) else parse_result(content, name), evidence, name, images)
 
@@ -46,7 +46,7 @@ class ShownResult:
     def of_answer(
         answer: Calibration | Refined | Solution, log: LogFields | None = None, findings: Sequence[Finding] = ()
     ) -> ShownResult:
-        """Of what was just computed."""
+        """From an answer that was just computed."""
         evidence = Evidence(derived=derived_of(answer)) if isinstance(answer, Calibration) else None
         shown = replace(ShownResult.of(result_json(answer, log), evidence), in_memory=True)
         if not findings or not isinstance(answer, Solution):

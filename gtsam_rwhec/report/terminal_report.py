@@ -150,7 +150,7 @@ class TerminalTable:
 
 
 def _in_ascii(row: tuple[Words, ...]) -> tuple[Words, ...]:
-    """A row whose signs differ on a terminal without them too."""
+    """A row with its signs in ASCII, where they still differ."""
     return tuple(plain_text(cell).translate(ASCII_SIGNS) for cell in row)
 
 

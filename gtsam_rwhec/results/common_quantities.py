@@ -60,7 +60,7 @@ class Quantities:
         return {str(unknown): rows for unknown, rows in self.slots.items()}
 
     def only(self, wanted: Callable[[Unknown], bool]) -> Quantities:
-        """Those that are wanted; all others are unknown again."""
+        """The quantities of the wanted unknowns; all others are marginalised."""
         kept = {unknown: rows for unknown, rows in self.slots.items() if wanted(unknown)}
         places = [np.arange(rows.start, rows.stop) for rows in kept.values()]
         rows = np.concatenate([np.zeros(0, int), *places])

@@ -35,7 +35,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 from gtsam_rwhec.results.nights import Nights, Spread, solved
 
-#: The share of false alarms that is left to "all of it moved"; the rest is for one frame alone, in equal parts.
+#: Share of the false alarms for the test that all frames moved; tests of one frame share the rest equally.
 OF_ALL = 0.1
 
 
@@ -263,8 +263,8 @@ BETTER = 2.0
 class ChangeFound:
     """What changed in a series of nights."""
 
-    #: Index of the first night after the change: it was between the night before and this one. Of a drift: the first
-    #: night that it moved.
+    #: Index of the first night after the change: it was between the night before and this one. With a drift: the
+    #: first night that it moved.
     first: int
     #: The same of the other moments that are hardly less likely
     earliest: int
@@ -337,7 +337,7 @@ def _fewest(
 
 
 def _variance(found: Shifts, ratio: float, spread: Spread) -> float:
-    """Of the nights beside the change, over what their covariances say."""
+    """The variance of the nights without the change, over what their covariances say."""
     if math.isinf(spread.freedom):
         return spread.variance
     left = spread.freedom * spread.variance + max(found.squares - ratio, 0.0)
@@ -373,7 +373,7 @@ class Chart:
     def next(
         self, day: float, x: Array, information: Array, spread: Spread, rate: float = RATE
     ) -> tuple[Chart, NightTest, Alarm | None]:
-        """The chart with one more night, what it says of it, and the alarm if there is one.
+        """The chart with one more night, that night's test, and the alarm if there is one.
 
         Parameters
         ----------
@@ -382,7 +382,7 @@ class Chart:
         x, information : (m,) and (m, m) arrays
             As in `Nights`.
         spread : Spread
-            What the nights before this one say.
+            How the nights before this one scatter.
         rate : float
             False alarms a night.
         """

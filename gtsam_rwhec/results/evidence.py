@@ -89,7 +89,7 @@ def checksum(content: bytes) -> str:
 
 
 def evidence_json(evidence: Evidence) -> bytes:
-    """What `write_evidence` writes."""
+    """The bytes that `write_evidence` writes."""
     return evidence.model_dump_json(indent=1).encode("utf-8") + b"\n"
 
 

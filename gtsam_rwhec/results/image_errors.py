@@ -92,7 +92,7 @@ class SeenView(NamedTuple):
         *,
         is_used: bool = True,
     ) -> SeenView:
-        """Of corners (n, 3) in the target's frame."""
+        """A view of corners (n, 3) in the target's frame."""
         Q = corners @ T_targetcarrier_target[:3, :3].T + T_targetcarrier_target[:3, 3]
         R = T_camera_targetcarrier[:3, :3]
         by_xi = np.concatenate([-se3.hat(Q), np.broadcast_to(np.eye(3), (len(Q), 3, 3))], axis=2)
@@ -155,9 +155,9 @@ def _at_optimum(J: Array, errors: Array, counts: np.ndarray) -> Array:
     return left
 
 
-#: So many corners of a camera are kept, and so many of all cameras together.
+#: At most this many corners are kept for one camera, and for all cameras together.
 MOST_CORNERS, MOST_OF_ALL = 4000, 16_000
-#: Of the worst images so many at most were left out of the answer.
+#: At most this many of the worst images that are shown were left out of the answer.
 MOST_LEFT_OUT = 2
 
 

@@ -155,7 +155,7 @@ def _noise_of_B(of: MeasuredRows, typical: PairNoise) -> Array:
 
 
 def derivatives(P: Array, scale: float = 1.0) -> Array:
-    """Those (N, 6, 13) of predictions (N, 4, 4), in true lengths, by target, sensor and scale."""
+    """Derivatives (N, 6, 13) of predictions (N, 4, 4), in true lengths, by target, sensor and scale."""
     as_measured = np.repeat([1.0, scale], 3)
     J = np.zeros((len(P), 6, OWN))
     J[:, :, :6] = np.diag(as_measured)
@@ -183,7 +183,7 @@ class MeasuredRows:
     A: Array
     B: Array
     stamps_ns: np.ndarray | None
-    #: Of B's right perturbation [omega (rad), v (m)], as it was stated; None where a log has none
+    #: Covariance of B's right perturbation [omega (rad), v (m)], as stated; None where a log has none
     covariance: Array | None
     reasons: tuple[str, ...]  #: Why a measurement is not used; empty where it is
 

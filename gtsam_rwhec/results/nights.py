@@ -148,7 +148,7 @@ class SpreadPool:
         self.dimensions.append(len(difference))
 
     def found(self) -> FoundSpread:
-        """What they say together."""
+        """What all differences say together."""
         robot, lag = np.array(self.robots, int), np.array(self.lags, int)
         square, size = np.array(self.squares), np.array(self.dimensions, float)
         quiet = np.zeros(len(square), bool)
@@ -182,7 +182,7 @@ class FoundSpread:
 
     @property
     def variance(self) -> float:
-        """Of all robots together, over the stated one; 1 where nothing is known."""
+        """The variance of all robots together, over the stated one; 1 where nothing is known."""
         return float((STATED_COUNTS + self.sums.sum()) / (STATED_COUNTS + self.sizes.sum()))
 
     def of_robot(self, robot: int) -> Spread:

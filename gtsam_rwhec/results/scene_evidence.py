@@ -36,7 +36,7 @@ from gtsam_rwhec.results.linear_model import MeasuredRows
 MOST_POSES = 400
 #: An edge of an image has this many points.
 EDGE = 4
-#: Words in the names of carriers: those of the first kind stand still for people, those of the last move.
+#: Words in the names of carriers, in order: from carriers that stand still for people to carriers that move.
 STANDING = frozenset({"world", "map", "earth", "room", "floor", "ground", "odom", "mocap", "vicon", "optitrack"})
 PARTLY = frozenset({"base", "table", "cell", "stand", "origin"})
 MOVING = frozenset({"hand", "tool", "tool0", "ee", "eef", "tcp", "flange", "gripper", "wrist", "body"})

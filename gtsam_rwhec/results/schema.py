@@ -185,10 +185,10 @@ class JointFields(JointCovariance):
 class FrameFields:
     """How well a refined frame is known. This is for people; only the joint covariance is read back."""
 
-    #: Of rotations about the frame's own x, y and z axes, degrees; null: infinite, because a direction is free
+    #: Rotations about the frame's own x, y and z axes, degrees; null: infinite, because a direction is free
     standard_deviations_deg: Triple
-    standard_deviations_mm: Triple  #: Of translations along the same axes, millimetres; null as above
-    #: Of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign
+    standard_deviations_mm: Triple  #: Translations along the same axes, millimetres; null as above
+    #: Covariance of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign
     covariance: list[list[float | None]]
 
 

@@ -43,7 +43,7 @@ class SensorCheck:
 
     #: Errors of predictions by the old poses: what a robot that uses them is off by, with the noise of the measurements
     held: PredictionError
-    #: Of the poses that fit the new log best: the noise of the measurements. None where none near the old ones fit.
+    #: Errors by the poses that fit the new log best: noise of the measurements. None where none near the old ones fit.
     best: PredictionError | None
     outliers: int  #: Measurements that agree with no others; they count in neither
     #: `best`'s root mean square translation over that of the old log's residuals; None where that has none
@@ -56,7 +56,7 @@ class SensorCheck:
 class Verification:
     """Whether an old calibration still holds; ``str()`` is the verdict."""
 
-    #: Of the old poses against those that fit the new log best, by the sum of both covariances. None where the
+    #: Test of the old poses against those that fit the new log best, by the sum of both covariances. None where the
     #: predictions are so far off that no test is needed, and none is possible.
     test: ChangeTest | None
     movements: dict[str, Movement]  #: From the old pose of each frame to the one that fits the new log best
