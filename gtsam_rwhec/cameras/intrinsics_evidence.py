@@ -42,8 +42,8 @@ SHARES = (1.0, 0.5, 0.25, 0.1, 0.02)
 LEAST_PROBABILITY, LARGER, LARGER_PX = 1e-4, 1.08, 0.02
 #: The same for the second fit: a bent board may look like distortion.
 LEAST_FAR, LARGER_FAR = 1e-6, 1.25
-#: A change by more than this share of the focal length, beyond two standard deviations, makes poses useless; and a
-#: distortion that moves the outermost corner by more than that share.
+#: Poses are useless if fx, fy, cx or cy is off by more than `USELESS` of the focal length, beyond two standard
+#: deviations, or if the changed distortion moves the outermost corner by more than `USELESS_BEND` focal lengths.
 USELESS, USELESS_BEND = 0.01, 0.003
 
 
@@ -68,7 +68,7 @@ class IntrinsicsEvidence:
     #: Root mean squares of the reprojection errors, pixels, each with the poses that fit best
     stated_px: float
     fitted_px: float
-    probability: float  #: That right intrinsics lead to so large a change
+    probability: float  #: Probability that correct intrinsics lead to so large a change
     views: int
     reach: float  #: Largest normalised radius of a corner that was seen
 
@@ -82,7 +82,7 @@ class IntrinsicsEvidence:
 
     @property
     def is_far_off(self) -> bool:
-        """Whether a number is so far off that poses are wrong by more than `USELESS` of a distance."""
+        """Whether the stated intrinsics are so wrong that poses are useless (`USELESS`, `USELESS_BEND`)."""
         change = np.abs(_numbers(self.fitted)[:4] - _numbers(self.stated)[:4]) - 2.0 * self.sigma[:4]
         return bool((change > USELESS * self.stated.K[0, 0]).any()) or self.bend > USELESS_BEND
 

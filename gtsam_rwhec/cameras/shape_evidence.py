@@ -62,7 +62,7 @@ class ShapeEvidence:
     #: Root mean squares of the reprojection errors, pixels, each with the poses that fit best
     stated_px: float
     fitted_px: float
-    probability: float  #: That a board of the stated shape leads to so large a change
+    probability: float  #: Probability that a board of the stated shape leads to so large a change
     views: int
     extent_m: float  #: Largest side of the box around the board, metres
 

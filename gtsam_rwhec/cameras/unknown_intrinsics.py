@@ -154,7 +154,7 @@ FISHEYE = (2, 4)
 FINEST_PX = 0.01
 #: A view whose corners are off by more than this multiple of the median view's, and by a pixel, was misread.
 MISREAD, MISREAD_PX = 4.0, 1.0
-#: Standard deviations beyond which the views do not determine intrinsics: of f, a share; of c, a share of the width.
+#: Intrinsics are undetermined if the standard deviation of f over f, or of c over the width, is larger than this.
 LARGEST_SIGMA = 0.1
 
 

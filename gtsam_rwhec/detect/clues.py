@@ -85,7 +85,7 @@ def _edge_blur_px(gray: Gray, by_px: tuple[float, float]) -> float:
 
 
 def _blur_px(ratios: Array, by_px: tuple[float, float]) -> float:
-    """The blur of edges that more blur lowers so; what the gradients were first smoothed by is taken off again."""
+    """Edge blur (pixels) from ratios of gradients before and after more blur, less the first smoothing `by_px[0]`."""
     ratio = max(float(np.median(ratios)), 1.01)
     return float(np.sqrt(max(by_px[1] ** 2 / (ratio**2 - 1.0) - by_px[0] ** 2, 0.0)))
 

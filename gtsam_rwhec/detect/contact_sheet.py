@@ -82,7 +82,7 @@ class Tile:
     words: str  #: What is to be said: targets and reasons
     gray: Gray | None  #: (height, WIDTH): the small picture; None where the image cannot be decoded
     outlines: tuple[Outline, ...] = ()
-    detail: Detail | None = None  #: The first target, larger, where it is small in the image
+    detail: Detail | None = None  #: The first target, enlarged; None if it is large in the image or missing
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def contact_sheet(bands: Sequence[Band]) -> Picture:
 
 
 def detail_of(gray: Gray, outline: Outline) -> Detail | None:
-    """A target as it is in an image of any size, if it is small in it: a square about it, `DETAIL` pixels wide."""
+    """Cut a square around a target, resized to `DETAIL` pixels; None if the target is not small in the image."""
     corners = outline.corners * gray.shape[1] - 0.5
     if not np.isfinite(corners).all() or float(np.ptp(outline.corners, axis=0).max()) > SMALL_SHARE:
         return None

@@ -74,7 +74,7 @@ def certified_motions(request: Request) -> Outcome[Array]:
     sigma, kappa = 1.0 / (request.alpha * np.sqrt(2.0 * w)), 2.0 * w
     known = request.scale == "known"
     problem = Problem(scale="known" if known else "shared", keep_measurements=False)
-    name = "h" if known else "c"  # whose pose the problem is about
+    name = "h" if known else "c"  # the name of the problem's only sensor
     problem.add_motion(name, *((C, H) if known else (H, C)), sigma, kappa)
     solution = quiet_solution(problem, MethodOptions())
     Y, scale = solution.Y[name], solution.scale

@@ -172,12 +172,12 @@ def _stationary(lambdas: list[float]) -> float:
 
 
 def lambda_expansion(relaxed: RelaxedCost) -> Array | None:
-    """Q to second order in Delta lambda, in the eigenvectors (4,), not normalised; None where mu = 0 is the answer.
+    """Coefficients (4,) of q in Z0's eigenvectors, to second order in D = Delta lambda; None if mu = 0 solves eq. 14.
 
-    mu = mu_1 D + mu_2 D^2 and q = q_0 + q_1 D + q_2 D^2 solve (Z0 + mu Z1 - mu^2 Z2) q = (lambda_0 + D) q order by
-    order. As printed, eq. 35 has the wrong sign of mu_1^2 Z2, in mu_2 and in q_2 (Z2 enters eq. 12 with a minus).
-    Eq. 36 has the wrong sign of the Z2 terms of q.(mu Z2 - Z1/2).q = 0. Delta lambda's formula divides by 2 in place of
-    2 c_2. With the signs below the residual of eq. 12 is of third order; as printed, of second
+    They are not normalised. mu = mu_1 D + mu_2 D^2 and q = q_0 + q_1 D + q_2 D^2 solve (Z0 + mu Z1 - mu^2 Z2) q =
+    (lambda_0 + D) q order by order. As printed, eq. 35 has the wrong sign of mu_1^2 Z2, in mu_2 and in q_2 (Z2 enters
+    eq. 12 with a minus). Eq. 36 has the wrong sign of the Z2 terms of q.(mu Z2 - Z1/2).q = 0. Delta lambda's formula
+    divides by 2 in place of 2 c_2. With the signs below the residual of eq. 12 is of third order; as printed, of second
     (tests/methods/test_dq_approximations.py).
     """
     Z1, Z2 = relaxed.Z1, relaxed.Z2

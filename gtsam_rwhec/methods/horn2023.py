@@ -77,7 +77,7 @@ def _smallest_eigenvector(Q: Array) -> Array:
 
 
 def rounded(z: Array, frames: int) -> tuple[Array, Array]:
-    """The unit p (n, 4) and t (n, 3) nearest to z: frames are divided by their lengths, dual parts made orthogonal."""
+    """Unit quaternions (n, 4) and t (n, 3) of z: each frame is divided by |p|, its dual part made orthogonal to p."""
     parts = z.reshape(frames, 2, 4)
     lengths = np.linalg.norm(parts[:, 0], axis=1)[:, None]
     q, dual = parts[:, 0] / lengths, parts[:, 1] / lengths
