@@ -25,15 +25,15 @@ class RefinedIntrinsics:
     """A camera's intrinsics."""
 
     camera: Camera
-    #: (m, m): Of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
+    #: (m, m): Covariance of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
     covariance: Array
-    #: (m,): Of the prior, as widened.
+    #: (m,): Standard deviations of the prior, as widened.
     stated_deviations: Array
-    #: By how much: 1 where the images do not contradict what was stated.
+    #: The factor by which they were widened: 1 where the images do not contradict what was stated.
     widened: float
     #: The test of the intrinsics as they were stated.
     innovation: Innovation
-    #: Of the corners that count, along each axis.
+    #: Root mean square error, along each axis, of the corners that count.
     rms_px: float
 
     @property

@@ -228,7 +228,7 @@ class NoiseOptions:
     systematic: bool = True
     #: "auto": as the residuals' correlation in time shows. A ``Walk``: this kind, which was found before.
     drift: Drift | Walk = "auto"
-    #: Which carrier the errors of A are fixed to: an arm's hand. None: as the data show.
+    #: The carrier that A's errors are fixed to, such as a hand. None: the data decide.
     side: About | None = None
 
 

@@ -38,7 +38,7 @@ STILL = 5e-5
 REVISITED, APART, SPREAD_M = (1e-3, 6e-3), 10.0, 0.3
 #: More pairs of near poses than this, an instant, are not those of visits to stations.
 MOST_LINKS = 50
-#: Stations are looked for where this share of so many sampled poses has another one near: of stations half would have.
+#: Stations are sought if this share of so many sampled poses has another pose near; with stations, half have.
 FEWEST_REVISITED, SAMPLED = 0.2, 300
 #: A velocity is taken from neighbours that are no further apart than this, s.
 NEIGHBOURS_S = 0.5
@@ -70,7 +70,7 @@ class Instants:
 
     @staticmethod
     def of(data: list[PairData]) -> Instants:
-        """Measurements of one standstill (of one stamp and A at least) are one instant; without stamps, of one A."""
+        """An instant has the measurements of one A (and stamp, where there are any), standstill or station."""
         pair = np.concatenate([np.full(item.count, i) for i, item in enumerate(data)])
         has_stamps = all(item.stamps_ns is not None for item in data)
         within = np.concatenate([np.arange(item.count) for item in data])

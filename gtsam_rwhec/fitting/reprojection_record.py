@@ -181,10 +181,10 @@ class Intrinsics:
     innovation_deviations: float
     #: Parameters that the images do not determine.
     held_by_prior: tuple[str, ...]
-    #: Of the corners that count, along each axis.
+    #: Root mean square error, along each axis, of the corners that count.
     rms_px: float
     #: Standard deviation of the projection of points at `projection_m` before the camera, pixels, by region of the
-    #: image: of the lens alone, with the pose that hides its errors best where corners were seen.
+    #: image: from the lens alone, with the pose refitted to the corners for each error of the lens.
     projection_px: Regions = ()
     projection_m: float = 0.0
 
