@@ -62,7 +62,7 @@ def _span(values: list[float]) -> str:
 NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
 
 
-#: Inliers are chosen again under the noise that is found at most this many times.
+#: Noise is found at most this many times; between them, inliers are chosen anew.
 MAX_CHOICES = 4
 
 

@@ -97,7 +97,7 @@ class Ground(StrEnum):
     LITTLE_ROTATION = "little_rotation"
     #: A frame rests on so few measurements that a wrong one would not show.
     FEW_MEASUREMENTS = "few_measurements"
-    #: The stated size of a target does not fit the motion, while others do; it was estimated in its place.
+    #: The stated size of a target does not fit the motion, as other targets' do; it was estimated instead.
     SIZE_ESTIMATED = "size_estimated"
     #: The stated intrinsics of a sensor do not fit its corners; they were estimated in their place.
     INTRINSICS_ESTIMATED = "intrinsics_estimated"

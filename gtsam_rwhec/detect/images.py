@@ -75,7 +75,7 @@ def _jpeg(data: bytes) -> Size | None:
 
 
 def _webp(data: bytes) -> Size | None:
-    """The canvas of the extended format, or the frame of the other two."""
+    """The canvas size of a VP8X file, or the frame size of a VP8L or VP8 file."""
     if len(data) < 30:
         return None
     kind = data[12:16]

@@ -103,7 +103,7 @@ def wrapped(text: str, size: int, width: float, most: int) -> list[str]:
 
 #: Qualities that are tried, the best first; where the last is too large the picture is made smaller.
 QUALITIES = (85, 70, 55)
-#: A picture is made smaller by this factor at a time, down to so many pixels.
+#: The scale of each reduction, and the fewest pixels of the shorter side.
 SMALLER, LEAST = 0.75, 64
 
 

@@ -74,10 +74,10 @@ def judged(
     noise_of: np.ndarray | None = None,
     robust: bool = False,
 ) -> np.ndarray:
-    """Which measurements (N,) belong to the answer, by a fit to the kept ones (N,).
+    """Which measurements (N,) are inliers, by a fit to those in ``keep`` (N,).
 
-    ``noise_of`` (N,) are the measurements that show the noise, all kept ones by default. ``robust`` takes the variances
-    from medians: for a fit to all measurements, of which some may be outliers.
+    The noise is estimated from those in ``noise_of`` (N,), by default all kept ones. ``robust`` takes the variances from
+    medians: for a fit to all measurements, of which some may be outliers.
     """
     pairs, size = _linearized(problem, measured, fit)
     known = np.zeros(len(keep), dtype=bool)

@@ -286,7 +286,7 @@ def check_spread(stacks: tuple[Stack, ...]) -> None:
 
 
 def check_rays(stacks: tuple[Stack, ...], options: CornerOptions) -> None:
-    """CameraError where intrinsics that are held as stated have no ray for a corner."""
+    """Raise CameraError if intrinsics held as stated have no ray for a corner."""
     for stack in stacks:
         words = without_rays(stack.camera, _seen(stack), stack.known)
         if words and options.stated_of(options.camera_of(stack.sensor)) == "exact":

@@ -183,7 +183,7 @@ class CornerGraph:
         self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error))
 
     def _rows_there(self) -> list[FewRows]:
-        """The linear rows at the values that were come to."""
+        """The linear rows at the values last visited."""
         if not self._rows:
             self._rows = self.model.few_rows(self._point)
         return self._rows

@@ -294,7 +294,7 @@ def _rms(settled: _Settled) -> dict[str, float]:
 class CornersCalibrated:
     """A calibration from corners."""
 
-    #: The certified solution of the images' poses.
+    #: The certified solution from the images' poses.
     solution: Solution
     #: The answer.
     refined: CornersRefined

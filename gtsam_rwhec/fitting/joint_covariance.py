@@ -83,7 +83,7 @@ class JointCovariance:
         return JointCovariance(slots_of(unknowns), finite, basis, unit)
 
     def rows(self, unknowns: tuple[Unknown, ...]) -> np.ndarray:
-        """The row indices of some unknowns, in the order given; FrameError for any other name."""
+        """The row indices of some unknowns, in the order given; FrameError for one not in `slots`."""
         for unknown in unknowns:
             if unknown not in self.slots:
                 there = ", ".join(map(str, self.slots))

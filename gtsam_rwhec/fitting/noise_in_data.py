@@ -117,7 +117,7 @@ class NoiseInData:
 
     @property
     def systematic_words(self) -> str:
-        """The size of these errors."""
+        """The size of the systematic errors, in words."""
         return (
             f"{self._words(C.SYSTEMATIC_ROTATION)} and {self._words(C.SYSTEMATIC_TRANSLATION)} between poses far apart"
         )

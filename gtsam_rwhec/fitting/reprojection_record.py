@@ -28,7 +28,7 @@ LEAST = 0.001
 class SensorReprojection:
     """Errors of a sensor's corners."""
 
-    #: How many count, and corners that were left out because they disagree with all others.
+    #: Numbers of images and corners used, and of corners that disagree with all others.
     images: int
     corners: int
     left_out: int

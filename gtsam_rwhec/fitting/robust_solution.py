@@ -63,7 +63,7 @@ MAX_VOTES = 3
 MAX_ADMISSIONS = 5
 #: With estimated noise so many equations must be left when one measurement is left out.
 SPARE = 6
-#: An outlier cannot hide where the unknowns take up no more than this part of the equations.
+#: With at most this many unknowns per equation, an outlier cannot pull the fit and so hide.
 PULLED = 0.02
 #: An estimated variance factor is settled when a fit changes it by no more than this part.
 SETTLED = 1e-4

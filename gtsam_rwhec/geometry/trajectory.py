@@ -372,8 +372,8 @@ def _unpredicted(poses: Array, seconds: Array, leverage: Array) -> Array:
     """Mean square error of velocities (6,) from each pose's distance to the cubic through two neighbours a side.
 
     For a smooth path with noise, the distance is the noise and the small error of a cubic. If the carrier stopped
-    between the stamps, or turned back, the distance is as large as the steps. Ends of the path, and poses beside a gap,
-    are left out, as those without four neighbours are.
+    between the stamps, or turned back, the distance is as large as the steps. Poses without two
+    neighbours on each side, at an end or beside a gap, are left out.
     """
     beside = np.arange(2, len(seconds) - 2)[:, None] + np.array([-2, -1, 1, 2])
     beside = beside[np.diff(seconds[beside], axis=1).max(axis=1) <= LONGEST_GAP_S] if len(beside) else beside

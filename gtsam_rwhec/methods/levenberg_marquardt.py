@@ -77,7 +77,7 @@ def descend(
 
 
 def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: int) -> Array:
-    """Parameters (k,) of a local minimum of x(p)' Q x(p), for a form Q (m, m), m >= k, from ``start`` (k,)."""
+    """Parameters p (k,) of a local minimum of x' Q x, x (m,) = chart(p), for a form Q (m, m), from ``start`` (k,)."""
     L = root(form)
 
     def residual(p: Array) -> Array:

@@ -237,7 +237,7 @@ def _seen_camera(
 
 
 def cells_with_corners(pixels: Array, size: tuple[int, int]) -> np.ndarray:
-    """How many corners (n, 2) are in each cell of an image of a (width, height), rows from the top."""
+    """How many corners (n, 2) each cell of a (width, height) image has, rows from the top."""
     columns, rows = CELLS if size[0] >= size[1] else CELLS[::-1]
     good = np.clip(pixels[np.isfinite(pixels).all(axis=1)] + 0.5, 0.0, size)
     cells, *_ = np.histogram2d(good[:, 1], good[:, 0], (rows, columns), ((0.0, size[1]), (0.0, size[0])))

@@ -351,7 +351,7 @@ class _Lagrangian:
         return Room.largest(Z, np.abs(self.form.curvature.diagonal), self.value)
 
     def _over_region(self, nulls: NullVectors, room: Room, enough: float) -> tuple[float, float, Region | None]:
-        """`_lower` over the largest region with a small loss, or without a region where none is needed."""
+        """`_lower` over the largest region that costs it at most ``enough``; without a region if none is needed."""
         if self.Z.is_rotation[nulls.held].all():
             return *self._lower(nulls, room, None), None
         smallest = smallest_region(self.form.part, self.evaluation.point, self.contains)
