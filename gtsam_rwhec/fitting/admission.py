@@ -76,8 +76,8 @@ def judged(
 ) -> np.ndarray:
     """Which measurements (N,) are inliers, by a fit to those in ``keep`` (N,).
 
-    The noise is estimated from those in ``noise_of`` (N,), by default all kept ones. ``robust`` takes the variances from
-    medians: for a fit to all measurements, of which some may be outliers.
+    The noise is estimated from those in ``noise_of`` (N,), by default all kept ones. ``robust`` takes the variances
+    from medians: for a fit to all measurements, of which some may be outliers.
     """
     pairs, size = _linearized(problem, measured, fit)
     known = np.zeros(len(keep), dtype=bool)
