@@ -26,8 +26,8 @@ JPEG_QUALITY = 70
 HEAD = """# What goes wrong, and what is said of it
 
 Fifteen ways to spoil a calibration. Each is a folder of 30 rendered images with poses beside them, as a user has
-it: a camera on an arm's hand, and a ChArUco board on a table. Below each picture are the first lines that `gtsam-
-rwhec calibrate` printed. `python benchmarks/gallery.py` counts how often the fault is named, over many seeds,
+it: a camera on an arm's hand, and a ChArUco board on a table. Below each picture are the first lines that
+`gtsam-rwhec calibrate` printed. `python benchmarks/gallery.py` counts how often the fault is named, over many seeds,
 and that the same folders without it are not accused. This page is made by `python benchmarks/gallery_pages.py
 docs`.
 """
