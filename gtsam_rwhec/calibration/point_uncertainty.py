@@ -196,6 +196,8 @@ def places_of(
         words = (known if is_across == has_A else known[:1]) if name is None else [name, known[0]]
         for word in words:
             places.setdefault(word, Place(name or usual, None, is_across))
+        if all(places[word].is_across != is_across for word in words):  # its words are names of the other carrier
+            places[usual] = Place(name or usual, None, is_across)
     for kind in kinds:
         for name, pose in poses[kind].items():
             if name != frame:
@@ -219,7 +221,8 @@ def place_of(
         return next(place for place in places.values() if place.frame is None and place.is_across == has_A)
     place = places.get(seen_from) if isinstance(seen_from, str) else None
     with_A = "uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
-    if place is None and seen_from == MORE_OFTEN_THE_OTHER[own] and not has_A and carriers.of(own) is None:
+    is_unclear = isinstance(seen_from, str) and seen_from == MORE_OFTEN_THE_OTHER[own]
+    if place is None and is_unclear and not has_A and carriers.of(own) is None:
         raise FrameError(
             f"it is not clear which carrier {seen_from!r} is, as the problem does not name its carriers; name them: "
             f'rw.Problem(sensor_carrier="hand", target_carrier="base"), or say seen_from="{CARRIER_WORDS[own][0]}" for '

@@ -40,6 +40,13 @@ IMAGES = 16
 #: Names for the frames of a folder's poses; files do not name them.
 PARENT, CHILD = "base", "hand"
 
+#: What the evidence says of the carriers, by the role that it finds.
+ROLES = {
+    "child": f"the cameras are on {CHILD}",
+    "parent": f"the cameras are on {PARENT}, and the targets on {CHILD}",
+    None: "the data cannot tell",
+}
+
 
 def propose_folder_rig(
     folder: str | Path, path: str | Path, *, progress: Progress | None = None
@@ -121,7 +128,7 @@ def _text(
     tell("solving with the cameras on either carrier")
     views = _views(topics, stated, [section.target(name) for name, section in targets.items()])
     reading = best_reading(folder, cameras, views)
-    notes.append(reading.evidence.in_words(PARENT, CHILD))
+    notes.append(f"{reading.evidence.in_words(PARENT, CHILD)}: {ROLES[reading.evidence.role]}")
     take_sizes(targets, remarks, reading.evidence.sizes)
     carriers, remarks["carriers", "poses"] = _carriers(reading)
     origin = origin_of([part for _, poses in cameras for part in poses.path.split("/")])

@@ -141,6 +141,15 @@ def test_carriers_have_the_names_that_the_problem_states(calibration: rw.Calibra
         named.uncertainty_at(POINT, "sensor0", "hand")
 
 
+def test_carriers_with_each_others_usual_names(calibration: rw.Calibration) -> None:
+    named = replace(calibration, carriers=Carriers("targetcarrier", "sensorcarrier"))
+    assert named.uncertainty_at(POINT, "sensor0", A=np.eye(4)).seen_from == "sensorcarrier"
+    with pytest.raises(
+        rw.errors.FrameError, match=r"array.* is no frame .* the other carrier \(the frame that carries"
+    ):
+        named.uncertainty_at(POINT, "sensor0", np.eye(4))  # A, in the wrong place
+
+
 def test_a_word_that_may_mean_either_carrier_is_refused(calibration: rw.Calibration) -> None:
     """A camera is on the hand more often than on the base; a target the other way about."""
     for frame, word in (("sensor0", "base"), ("target0", "hand")):

@@ -40,6 +40,7 @@ def test_a_workcell_with_a_checkerboard_on_the_hand(workcell_camera2: Path, tmp_
     assert (rig.carriers.sensors, rig.carriers.targets) == ("base", "hand")  # by solving both ways
     assert rig.carriers.poses.frames == ("base", "hand")
     assert "solved both ways over" in text
+    assert "the cameras are on base, and the targets on hand" in notes
     (sensor,) = rig.sensors.values()
     assert (sensor.images, sensor.poses, sensor.time_offset) == ("image", "pose", 0.0)
     assert "were taken at rest, so no clock is estimated" in text
