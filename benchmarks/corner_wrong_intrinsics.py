@@ -148,7 +148,7 @@ def one(case: str, seed: int) -> Found:
 
 def _told_deviations(refined: RefinedIntrinsics, stated: Camera, told: Stated) -> float:
     """How far off stated intrinsics are, of what the images tell: the worst part's innovation deviations."""
-    mean, deviation = prior_of(free_model(stated, told), told)
+    mean, deviation, _ = prior_of(free_model(stated, told), told)
     truth = simulated_cells.CAMERA.parameters
     # the posterior had the prior not been widened
     information = np.linalg.inv(refined.covariance) + np.diag(deviation**-2.0 - refined.stated_deviations**-2.0)

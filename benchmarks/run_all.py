@@ -42,6 +42,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "corner_intrinsics": ("--runs 200", "--runs 2"),
     "corner_efficiency": ("--runs 2000", "--runs 4"),
     "rendered_boards": ("--images 200", "--images 3"),
+    "rendered_cells": ("--cells 300", None),
     "thousand_images": ("", None),
     "workcell": ("", "--repetitions 1"),
     "report_cost": ("", ""),

@@ -15,12 +15,12 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, agreeing
 from gtsam_rwhec.calibration.clock_offsets import Answer
+from gtsam_rwhec.calibration.corner_models import Tried, chosen_model, thinned
 from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS, Lens, estimated_intrinsics
 from gtsam_rwhec.errors import (
     CameraError,
-    CountError,
     OptionError,
     OutlierError,
     RwhecError,
@@ -29,14 +29,15 @@ from gtsam_rwhec.errors import (
     UnderdeterminedError,
 )
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.fitting.camera_choice import with_widest
 from gtsam_rwhec.fitting.corner_findings import DETECTOR_PX, is_doubtful, lens_that_was_left_out
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corners_as_refined import as_refined, intrinsics_of, numbers_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
-from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
-from gtsam_rwhec.fitting.held_out import LeftOut, left_out
+from gtsam_rwhec.fitting.fit_options import CornerOptions
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
-from gtsam_rwhec.fitting.observations import Observations, Views, check_corners_can_hold, check_corners_everywhere
+from gtsam_rwhec.fitting.observations import Observations, check_corners_can_hold, check_corners_everywhere
+from gtsam_rwhec.fitting.readmission import agreeing_by_corners
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement import as_stated, beyond_independent_errors, observed
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection, TriedModel
@@ -47,114 +48,12 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import nearer_poses, selected, with_poses
 from gtsam_rwhec.solver.solution import solve
 
-#: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case.
-MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
-#: Number of cross-validation folds; below `FEW_IMAGES` images more folds, so that enough images remain to calibrate
-#: from.
-FOLDS, FEW_IMAGES, FOLDS_OF_FEW = 4, 50, 8
-#: A counts as exact if this lowers the held-out error to less than this share of the error with noise of A.
-BETTER_SHARE = 0.95
-
-
-@dataclass(frozen=True)
-class Score:
-    """A model, its error in held-out images, and the error that its covariances predict."""
-
-    words: str
-    px: float
-    mm: float
-    expected_px: float
-
-
-@dataclass(frozen=True, eq=False)
-class Tried:
-    """The model that was chosen."""
-
-    options: CornerOptions
-    words: str  #: What it assumes about A and about sizes
-    evidence: str
-    scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
-    left_out: LeftOut  #: Of the chosen one; empty where images are too few
-
-    @property
-    def unexplained(self) -> float:
-        """The ratio of held-out errors to those that the covariances predict; 1 if it may be chance."""
-        times = self.scores[0].px / self.scores[0].expected_px if self.scores else 1.0
-        return times if times > UNEXPLAINED else 1.0
-
-
-def chosen_model(
-    observations: Observations,
-    X: Mapping[str, PoseLike],
-    Y: Mapping[str, PoseLike],
-    options: CornerOptions,
-    tell: Progress,
-    thin: CornersRefined | None = None,
-) -> Tried:
-    """The options that predict held-out images best: the given ones, or the same with A as exact.
-
-    Raises as ``refine_corners`` does.
-    """
-    some = thinned(observations)
-
-    def scored(of: CornerOptions, refined: CornersRefined | None = None) -> tuple[CornerOptions, Score, LeftOut]:
-        refined = refined or refine_corners(some, X, Y, of, tell)
-        folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
-        found = left_out(refined, folds=folds, progress=tell)
-        errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.errors.values()])
-        weights = np.array([one.corners for one in found.errors.values()], dtype=float)
-        return of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found
-
-    try:
-        every = [scored(options, thin)]
-    except CountError as error:
-        return Tried(options, in_words(options), f"no other was tried: {error}", (), LeftOut({}, {}))
-    if options.carrier_noise != "exact":
-        every.append(scored(replace(options, carrier_noise="exact")))
-        if every[1][1].mm < BETTER_SHARE * every[0][1].mm:
-            every.reverse()
-    chosen, score, found = every[0]
-    evidence = f"it predicts images that were left out to {score.px:.3g} px, and {score.mm:.3g} mm on the target"
-    for _, other, _ in every[1:]:
-        size = f"{other.mm:.3g} mm" if np.isfinite(other.mm) else "a target behind its camera"
-        evidence += f" ({size} with {other.words})"
-    return Tried(chosen, score.words, evidence, tuple(one for _, one, _ in every), found)
-
-
-def thinned(observations: Observations) -> Observations:
-    """At most so many images of each pair, evenly over their order."""
-    most = max(MOST_IMAGES // len(observations.views), FEWEST_OF_PAIR)
-
-    def some(view: Views) -> Views:
-        number = len(view.A)
-        at = np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))
-        return view.selected(at)
-
-    return replace(observations, views={pair: some(view) for pair, view in observations.views.items()})
-
-
-def in_words(options: CornerOptions) -> str:
-    """What the options assume about A and about sizes."""
-    noise = options.carrier_noise
-    if isinstance(noise, CarrierNoise):
-        of_A = f"A's noise as stated ({np.degrees(noise.rotation_rad):.2g}° and {1e3 * noise.translation_m:.2g} mm)"
-    else:
-        of_A = "A as exact" if noise == "exact" else "A's noise estimated"
-    if not isinstance(options.size_share, Mapping):
-        return f"{of_A} and sizes {'estimated' if options.size_share else 'as stated'}"
-    free = [name for name, share in options.size_share.items() if share]
-    sizes = f"the size of {free[0]} estimated" if len(free) == 1 else "some sizes estimated"
-    return f"{of_A} and {sizes if free else 'sizes as stated'}"
-
-
 #: The name of this choice: whether the answer is from corners or from poses.
 MEASUREMENTS = "refinement"
 #: Prior standard deviation of an estimated size, relative.
 SIZE_SHARE = 0.2
 #: A growth of standard deviations below this factor is not reported.
 SEEN_GROWTH = 1.05
-#: If errors in held-out images are more than this many times what the covariances predict, the model is incomplete.
-UNEXPLAINED = 1.5
 #: Intrinsics taken as exact, but wrong by more than this many standard deviations of a calibration, give wrong poses.
 SURE_SIGMAS = 5.0
 
@@ -168,8 +67,7 @@ class CornersFound:
     reprojection: Reprojection | None
     choices: tuple[Choice, ...]
     findings: tuple[Finding, ...]
-    #: The factor on each unknown's standard deviations, where held-out images have larger errors than the covariances
-    #: predict; else empty
+    #: The factor on each unknown's standard deviations, where images that were left out show them to be too small
     wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
     start: Refined | None = None  #: The answer from poses that was its start
     without: dict[Pair, int] = field(default_factory=dict)  #: How many measurements have no corners, by pair
@@ -215,7 +113,7 @@ def corners_found(
     options : CornerOptions
     tell : callable
     thin : CornersRefined, optional
-        The refinement of ``thinned(observations)`` under the options, where it was made already.
+        The refinement of ``thinned(observations)`` with everything free, where it was made already.
     far_off : collection of str
         Sensors whose stated intrinsics do not fit their corners, and count as unknown.
     """
@@ -248,15 +146,13 @@ def corners_found(
         return CornersFound.none(why, Finding(Ground.CORNERS_DOUBTED, why))
     scores = tried.scores  # without models that put a target behind its camera
     models = tuple(TriedModel(one.words, one.px, one.mm, one is scores[0]) for one in scores if np.isfinite(one.px))
-    times = tried.unexplained
     return CornersFound(
         corners,
         intrinsics,
         numbers_of(observations, corners, tried.options, tried.left_out.errors, models),
         tuple(_corner_choices(observations, corners, tried, intrinsics, far_off)),
         (*_corner_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
-        # unexplained errors: their ratio, or the disagreement between folds, whichever is larger
-        {slot: max(times, spread) for slot, spread in tried.left_out.spread.items()} if times > 1.0 else {},
+        {slot: factor for slot, factor in tried.wider.items() if slot in corners.slots},
     )
 
 
@@ -293,6 +189,7 @@ def _corner_choices(
     number -= sum(int(mask.sum()) for mask in corners.left_out.values())
     chosen = f"from {number} corners ({corners.noise.corner_px:.2g} px), with {tried.words}"
     yield Choice(MEASUREMENTS, chosen, tried.evidence)
+    yield from _camera_choices(corners, tried)
     growth = growth_by_intrinsics(corners)
     for name, one in intrinsics.items():
         if one.stated_as == "exact":
@@ -319,6 +216,27 @@ def _corner_choices(
         if one.held_by_prior:
             found += f"; {', '.join(one.held_by_prior)} about as stated, since the images do not tell them"
         yield Choice(f"intrinsics of {name}", found, known)
+
+
+def _camera_choices(corners: CornersRefined, tried: Tried) -> Iterator[Choice]:
+    """What is free of cameras and boards, with its rivals; and by how much blocks of images widen the deviations."""
+    for what in dict.fromkeys(one.what for one in tried.cameras.tried):
+        every = [one for one in tried.cameras.tried if one.what == what]
+        chosen = next(one for one in every if one.is_chosen)
+        others = [one for one in every if one.is_shared != chosen.is_shared]
+        if others and not chosen.is_shared:
+            continue  # they are no one camera, and what is free of each is said of it
+        rivals = [f"{one.px:.4g} px {one.words}" for one in every if one not in others and one is not chosen]
+        if others:
+            rivals.append(f"{min(one.px for one in others):.4g} px each camera by itself, at best")
+        words = f"one camera for all of them, {chosen.words}" if chosen.is_shared else chosen.words
+        evidence = f"the simplest that predicts images that were left out as well as any: {chosen.px:.4g} px"
+        yield Choice(what, words, f"{evidence} ({', '.join(rivals)})")
+    frames = [(name, factor) for (letter, name), factor in tried.wider.items() if letter in "xy"]
+    said = ", ".join(f"{name} {factor:.2g}" for name, factor in frames if factor > SEEN_GROWTH)
+    if said:
+        evidence = "answers without blocks of images, by time and by pose, scatter by more than corners' errors explain"
+        yield Choice("standard deviations", f"widened by these factors: {said}", evidence)
 
 
 def growth_by_intrinsics(corners: CornersRefined) -> dict[str, float]:
@@ -395,7 +313,8 @@ def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefin
     if not _why_not(run, base):
         observations, options, _ = _observed(run, base, found.noise.model)
         try:
-            corners = refine_corners(thinned(observations), X, Y, options, run.tell)
+            widest = with_widest(options, observations)
+            corners = refine_corners(thinned(observations), X, Y, widest, run.tell)
         except RwhecError:  # then the answer is from the poses, and says why
             return None, None
         if is_doubtful(corners):
@@ -424,25 +343,50 @@ def _from_corners(
     return replace(found, start=base, without=without)
 
 
-def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tuple[Run, CornersFound]:
-    """The run with target poses by the intrinsics that a log's corners give, and the result from these corners.
+def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tuple[Run, CornersFound, Inliers]:
+    """The run with target poses by the intrinsics that a log's corners give, what these corners give, and inliers.
 
-    ``base`` is an answer from the poses of the inliers. If the corners contradict the stated intrinsics, the run starts
-    again.
+    ``base`` is an answer from the poses of the inliers. Images whose corners agree are inliers, too. If the corners
+    contradict the stated intrinsics, the run starts again.
     """
     found = _from_corners(replace(run, problem=agreeing(run.problem, inliers)), base)
+    for _ in range(MOST_TIMES):
+        more = None if found.corners is None else _readmitted(run, base, inliers, found.corners)
+        if more is None:
+            break
+        run.tell("refining from corners, with images whose corners agree")
+        again = _from_corners(replace(run, problem=agreeing(run.problem, more)), base)
+        if again.corners is None:
+            break
+        found, inliers = again, more
     corners = found.corners
     if corners is None:
-        return run, found
+        return run, found, inliers
     run.tell("computing the poses of targets again, with the estimated intrinsics")
     try:
         cameras = {name: one.camera for name, one in corners.intrinsics.items()}
         better, _ = nearer_poses(run.problem, corners.X, corners.Y, cameras)
     except (CameraError, TargetError):  # a lens without a ray for a corner, or a target that is not flat
-        return run, found
+        return run, found, inliers
     if found.contradicted and run.times <= MOST_TIMES:
-        return run.again(better, cameras), found
-    return replace(run, problem=better, cameras=cameras), found
+        return run.again(better, cameras), found, inliers
+    return replace(run, problem=better, cameras=cameras), found, inliers
+
+
+def _readmitted(run: Run, base: Refined, inliers: Inliers, corners: CornersRefined) -> Inliers | None:
+    """The inliers, with images that their poses left out and whose corners agree; None if there is none of these."""
+    if not inliers or all(mask.all() for mask in inliers.values()):
+        return None
+    observations, _, _ = _observed(run, replace(base, inliers={}), None)
+    has = _with_corners(run.problem)
+    kept = {pair: inliers[pair][has[pair]] for pair in map(Pair._make, observations.views)}
+    found = agreeing_by_corners(observations, kept, corners)
+    if all(np.array_equal(mask, kept[pair]) for pair, mask in found.items()):
+        return None
+    more = {pair: mask.copy() for pair, mask in inliers.items()}
+    for pair, mask in found.items():
+        more[pair][np.flatnonzero(has[pair])[mask]] = True
+    return more
 
 
 def answered_by_corners(

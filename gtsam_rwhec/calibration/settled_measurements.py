@@ -83,18 +83,18 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], Corners
     run = replace(run, problem=now.problem, stated=stated, moved_s=now.moved_s)
     if told is None or told.refined is None:
         return run, sizes, None
-    by = None
+    by, inliers = None, told.inliers
     if run.recording is not None:
         if options.sizes == "check" and problem.scale == "known":
             sizes = _sizes_as_seen(run, told.inliers)
-        better, by = with_estimated_intrinsics(run, told.refined, told.inliers)
+        better, by, inliers = with_estimated_intrinsics(run, told.refined, told.inliers)
         if better.times > run.times:
             again, other_sizes, other = settled_measurements(better)
             if other is not None and other.corners is not None:
                 return again, other_sizes, other
         else:
             run = better
-    return replace(run, agreed=_agreed(run, told.inliers)), sizes, by
+    return replace(run, agreed=_agreed(run, inliers)), sizes, by
 
 
 def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:

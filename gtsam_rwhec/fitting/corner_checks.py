@@ -69,7 +69,9 @@ def check_options(options: CornerOptions, observations: Observations) -> None:
             )
     for words, given, known, what in (
         ("stated", options.stated, observations.cameras, "sensors"),
+        ("lens", options.lens, observations.cameras, "sensors"),
         ("size_share", options.size_share, observations.corners, "targets"),
+        ("warp_m", options.warp_m, observations.corners, "targets"),
     ):
         strange = [name for name in given if name not in known] if isinstance(given, Mapping) else []
         if strange:
@@ -196,7 +198,7 @@ def _what_there_is(model: Model) -> str:
 def few_corners(model: Model) -> str:
     """A sentence if the corners give no more equations than there are unknowns; else empty."""
     numbers = 2 * sum(int(stack.known.sum()) for stack in model.stacks)
-    cameras = sum(len(mean) for mean, off in model.camera_priors.values() if off[2] > CENTRE_PX["exact"])
+    cameras = sum(len(prior.mean) for prior in model.camera_priors.values() if prior.deviation[2] > CENTRE_PX["exact"])
     boards = sum(len(model.free_shape(name)) for name in model.targets)
     corners = {stack.target: 3 * len(stack.points) for stack in model.stacks if stack.target in model.corner_priors}
     unknowns = 6 * (len(model.targets) + len(model.sensors)) + cameras + boards + sum(corners.values())

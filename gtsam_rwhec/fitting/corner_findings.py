@@ -118,7 +118,7 @@ def _of_clocks(refined: CornersRefined) -> Iterator[str]:
             why = "move alike" if moves else "stand still"
             yield (
                 f"The images do not tell the time offset of {name}, since the carriers {why} in all of them: it is "
-                f"{round(offset_s, 9):+.2g} s, with a deviation of {deviation:.2g} s. Leave {name} out of "
+                f"{round(offset_s, 9) + 0.0:+.2g} s, with a deviation of {deviation:.2g} s. Leave {name} out of "
                 "CornerOptions.time_offsets, or take images in motion that speeds up, slows down and turns back."
             )
         elif abs(offset_s) > CONSTANT_S:
@@ -187,7 +187,7 @@ def _off(intrinsics: RefinedIntrinsics, part: str) -> str:
 def lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
     """The distortion found for sensors that share a camera stated without distortion; empty if there is none."""
     model, intrinsics = refined.graph.model, refined.intrinsics[sensors[0]]
-    mean, _ = model.camera_priors[model.camera_of[sensors[0]]]
+    mean = model.camera_priors[model.camera_of[sensors[0]]].mean
     D = intrinsics.camera.D
     if intrinsics.camera.model != "radtan" or mean[PINHOLE:].any():
         return ""

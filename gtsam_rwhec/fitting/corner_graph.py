@@ -126,10 +126,15 @@ class CornerGraph:
             for i, (T, covariance) in enumerate(zip(model.A, columns @ columns.transpose(0, 2, 1), strict=True)):
                 noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
                 self.graph.add(gtsam.PriorFactorPose3(key_of("a", i), gtsam.Pose3(T), noise))
-        for at, (mean, deviation) in model.priors(self.start).items():
-            # an infinite deviation is a weight of zero
-            noise = gtsam.noiseModel.Diagonal.Precisions(deviation**-2.0)  # small deviations are no constraints either
-            self.graph.add(gtsam.PriorFactorVector(self.keys[at], mean, noise))
+        for at, prior in model.priors(self.start).items():
+            # an infinite deviation is a weight of zero, and small ones are no constraints either
+            noise = gtsam.noiseModel.Diagonal.Precisions(prior.deviation**-2.0)
+            self.graph.add(gtsam.PriorFactorVector(self.keys[at], prior.mean, noise))
+            if np.isfinite(prior.aspect):
+                rows = np.zeros((len(prior.mean), len(prior.mean)))
+                rows[0] = prior.tie
+                noise = gtsam.noiseModel.Gaussian.SqrtInformation(rows)
+                self.graph.add(gtsam.PriorFactorVector(self.keys[at], prior.mean, noise))
 
     def _variables_of(self, s: int) -> dict[str, tuple[str, str]]:
         """The letters and names of a stack's variables by their names in `Model`, without A."""

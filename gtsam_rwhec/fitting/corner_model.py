@@ -9,6 +9,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.fitting.corner_residuals import Linear, Seen, Stack, linearised, pixel_errors, seen
 from gtsam_rwhec.fitting.fit_options import About
+from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior
 from gtsam_rwhec.geometry.poses import Array
 
 #: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
@@ -46,9 +47,9 @@ class Model:
     about: About
     #: The camera of each sensor: several sensors may share one.
     camera_of: dict[str, str]
-    #: Mean (m,) and deviation (m,) by camera. A deviation may be infinite.
-    camera_priors: dict[str, tuple[Array, Array]]
-    #: (3,) each. Deviations of a board's shape by target; zero: that number is not free.
+    #: By camera. A deviation may be infinite.
+    camera_priors: dict[str, CameraPrior]
+    #: (4,) each. Deviations of a board's shape by target; zero: that number is not free.
     shape_priors: dict[str, Array]
     #: Standard deviation of a corner along each axis.
     corner_px: float
@@ -131,19 +132,20 @@ class Model:
             | {("p", name): point.corners[name].ravel() for name in self.corner_priors}
         )
 
-    def priors(self, point: Point) -> dict[tuple[str, str], tuple[Array, Array]]:
-        """Mean and deviations of the prior of each of the `vectors`."""
+    def priors(self, point: Point) -> dict[tuple[str, str], CameraPrior]:
+        """The prior of each of the `vectors`."""
         deviations: dict[tuple[str, str], float | Array] = {}
         deviations |= {("t", name): in_s for name, in_s in self.offset_priors.items()}
         deviations |= {("p", name): in_m for name, in_m in self.corner_priors.items()}
         deviations |= {("b", name): of[self.free_shape(name)] for name, of in self.shape_priors.items()}
-        found: dict[tuple[str, str], tuple[Array, Array]] = {("k", name): of for name, of in self.camera_priors.items()}
+        found = {("k", name): of for name, of in self.camera_priors.items()}
         vectors = self.vectors(point)
-        found |= {at: (np.zeros(len(vectors[at])), of * np.ones(len(vectors[at]))) for at, of in deviations.items()}
+        for at, of in deviations.items():
+            found[at] = CameraPrior(np.zeros(len(vectors[at])), of * np.ones(len(vectors[at])))
         return {at: found[at] for at in vectors}
 
     def free_shape(self, target: str) -> np.ndarray:
-        """Which of the three numbers of a board's shape are free."""
+        """Which of the four numbers of a board's shape are free."""
         return np.flatnonzero(self.shape_priors.get(target, ()))
 
     def variables_of(self, stack: Stack) -> tuple[str, ...]:

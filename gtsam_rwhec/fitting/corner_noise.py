@@ -51,8 +51,11 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class _WithoutCarriers:
-    """H, h, r'F^-1 r and log |F| without the carriers' errors; K (I, 6, 6), K C / s^2 and K b / s^2."""
+class WithoutCarriers:
+    """H, h, r'F^-1 r and log |F| of the measurements, without the carriers' errors; K (I, 6, 6), K C / s^2, K b / s^2.
+
+    The prior is not among them.
+    """
 
     H: Array
     h: Array
@@ -79,19 +82,23 @@ class Reduced:
     rr: float
     #: Number of residuals, weights counted.
     count: float
-    #: (d,): Precisions of the priors on theta, and `prior_off` (d,) how far the point is from their means.
+    #: (d, d): The precision of the prior on theta, and `prior_off` (d,) how far the point is from its mean.
     prior: Array
     prior_off: Array
 
     @staticmethod
-    def of(model: Model, point: Point) -> Reduced:
-        """The sums at a point. The errors of its A are taken off the residuals, to first order."""
+    def of(model: Model, point: Point, slots: Mapping[tuple[str, str], slice] | None = None) -> Reduced:
+        """The sums at a point; of a part of a model's images in the whole's `slots`.
+
+        The errors of the point's A are taken off the residuals, to first order.
+        """
         vectors = model.vectors(point)
-        widths = {("x", name): 6 for name in model.targets} | {("y", name): 6 for name in model.sensors}
-        widths |= {at: len(vector) for at, vector in vectors.items()}
-        ends = np.cumsum(list(widths.values())).tolist()
-        slots = {at: slice(end - width, end) for (at, width), end in zip(widths.items(), ends, strict=True)}
-        size = ends[-1]
+        if slots is None:
+            widths = {("x", name): 6 for name in model.targets} | {("y", name): 6 for name in model.sensors}
+            widths |= {at: len(vector) for at, vector in vectors.items()}
+            ends = np.cumsum(list(widths.values())).tolist()
+            slots = {at: slice(end - width, end) for (at, width), end in zip(widths.items(), ends, strict=True)}
+        size = max(at.stop for at in slots.values())
         count = len(model.A)
         G, g = np.zeros((size, size)), np.zeros(size)
         C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
@@ -126,10 +133,10 @@ class Reduced:
             np.add.at(C, stack.instant, of_view)
             np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
             np.add.at(b, stack.instant, of_A[..., -1])
-        prior, off = np.zeros(size), np.zeros(size)
-        for at, (mean, deviation) in model.priors(point).items():
-            prior[slots[at]] = deviation**-2.0
-            off[slots[at]] = vectors[at] - mean
+        prior, off = np.zeros((size, size)), np.zeros(size)
+        for at, of in model.priors(point).items():
+            prior[slots[at], slots[at]] = of.precision
+            off[slots[at]] = vectors[at] - of.mean
         return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
@@ -143,16 +150,17 @@ class Reduced:
         its variance (Patterson and Thompson's equations).
         """
         s2, S = noise.corner_px**2, noise.carrier
-        at = self._without_carriers(noise)
-        H, h, K, KC, Kb = at.H, at.h, at.K, at.KC, at.Kb
+        at = self.without_carriers(noise)
+        H, h, K, KC, Kb = at.H + self.prior, at.h + self.prior @ self.prior_off, at.K, at.KC, at.Kb
         size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
         sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
         if sign <= 0.0:
             return np.inf, np.zeros(3)
         inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
         theta = -inverse @ h
-        value = at.rr + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
-        free = len(H) - float(self.prior @ np.diagonal(inverse))
+        off = float(self.prior_off @ self.prior @ self.prior_off)
+        value = at.rr + off + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
+        free = len(H) - float((self.prior * inverse).sum())
         squares = self.rr + 2.0 * float(self.g @ theta) + float(theta @ self.G @ theta)
         gradient = np.zeros(3)
         if S is not None:
@@ -167,7 +175,8 @@ class Reduced:
         gradient[0] = 2.0 * (self.count - squares / s2 - free)
         return value, gradient
 
-    def _without_carriers(self, noise: Noise) -> _WithoutCarriers:
+    def without_carriers(self, noise: Noise) -> WithoutCarriers:
+        """The sums of the measurements under a noise, the carriers' errors eliminated."""
         s2, S = noise.corner_px**2, noise.carrier
         H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, self.count * np.log(s2)
         K, KC, Kb = np.zeros_like(self.M), np.zeros_like(self.C), np.zeros_like(self.b)
@@ -181,13 +190,11 @@ class Reduced:
             h = h - flat.T @ Kb.ravel() / s2
             rr -= float((self.b * Kb).sum()) / s2
             log_det += float(np.linalg.slogdet(inner)[1].sum())
-        H = H + np.diag(self.prior)
-        h = h + self.prior * self.prior_off
-        return _WithoutCarriers(H, h, rr + float(self.prior @ self.prior_off**2), log_det, K, KC, Kb)
+        return WithoutCarriers(H, h, rr, log_det, K, KC, Kb)
 
     def information(self, noise: Noise) -> Array:
         """The information (d, d) of theta under a noise, the carriers' errors eliminated."""
-        return self._without_carriers(noise).H
+        return self.without_carriers(noise).H + self.prior
 
     def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
         """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""

@@ -36,9 +36,11 @@ from gtsam_rwhec.fitting.corner_residuals import SHAPE, shaped, stacks_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions, RefineOptions
 from gtsam_rwhec.fitting.observations import Observations, first_intrinsics, solved_with_chosen_poses
+from gtsam_rwhec.fitting.readmission import agreeing_by_corners
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.fitting.stated_intrinsics import Innovation, free_model, innovation_of, prior_of, wider
+from gtsam_rwhec.fitting.reprojection_record import WARPS
+from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior, Innovation, free_model, innovation_of, prior_of, wider
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.problem.measurements import Pair
@@ -50,6 +52,8 @@ ROUNDS, SETTLED = 12, 1e-3
 #: Steps end where the cost falls by less than this share; with outliers in the fit, which only tells which corners they
 #: are, by less than ``ROUGHLY``.
 EXACTLY, ROUGHLY = 1e-9, 1e-2
+#: Images that their poses left out are taken back by their corners at most so many times, less one.
+READMISSIONS = 3
 #: Doubted priors are widened at most so many times.
 WIDENINGS = 6
 #: Deviations at the start: of a corner (pixels) and of the carriers' poses (rad, m).
@@ -123,11 +127,8 @@ def refine_corners(
     tests = _innovations(settled, priors)
     for _ in range(WIDENINGS):
         before = settled.model.camera_priors
-        now = {
-            name: (before[name][0], wider(before[name][1], test))
-            for name, test in _innovations(settled, before).items()
-        }
-        if all(np.array_equal(now[name][1], before[name][1]) for name in now):
+        now = {name: wider(before[name], test) for name, test in _innovations(settled, before).items()}
+        if all(np.array_equal(now[name].deviation, before[name].deviation) for name in now):
             break
         settled = _settled(
             replace(settled.model, camera_priors=now), settled.point, settled.noise, options, tell, settled.iterations
@@ -142,10 +143,11 @@ def refine_corners(
             name: RefinedIntrinsics(
                 camera.with_parameters(point.cameras[first[name]]),
                 _block(settled, ("k", first[name])),
-                settled.model.camera_priors[first[name]][1],
-                float((settled.model.camera_priors[first[name]][1] / priors[first[name]][1]).max()),
+                settled.model.camera_priors[first[name]].deviation,
+                float((settled.model.camera_priors[first[name]].deviation / priors[first[name]].deviation).max()),
                 tests[first[name]],
                 rms[name],
+                options.lens_of(first[name]),
             )
             for name, camera in cameras.items()
         },
@@ -177,8 +179,11 @@ def _stated(
     """The model as it is stated, the start, rough noise, and the cameras with the lens models that are estimated."""
     first = {name: options.camera_of(name) for name in observations.sensors}
     stated = {name: options.stated_of(first[name]) for name in observations.sensors}
-    cameras = {name: free_model(observations.cameras[first[name]], stated[name]) for name in observations.sensors}
-    priors = {first[name]: prior_of(camera, stated[name]) for name, camera in cameras.items()}
+    lens = {name: options.lens_of(first[name]) for name in observations.sensors}
+    cameras = {
+        name: free_model(observations.cameras[first[name]], stated[name], lens[name]) for name in observations.sensors
+    }
+    priors = {first[name]: prior_of(camera, stated[name], lens[name]) for name, camera in cameras.items()}
     stacks, A = stacks_of(replace(observations, cameras=cameras))
     given = options.carrier_noise
     noise, about = ROUGH, options.about
@@ -187,7 +192,8 @@ def _stated(
     elif given == "exact":
         noise = Noise(ROUGH.corner_px, 0.0, 0.0)
     shapes = {
-        name: np.array([options.size_share_of(name), options.warp_m, options.warp_m]) for name in observations.targets
+        name: np.append(options.size_share_of(name), np.full(len(WARPS), options.warp_m_of(name)))
+        for name in observations.targets
     }
     model = Model(
         stacks, A, noise.carrier, about, first, priors,
@@ -201,7 +207,7 @@ def _stated(
         {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
         {name: one_transform(Y[name], f"start of {name}") for name in observations.sensors},
         A,
-        {name: cameras[name].parameters for name in priors},
+        {name: prior.start(cameras[name].parameters) for name, prior in priors.items()},
         {name: np.zeros(SHAPE) for name in observations.targets},
         dict.fromkeys(options.time_offsets, 0.0),
         {name: np.zeros_like(observations.corners[name]) for name in observations.targets if options.corners_m},
@@ -273,10 +279,10 @@ def _block(settled: _Settled, name: tuple[str, str]) -> Array:
     return settled.joint[at, at]
 
 
-def _innovations(settled: _Settled, priors: Mapping[str, tuple[Array, Array]]) -> dict[str, Innovation]:
+def _innovations(settled: _Settled, priors: Mapping[str, CameraPrior]) -> dict[str, Innovation]:
     return {
-        name: innovation_of(settled.point.cameras[name] - mean, deviation, _block(settled, ("k", name)))
-        for name, (mean, deviation) in priors.items()
+        name: innovation_of(settled.point.cameras[name] - prior.mean, prior.deviation, _block(settled, ("k", name)))
+        for name, prior in priors.items()
     }
 
 
@@ -345,16 +351,21 @@ def calibrate_corners(
     refined = solved_with_chosen_poses(
         observations, lambda problem: _refined(problem, robust, tell), lambda answer: (answer.X, answer.Y)
     )
-    views = {
-        pair: view.selected(good)
-        for pair, view in observations.views.items()
-        if (good := refined.inliers[Pair(*pair)]).any()
-    }
-    kept = replace(observations, views=views)
-    answer = refine_corners(kept, refined.X, refined.Y, options, tell)
-    lenses = findings_of_images_left_out(observations, refined.inliers)
+    inliers = dict(refined.inliers)
+    for _ in range(READMISSIONS):
+        views = {
+            pair: view.selected(good)
+            for pair, view in observations.views.items()
+            if (good := inliers[Pair(*pair)]).any()
+        }
+        kept = replace(observations, views=views)
+        answer = refine_corners(kept, refined.X, refined.Y, options, tell)
+        before, inliers = inliers, agreeing_by_corners(observations, inliers, answer)
+        if all(np.array_equal(mask, before[pair]) for pair, mask in inliers.items()):
+            break
+    lenses = findings_of_images_left_out(observations, before)
     answer = replace(answer, findings=(*answer.findings, *lenses))
-    return CornersCalibrated(refined.solution, answer, dict(refined.inliers), kept)
+    return CornersCalibrated(refined.solution, answer, before, kept)
 
 
 def _refined(problem: Problem, options: RefineOptions, tell: Progress) -> Refined:

@@ -1,10 +1,12 @@
 """Corners in images as residuals: pixel errors over their deviation, with derivatives by everything that is not known.
 
 A corner p of a target's board is seen by a sensor at the pixel of P = Y^-1 A X p', by the camera's parameters. The
-board may be larger than stated, and bent: p' = (1 + s) p + (w_x (x / l)^2 + w_y (y / l)^2) e_z, l the largest distance
-of a corner from the board's origin; and each corner may be off its place: p' + d. A is the carriers' pose at the
-instant of the image. Where the sensor's clock is off by t seconds, it is the pose at that time: A Expmap(t twist), with
-the carriers' velocity at the instant.
+board may be larger than stated, and bent about any axis, with l the largest distance of a corner from its origin:
+
+    p' = (1 + s) p + (w_x x^2 + w_y y^2 + w_xy x y) / l^2 e_z
+
+Each corner may be off its place: p' + d. A is the carriers' pose at the instant of the image. Where the sensor's clock
+is off by t seconds, it is the pose at that time: A Expmap(t twist), with the carriers' velocity at the instant.
 """
 
 from __future__ import annotations
@@ -19,8 +21,8 @@ from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.stated_intrinsics import pixels_and_derivatives
 from gtsam_rwhec.geometry.poses import Array
 
-#: The shape of a board: s (a share), w_x and w_y (metres).
-SHAPE = 3
+#: The shape of a board: s (a share), w_x, w_y and w_xy (metres).
+SHAPE = 4
 #: A corner must be this far in front of its camera, metres.
 NEAREST_M = 1e-6
 
@@ -148,11 +150,11 @@ def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
 
 
 def shaped(points: Array, shape: Array) -> tuple[Array, Array]:
-    """The corners (n, 3) of a board with a shape (3,), and their derivatives (n, 3, 3) by it."""
-    squared = (points[:, :2] / np.linalg.norm(points, axis=1).max()) ** 2
+    """The corners (n, 3) of a board with a shape (4,), and their derivatives (n, 3, 4) by it."""
+    x, y = (points[:, :2] / np.linalg.norm(points, axis=1).max()).T
     by_shape = np.zeros((len(points), 3, SHAPE))
     by_shape[:, :, 0] = points
-    by_shape[:, 2, 1:] = squared
+    by_shape[:, 2, 1:] = np.stack([x * x, y * y, x * y], axis=1)
     return points + by_shape @ shape, by_shape
 
 
@@ -160,7 +162,7 @@ def shaped(points: Array, shape: Array) -> tuple[Array, Array]:
 class Seen:
     """A stack's corners on their way to the camera."""
 
-    #: (n, 3): In the target's frame, shaped; `by_shape` (n, 3, 3) are its derivatives.
+    #: (n, 3): In the target's frame, shaped; `by_shape` (n, 3, 4) are its derivatives.
     p: Array
     by_shape: Array
     #: (V, 4, 4): Poses T_sensor_target.

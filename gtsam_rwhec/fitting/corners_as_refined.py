@@ -26,6 +26,7 @@ from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements
 from gtsam_rwhec.fitting.reprojection_record import (
     SIZE,
+    WARPS,
     BoardShape,
     Consequence,
     Intrinsics,
@@ -37,7 +38,7 @@ from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 
 #: The numbers of a board's shape.
-SHAPE_NAMES = (SIZE, "warp_x", "warp_y")
+SHAPE_NAMES = (SIZE, *WARPS.values())
 assert len(SHAPE_NAMES) == SHAPE
 
 
@@ -137,7 +138,7 @@ def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict
     found = {}
     camera_of = corners.graph.model.camera_of
     for name, refined in corners.intrinsics.items():
-        camera, mean = refined.camera, corners.graph.model.camera_priors[camera_of[name]][0]
+        camera, mean = refined.camera, corners.graph.model.camera_priors[camera_of[name]].mean
         found[name] = Intrinsics(
             model=camera.model,
             width=camera.width,
@@ -153,6 +154,7 @@ def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict
             innovation_deviations=refined.innovation.deviations,
             held_by_prior=refined.held_by_prior,
             rms_px=refined.rms_px,
+            not_free=refined.not_free,
         )
     return found
 
@@ -308,7 +310,7 @@ def _of_carrier_noise(refined: CornersRefined) -> Array:
     model = refined.graph.model
     reduced = Reduced.of(model, replace(refined.point, A=model.A))
     s2 = refined.noise.corner_px**2
-    inverse = np.linalg.inv(reduced.G / s2 + np.diag(reduced.prior))
+    inverse = np.linalg.inv(reduced.G / s2 + reduced.prior)
     C = reduced.C[:, :3] / s2 * CARRIER_RAD
     flat = C.reshape(-1, C.shape[2])
     covariance: Array = inverse @ (flat.T @ flat) @ inverse

@@ -15,7 +15,8 @@ from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corner_model import Point
 from gtsam_rwhec.fitting.corner_noise import Noise
-from gtsam_rwhec.fitting.stated_intrinsics import Innovation, held_by_prior
+from gtsam_rwhec.fitting.fit_options import FreeLens
+from gtsam_rwhec.fitting.stated_intrinsics import Innovation, held_by_prior, is_free
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 
@@ -35,6 +36,8 @@ class RefinedIntrinsics:
     innovation: Innovation
     #: Root mean square error, along each axis, of the corners that count.
     rms_px: float
+    #: What was free.
+    lens: FreeLens = "all"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -47,9 +50,14 @@ class RefinedIntrinsics:
         return tuple(np.sqrt(np.diagonal(self.covariance)).tolist())
 
     @property
+    def not_free(self) -> tuple[str, ...]:
+        """Parameters that were held as stated."""
+        return tuple(name for name, free in zip(self.names, is_free(self.camera, self.lens), strict=True) if not free)
+
+    @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Parameters that the images do not determine: what is known of them is what was stated."""
-        held = held_by_prior(self.stated_deviations, self.covariance)
+        held = held_by_prior(self.stated_deviations, self.covariance) & is_free(self.camera, self.lens)
         return tuple(name for name, is_held in zip(self.names, held, strict=True) if is_held)
 
 
@@ -62,8 +70,8 @@ class CornersRefined:
     Y: dict[str, gtsam.Pose3]
     #: By sensor.
     intrinsics: dict[str, RefinedIntrinsics]
-    #: (3,) each. By target: its size less the stated one, a share; heights of its edge over its middle along x and y,
-    #: metres.
+    #: (4,) each. By target: its size less the stated one, a share; heights of its edge over its middle along x and y,
+    #: and of a bend along its diagonals (`corner_residuals`), metres.
     shapes: dict[str, Array]
     #: (n, 3) each. By target: its corners in its frame, with its size, its bend and what each is off its place, metres.
     corners: dict[str, Array]

@@ -24,6 +24,9 @@ CarrierModel = Literal["auto", "propagated", "variables"]
 About = Literal["targetcarrier", "sensorcarrier"]
 ObservationKind = Literal["poses", "corners"]
 Stated = Literal["exact", "calibration", "nominal", "unknown"]
+#: What is free of a camera, each with what comes before it: one focal length and the centre; fx and fy apart; and the
+#: coefficients of the lens in this order. "all": what its lens model has.
+FreeLens = Literal["focal", "focals", "k1", "k2", "p2", "k3", "all"]
 
 
 @dataclass(frozen=True)
@@ -244,13 +247,17 @@ class CornerOptions:
     #: fixed. Sensors that a dict lacks are nominal. Where the images contradict what is stated, the deviation is
     #: widened, and the result says so.
     stated: Stated | Mapping[str, Stated] = "nominal"
+    #: What is free of each camera's intrinsics; the rest is held as stated. Sensors that a dict lacks have all free.
+    #: ``calibrate`` chooses it: the simplest camera that predicts images that were left out.
+    lens: FreeLens | Mapping[str, FreeLens] = "all"
     #: Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
     shared: tuple[tuple[str, ...], ...] = field(default=())
     #: Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated, as are those of targets
     #: that a dict lacks.
     size_share: float | Mapping[str, float] = 0.0
-    #: Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
-    warp_m: float = 0.0
+    #: Standard deviation of the height of a bent board's edge over its middle, metres; 0: it is flat, as are targets
+    #: that a dict lacks. ``calibrate`` chooses between flat and bent where this is 0.
+    warp_m: float | Mapping[str, float] = 0.0
     #: Standard deviation of each corner's place on its board along each axis, metres, such as a printer's 1e-4; 0: they
     #: are where the board has them. With n corners there are 3n more unknowns: time grows with their square.
     corners_m: float = 0.0
@@ -275,8 +282,14 @@ class CornerOptions:
                 raise OptionError(
                     f"CornerOptions.stated={brief(value)} is not one of {', '.join(map(repr, get_args(Stated)))}"
                 )
+        for lens in self.lens.values() if isinstance(self.lens, Mapping) else (self.lens,):
+            if not is_one_of(lens, get_args(FreeLens)):
+                raise OptionError(
+                    f"CornerOptions.lens={brief(lens)} is not one of {', '.join(map(repr, get_args(FreeLens)))}"
+                )
         shares = self.size_share.values() if isinstance(self.size_share, Mapping) else (self.size_share,)
-        others = (("warp_m", self.warp_m), ("corners_m", self.corners_m))
+        warps = self.warp_m.values() if isinstance(self.warp_m, Mapping) else (self.warp_m,)
+        others = (*(("warp_m", each) for each in warps), ("corners_m", self.corners_m))
         for name, deviation in (*(("size_share", each) for each in shares), *others):
             if not (is_real(deviation) and 0.0 <= deviation < np.inf):
                 raise OptionError(f"CornerOptions.{name}={brief(deviation)}; give a standard deviation, or 0")
@@ -299,9 +312,17 @@ class CornerOptions:
         """Where a sensor's intrinsics come from."""
         return self.stated.get(sensor, "nominal") if isinstance(self.stated, Mapping) else self.stated
 
+    def lens_of(self, sensor: str) -> FreeLens:
+        """What is free of a sensor's intrinsics."""
+        return self.lens.get(sensor, "all") if isinstance(self.lens, Mapping) else self.lens
+
     def size_share_of(self, target: str) -> float:
         """The standard deviation of a target's size, a share of 1."""
         return self.size_share.get(target, 0.0) if isinstance(self.size_share, Mapping) else self.size_share
+
+    def warp_m_of(self, target: str) -> float:
+        """The standard deviation of a target's bend, metres."""
+        return self.warp_m.get(target, 0.0) if isinstance(self.warp_m, Mapping) else self.warp_m
 
     def camera_of(self, sensor: str) -> str:
         """The sensor whose intrinsics this sensor has: its own, or the first one's of its group."""

@@ -141,6 +141,9 @@ def observed(
         observations = replace(observations, views=kept)
     if late and not options.time_offsets:
         options = replace(options, time_offsets=tuple(name for name in late if name in observations.sensors))
+    gone = set(problem.sensors) - set(observations.sensors)  # all their images are left out
+    groups = [tuple(name for name in group if name not in gone) for group in options.shared]
+    options = replace(options, shared=tuple(group for group in groups if len(group) > 1))
     if problem.scale == "per_target" and not options.size_share:
         free = [name for name in problem.targets if name not in problem.fixed_scales]
         options = replace(options, size_share=dict.fromkeys(free, SIZE_SHARE))
@@ -204,8 +207,8 @@ def beyond_independent_errors(
         letters = "xyt" if corners.noise.carrier is not None else "xytkbp"
         of_poses = np.sqrt(max(found.instants / max(found.worth, 1e-300), 1.0))
         for (letter, _), rows in corners.slots.items():
-            if letter in letters:
-                scale[rows] *= of_poses
+            if letter in letters:  # both see errors that neighbours share
+                scale[rows] = np.maximum(scale[rows], of_poses)
     more: Array = corners.joint * (np.outer(scale, scale) - 1.0)
     if found is None:
         return more

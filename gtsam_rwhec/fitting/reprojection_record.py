@@ -15,7 +15,7 @@ from gtsam_rwhec.files.terminal_text import rounded
 #: The name of a board's size among its numbers: its covariance is that of the target's scale.
 SIZE = "size"
 #: The names of a board's warp, by its axis.
-WARPS = {"x": "warp_x", "y": "warp_y"}
+WARPS = {"x": "warp_x", "y": "warp_y", "xy": "warp_xy"}
 #: By region of the image, rows from the top, columns from the left; None where no corner was seen.
 Regions = tuple[tuple[float | None, ...], ...]
 
@@ -85,7 +85,7 @@ class BoardShape:
     """What was estimated of a board."""
 
     #: "size" (its size less the stated one, a share of 1), "warp_x" and "warp_y" (heights of its edge over its middle
-    #: along x and y, metres).
+    #: along x and y, metres) and "warp_xy" (how much farther up it is along one diagonal than along the other).
     names: tuple[str, ...]
     #: In that order.
     values: tuple[float, ...]
@@ -107,7 +107,8 @@ class BoardShape:
         for axis, name in WARPS.items():
             if name in found:
                 height, deviation = (1e3 * each[found[name]] for each in (self.values, self.standard_deviations))
-                said.append(f"its edge along {axis} is {height:+.3f} ± {rounded(deviation)} mm above its middle")
+                where = "along x = y less that along x = -y" if axis == "xy" else f"along {axis}"
+                said.append(f"its edge {where} is {height:+.3f} ± {rounded(deviation)} mm above its middle")
         if self.corners_off_m:
             off, deviation = (
                 1e3 * float(np.sqrt((np.array(each) ** 2).sum(axis=1).mean()))
@@ -183,6 +184,8 @@ class Intrinsics:
     held_by_prior: tuple[str, ...]
     #: Root mean square error, along each axis, of the corners that count.
     rms_px: float
+    #: Parameters that were held as stated: images that were left out are predicted as well without them.
+    not_free: tuple[str, ...] = ()
     #: Standard deviation of the projection of points at `projection_m` before the camera, pixels, by region of the
     #: image: from the lens alone, with the pose refitted to the corners for each error of the lens.
     projection_px: Regions = ()

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple, get_args
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.distortion import coefficient_jacobian, distorted
-from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.fit_options import FreeLens, Stated
 from gtsam_rwhec.geometry.poses import Array
 
 #: fx, fy, cx, cy come before the coefficients.
@@ -30,30 +31,83 @@ CENTRE_PX = {"exact": 1e-5, "calibration": 3.0, "nominal": 30.0, "unknown": 30.0
 CENTRE_OF_WIDTH = {"exact": 0.0, "calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
 LENS_PX = {"exact": 1e-5, "calibration": 3.0}
 LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
+#: Deviations of fy / fx and of p1 and p2 from what is stated; those of published calibrations: docs/lens_priors.md.
+ASPECT, TANGENTIAL = 2e-3, 1e-3
+#: That of fy / fx where they are one focal length. Where it is 1e-8, GTSAM's Levenberg-Marquardt takes a hundred steps.
+SQUARE = 1e-6
+#: Where a parameter is off its mean by more than 1 / this of its deviations, it is held, and begins at the mean.
+NOTHING = 1e-3
 #: xi of a nominal unified camera is right to this share of 1 + xi. It bends the image as k1 does, but along a curve:
 #: where xi is as free as the other coefficients, their linear deviations hold the truth in 78 to 88 % of simulations.
 XI_OF_NOMINAL = 0.05
 
 
-def free_model(camera: Camera, stated: Stated) -> Camera:
+#: The coefficients that each `FreeLens` adds to what is free; those that none adds are free with "all".
+ADDED: dict[FreeLens, tuple[str, ...]] = {
+    "focal": (), "focals": (), "k1": ("xi", "k1"), "k2": ("k2",), "p2": ("p1", "p2"), "k3": ("k3",),
+}  # fmt: skip
+
+
+class CameraPrior(NamedTuple):
+    """What is known of a camera's parameters: mean (m,), standard deviations (m,), and that of fy / fx."""
+
+    mean: Array
+    deviation: Array
+    aspect: float = np.inf
+
+    @property
+    def tie(self) -> Array:
+        """The row (m,) whose product with errors of the parameters is that of fy / fx, in its deviations."""
+        row = np.zeros(len(self.mean))
+        if np.isfinite(self.aspect):
+            row[:2] = np.array([-1.0, 1.0]) / self.mean[:2] / self.aspect
+        return row
+
+    def start(self, parameters: Array) -> Array:
+        """Parameters (m,) to begin with: the mean of those that are held."""
+        return np.where(self.deviation < NOTHING * np.abs(parameters - self.mean), self.mean, parameters)
+
+    @property
+    def precision(self) -> Array:
+        """(m, m): The inverse of the covariance."""
+        return np.diag(self.deviation**-2.0) + np.outer(self.tie, self.tie)
+
+
+def is_free(camera: Camera, lens: FreeLens) -> np.ndarray:
+    """Which of a camera's parameters (m,) are free."""
+    levels, names = get_args(FreeLens), camera.parameter_names
+    free = {*names[:PINHOLE], *(n for level in levels[: levels.index(lens) + 1] for n in ADDED.get(level, names))}
+    return np.array([name in free for name in names])
+
+
+def free_model(camera: Camera, stated: Stated, lens: FreeLens = "all") -> Camera:
     """The camera with the lens model that is estimated: a pinhole may have distortion that nobody stated."""
-    if camera.model == "pinhole" and stated != "exact":
-        return Camera(camera.width, camera.height, "radtan", camera.K, np.zeros(4))
-    return camera
+    if camera.model not in ("pinhole", "radtan") or stated == "exact" or (camera.model == "radtan" and lens != "k3"):
+        return camera
+    more = {"k3": 5, "all": 4}.get(lens, 4)
+    return Camera(camera.width, camera.height, "radtan", camera.K, np.pad(camera.D, (0, max(more - len(camera.D), 0))))
 
 
-def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
-    """Mean (m,) and standard deviation (m,) of a camera's parameters."""
+def prior_of(camera: Camera, stated: Stated, lens: FreeLens = "all") -> CameraPrior:
+    """What is known of a camera's parameters before the images, with those held that are not free."""
     mean = camera.parameters
+    if stated == "unknown" and camera.model == "radtan":
+        mean[PINHOLE:] = 0.0  # an estimate from boards alone states nothing
     f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
     lens_px = LENS_PX[stated] if stated in LENS_PX else LENS_OF_FOCAL[stated] * float(f.mean())
     corner = 0.5 * np.array([camera.width, camera.height]) / f
-    by_lens = pixels_and_derivatives(camera, mean, corner)[2][:, PINHOLE:]
-    deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / np.linalg.norm(by_lens, axis=0)])
+    bend_px = np.linalg.norm(pixels_and_derivatives(camera, mean, corner)[2][:, PINHOLE:], axis=0)
+    deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / bend_px])
     if camera.model == "unified" and stated == "nominal":
         deviation[PINHOLE] = min(deviation[PINHOLE], XI_OF_NOMINAL * (1.0 + camera.D[0]))
     assert len(deviation) == PINHOLE + len(camera.D)
-    return mean, deviation
+    if stated == "exact":
+        return CameraPrior(mean, deviation)
+    for at in (at for at, name in enumerate(camera.parameter_names) if name in ("p1", "p2")):
+        deviation[at] = min(deviation[at], TANGENTIAL)
+    held = ~is_free(camera, lens)[PINHOLE:]
+    deviation[PINHOLE:][held] = LENS_PX["exact"] / bend_px[held]
+    return CameraPrior(mean, deviation, SQUARE if lens == "focal" else ASPECT)
 
 
 #: Directions count in which the images say at least this share of what the prior and the images say together.
@@ -131,12 +185,12 @@ def chance_of(off: Array, prior: Array, posterior: Array) -> float:
     return float(chdtrc(told.sum(), z2))
 
 
-def wider(deviation: Array, innovation: Innovation) -> Array:
-    """The prior's deviations (m,), wider for the parts that are doubted."""
-    result = deviation.copy()
+def wider(prior: CameraPrior, innovation: Innovation) -> CameraPrior:
+    """The prior, wider for the parts that are doubted."""
+    deviation = prior.deviation.copy()
     for part in innovation.doubted:
-        result[PARTS[part]] *= WIDER_CONTRADICTED if part in innovation.contradicted else WIDER_DOUBTED
-    return result
+        deviation[PARTS[part]] *= WIDER_CONTRADICTED if part in innovation.contradicted else WIDER_DOUBTED
+    return prior._replace(deviation=deviation)
 
 
 def held_by_prior(prior: Array, posterior: Array) -> np.ndarray:

@@ -31,7 +31,8 @@ ERRORS_LEGEND = (
 )
 INTRINSICS_LEGEND = (
     "±: one standard deviation; of what was stated, as it counted. told by: the images, or only what was stated, where "
-    "the images do not determine a parameter; nothing, where none was stated."
+    "the images do not determine a parameter; nothing, where none was stated; held: the parameter is not free, since "
+    "images that were left out are predicted as well without it."
 )
 #: Left-out images that are predicted so many times worse than expected show that the model lacks something.
 UNEXPECTED = 1.5
@@ -154,6 +155,8 @@ def intrinsics_table(refined: RefinedPoses) -> Table:
             cells = [f"{number:.{decimals_of[_is_pixels(parameter)]}f}" for number in numbers]
             if of.stated_as == "unknown":
                 cells[2:] = [NONE, NONE]
+            if parameter in of.not_free:
+                cells[1] = cells[3] = NONE
             rows[f"{name} {parameter}"] = (*cells, _told_by(parameter, of))
     headings = ("found", "±", "stated", "±", "told by")
     return Table.of("Intrinsics", "parameter", headings, rows, INTRINSICS_LEGEND)
@@ -165,6 +168,8 @@ def _is_pixels(parameter: str) -> bool:
 
 
 def _told_by(parameter: str, of: Intrinsics) -> str:
+    if parameter in of.not_free:
+        return "held"
     if of.stated_as != "exact" and parameter not in of.held_by_prior:
         return "images"
     return "nothing" if of.stated_as == "unknown" else "stated"

@@ -110,7 +110,7 @@ class CornerErrors(NamedTuple):
 def board_of(refined: RefinedPoses, target: str, corners: Array) -> Array:
     """A target's corners (n, 3) with its estimated size and warp."""
     scale = refined.scale if isinstance(refined.scale, float) else refined.scale[target]
-    shape = np.array([1.0 / scale - 1.0, 0.0, 0.0])
+    shape = np.array([1.0 / scale - 1.0, *[0.0] * len(WARPS)])
     found = None if refined.reprojection is None else refined.reprojection.boards.get(target)
     if found is not None:
         for name, value in zip(found.names, found.values, strict=True):

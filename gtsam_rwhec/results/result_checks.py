@@ -272,6 +272,7 @@ def _check_intrinsics(intrinsics: Intrinsics, refined: RefinedFields, place: str
             f"{place}.names: must be {', '.join(wanted)} (found {', '.join(map(shown, intrinsics.names))})"
         )
     _check_are_there(intrinsics.held_by_prior, intrinsics.names, f"{place}.held_by_prior", "parameters")
+    _check_are_there(intrinsics.not_free, intrinsics.names, f"{place}.not_free", "parameters")
     _check_are_there(intrinsics.shared_with, refined.intrinsics, f"{place}.shared_with", "cameras")
     _check_regions(intrinsics.projection_px, f"{place}.projection_px")
 

@@ -307,7 +307,9 @@ def drawn_board(
     if len(dark) > MOST_PARTS:
         dark = [dark[i] for i in np.linspace(0, len(dark) - 1, MOST_PARTS).round().astype(int).tolist()]
     reach = float(np.linalg.norm(target.corners(), axis=1).max())
-    warp = np.zeros(2) if isinstance(target, Bundle) else _warp(shape)  # a bundle's tags are in no common plane
+    warp = (
+        np.zeros(len(WARPS)) if isinstance(target, Bundle) else _warp(shape)
+    )  # a bundle's tags are in no common plane
     bent = [_bent(polygon / scale, reach / scale, warp) for polygon in dark]
     if len(paper):
         low = min((float(polygon[:, 2].min()) for polygon in bent), default=0.0)
@@ -403,14 +405,15 @@ def _circle() -> Array:
 
 
 def _warp(shape: BoardShape | None) -> Array:
-    """Heights (2,) of the edge over the middle along x and y, metres."""
+    """Heights (3,) of the edge over the middle along x, y and the diagonals, metres."""
     found = {} if shape is None else dict(zip(shape.names, shape.values, strict=True))
-    return np.array([found.get(WARPS[axis], 0.0) for axis in "xy"])
+    return np.array([found.get(name, 0.0) for name in WARPS.values()])
 
 
 def _bent(points: Array, reach: float, warp: Array) -> Array:
     """Points of a flat board (n, 3) on the warped one, by the formula of `corner_residuals.shaped`."""
-    bent: Array = points + np.outer((points[:, :2] / reach) ** 2 @ warp, [0.0, 0.0, 1.0])
+    x, y = (points[:, :2] / reach).T
+    bent: Array = points + np.outer(np.stack([x * x, y * y, x * y], axis=1) @ warp, [0.0, 0.0, 1.0])
     return bent
 
 

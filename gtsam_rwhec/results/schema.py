@@ -277,9 +277,9 @@ CONVENTIONS = {
     ),
     "shape": (
         "of refined.reprojection.boards: size is the true size less the stated one, a share of 1 (its covariance is "
-        "that of the target's scale, 1 / (1 + size)); warp_x and warp_y are heights of its edge over its middle, "
-        "metres; corners_off_m is how far each corner is from its place on that board, x, y, z in the target's frame, "
-        "where corners were free"
+        "that of the target's scale, 1 / (1 + size)); warp_x and warp_y are heights of its edge over its middle, and "
+        "warp_xy that along x = y less that along x = -y, metres; corners_off_m is how far each corner is from its "
+        "place on that board, x, y, z in the target's frame, where corners were free"
     ),
     "infinity": (
         "null means an infinite number: minus infinity in lower_bound, float_bound and min_eigenvalue (no bound was "

@@ -16,6 +16,7 @@ from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target, print_
 from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.errors import OptionError, TargetError
 from gtsam_rwhec.files.yaml_lines import KeyPath, dotted, suggestion
+from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.rig.odometry_sections import GivenSection, OdometrySensor, odometry_contradictions, with_what_follows
 from gtsam_rwhec.rig.section_types import Name, Section, needed, optional
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
@@ -110,6 +111,20 @@ class RigFile(Section):
     def detection_options(self) -> DetectionOptions:
         """The options of detection, with the values of the section ``detection``."""
         return DetectionOptions(**self.detection)
+
+    def stated_of(self, sensor: str) -> Stated:
+        """Where a sensor's intrinsics come from; of a shared camera those of the other sensor."""
+        of = self.sensors[sensor]
+        return self.sensors[of.shared].stated if of.shared is not None else of.stated
+
+    @property
+    def shared(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of sensors with one camera; the first of each has its intrinsics."""
+        groups: dict[str, list[str]] = {}
+        for name, sensor in self.sensors.items():
+            if sensor.shared is not None:
+                groups.setdefault(sensor.shared, [sensor.shared]).append(name)
+        return tuple(map(tuple, groups.values()))
 
     def frame_of(self, sensor: str) -> str:
         """The name of a sensor's frame."""
@@ -210,6 +225,13 @@ def _sensors(rig: RigFile) -> Iterator[Fault]:
                 words = f"{topic} is also the topic or path of sensor {first[topic]}; each sensor needs its own"
                 yield ("sensors", name, key), words
     for name, sensor in rig.sensors.items():
+        if sensor.shared is not None:
+            other = rig.sensors.get(sensor.shared)
+            there = [each for each, of in rig.sensors.items() if of.intrinsics is not None and of.shared is None]
+            if other is None or other.intrinsics is None or other.shared is not None:
+                known = f"these sensors do: {', '.join(there)}" if there else "no sensor does"
+                words = f"{sensor.shared} states no intrinsics of its own; {known}"
+                yield ("sensors", name, "intrinsics", "shared"), words
         if sensor.poses is not None and rig.carriers.poses.frames is None:
             yield (
                 ("sensors", name, "poses"),

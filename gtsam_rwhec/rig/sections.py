@@ -68,7 +68,7 @@ class Intrinsics(Section):
     """
 
     model_config = one_of(
-        "topic", "kalibr", "file", "K", "estimate",
+        "topic", "kalibr", "file", "K", "estimate", "shared",
         together=(("width", "K"), ("height", "K"), ("model", "K"), ("D", "K")),
     )  # fmt: skip
 
@@ -99,11 +99,17 @@ class Intrinsics(Section):
         "estimate is {estimate: any} in short. It takes images of a board at different tilts",
         "equidistant",
     )
-    stated: Literal["calibration", "nominal"] | None = optional(
+    shared: Name | None = optional(
+        "another sensor that is the same camera, or whose camera is known to have the same intrinsics (a renderer's, "
+        "rectified images): one set is estimated for both. Cameras that are stated alike share them without it, where "
+        "the images say so",
+        "cam_left",
+    )
+    stated: Literal["exact", "calibration", "nominal"] | None = optional(
         "where they come from, however they are given: calibration (of this camera, with this lens and focus: "
-        "right to 0.3 % of the focal length and 3 pixels of the centre) or nominal (a data sheet, a driver's "
-        "default, another camera of the kind: right to 3 %, and to 30 pixels or 2 % of the width); nominal "
-        "without it",
+        "right to 0.3 % of the focal length and 3 pixels of the centre), nominal (a data sheet, a driver's "
+        "default, another camera of the kind: right to 3 %, and to 30 pixels or 2 % of the width) or exact (they are "
+        "held, and their errors are in no standard deviation); nominal without it",
         "calibration",
     )
 
@@ -117,14 +123,16 @@ class Intrinsics(Section):
         of_file = self.file is not None or self.kalibr is not None
         # A file of OpenCV may lack the size of the images.
         numbers = self._given("model", "width", "height", "K", "D", *([] if of_file else ["size"]))
-        sources = self._given("topic", "kalibr", "file", "estimate") + (["numbers"] if numbers else [])
+        sources = self._given("topic", "kalibr", "file", "estimate", "shared") + (["numbers"] if numbers else [])
         self._need_one(
             sources,
-            "topic, kalibr (with camera), file, numbers (K, size, and model and D with distortion), or estimate alone: "
-            "the images say the rest",
+            "topic, kalibr (with camera), file, numbers (K, size, and model and D with distortion), shared (another "
+            "sensor), or estimate alone: the images say the rest",
         )
         if self.estimate is not None and self.stated is not None:
             raise ValueError(f"stated: {self.stated}, and they are to be estimated; leave stated or estimate out")
+        if self.shared is not None and self.stated is not None:
+            raise ValueError(f"stated: {self.stated}, and {self.shared} has the intrinsics; say it there")
         if self.camera is not None and not of_file:
             raise ValueError("camera goes with a file: {file: camchain.yaml, camera: cam0}")
         if numbers:
@@ -308,6 +316,11 @@ class Sensor(Section):
     link: Annotated[Link, BeforeValidator(_frame_or_section), or_text("the name of the frame")] | None = optional(
         "the frame of a camera's body; it takes the optical frame's place in the files for ROS", "camera_link"
     )
+
+    @property
+    def shared(self) -> str | None:
+        """The sensor that has its intrinsics, if it is another one."""
+        return None if self.intrinsics is None else self.intrinsics.shared
 
     @property
     def stated(self) -> Stated:

@@ -22,7 +22,13 @@ from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
 from gtsam_rwhec.runs.sensor_detections import check_usable, detect_in_log, detection_report, read_driver_detections
-from gtsam_rwhec.runs.sensor_intrinsics import estimate_intrinsics, in_words, read_intrinsics, refuse_not_estimated
+from gtsam_rwhec.runs.sensor_intrinsics import (
+    estimate_intrinsics,
+    in_words,
+    read_intrinsics,
+    refuse_not_estimated,
+    with_shared,
+)
 from gtsam_rwhec.runs.topics_of_rig import check_topics
 from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_detections
 
@@ -127,7 +133,7 @@ def detected(
     estimated, failed = estimate_intrinsics(log, rig, workers=workers, progress=tell)
     if failed:
         refuse_not_estimated(log, rig, failed, motion, sheet)
-    cameras |= {sensor: of_sensor.camera for sensor, of_sensor in estimated.items()}
+    cameras = with_shared(cameras | {sensor: of_sensor.camera for sensor, of_sensor in estimated.items()}, rig)
     kept = None if keep is None else keep(cameras)
     found = detect_in_log(log, rig, cameras, motion, workers=workers, progress=tell, kept=kept)
     for sensor, of_camera in estimated.items():

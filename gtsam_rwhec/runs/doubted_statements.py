@@ -49,7 +49,7 @@ def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> dic
     boards = {name: points for name, points in corners.items() if len(points) >= LEAST_CORNERS}
     doubted = {}
     for sensor, camera in cameras.items():
-        if not boards or sensor not in rig.sensors or rig.sensors[sensor].stated == "unknown":
+        if not boards or sensor not in rig.sensors or rig.stated_of(sensor) == "unknown":
             continue
         views = _views(log, sensor, boards)
         of_planes = [View(boards[name][s.indices], s.corners_px, s.T) for name, seen in views.items() for s in seen]

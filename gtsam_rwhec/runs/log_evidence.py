@@ -104,7 +104,7 @@ def frames_of(solved: Solved) -> RigFrames:
 
 def origins_before_corners(rig: Rig, sensors: Iterable[str]) -> dict[str, str]:
     """The origin of intrinsics that detection estimated, by sensor; sensors with stated intrinsics are missing."""
-    return {name: BOARDS_ALONE for name in sensors if rig.sensors[name].stated == "unknown"}
+    return {name: BOARDS_ALONE for name in sensors if rig.stated_of(name) == "unknown"}
 
 
 def warnings_of(solved: Solved) -> tuple[str, ...]:

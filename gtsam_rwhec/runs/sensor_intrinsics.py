@@ -58,7 +58,7 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
     cameras = {}
     for name, sensor in rig.sensors.items():
         source = sensor.intrinsics
-        if source is None or source.estimate is not None:
+        if source is None or source.estimate is not None or source.shared is not None:
             continue
         if source.topic is not None:
             cameras[name] = _from_topic(log, source.topic, name)
@@ -68,11 +68,16 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
     return cameras
 
 
+def with_shared(cameras: Mapping[str, Camera], rig: Rig) -> dict[str, Camera]:
+    """The cameras of all sensors: those of others where the rig file says that they are shared."""
+    return {**cameras, **{name: cameras[of.shared] for name, of in rig.sensors.items() if of.shared is not None}}
+
+
 def check_intrinsics_files(rig: Rig) -> None:
     """Read the intrinsics that are in files, with the errors of `read_intrinsics`, before a log is there."""
     for name, sensor in rig.sensors.items():
         source = sensor.intrinsics
-        if source is not None and source.topic is None and source.estimate is None:
+        if source is not None and source.topic is None and source.estimate is None and source.shared is None:
             _stated(rig, name, source)
 
 

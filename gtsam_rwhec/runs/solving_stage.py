@@ -156,7 +156,8 @@ class CleanedLog:
             time_offsets=self.estimated or False,
             carrier_path=self.motion.trajectory if self.estimated else None,
             corners=CornerOptions(
-                stated={name: rig.sensors[name].stated for name in self.cameras if name in rig.sensors},
+                stated={name: rig.stated_of(name) for name in self.cameras if name in rig.sensors},
+                shared=rig.shared,
                 carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
                 about=self.motion.about,
             ),

@@ -72,10 +72,12 @@ class NativeGraph:
                 )
             )
         for name, key in self.k.items():
-            mean, deviation = model.camera_priors[name]
-            sigmas = noise.Diagonal.Sigmas(np.insert(deviation, SKEW, SKEW_DEVIATION))
-            prior = getattr(gtsam, f"PriorFactor{self.kind[name]}")
-            self.graph.add(prior(key, self._calibration(name, mean), sigmas))
+            prior = model.camera_priors[name]
+            others = np.insert(np.insert(prior.precision, SKEW, 0.0, axis=0), SKEW, 0.0, axis=1)
+            others[SKEW, SKEW] = SKEW_DEVIATION**-2
+            factor = getattr(gtsam, f"PriorFactor{self.kind[name]}")
+            information = noise.Gaussian.Information(others)
+            self.graph.add(factor(key, self._calibration(name, prior.mean), information))
         for j, p in enumerate(self.points):
             self.graph.add(gtsam.PriorFactorPoint3(key_of("p", j), p, noise.Isotropic.Sigma(3, POINT_M)))
 
@@ -103,7 +105,7 @@ class NativeGraph:
         # the wheel's Cal3Fisheye.vector() and Cal3Unified.vector() leave parameters out, localCoordinates do not
         cameras = {}
         for name, key in self.k.items():
-            mean = self.model.camera_priors[name][0]
+            mean = self.model.camera_priors[name].mean
             found = getattr(values, f"at{self.kind[name]}")(key)
             cameras[name] = mean + np.delete(self._calibration(name, mean).localCoordinates(found), SKEW)
         return Point(
@@ -129,7 +131,7 @@ class NativeGraph:
         skews, begin = [], 6 + 6 * len(self.y)
         for name in self.k:
             skews.append(begin + SKEW)
-            begin += len(self.model.camera_priors[name][0]) + 1
+            begin += len(self.model.camera_priors[name].mean) + 1
         rows = np.delete(np.arange(len(joint)), skews)
         turned: Array = (turn @ joint @ turn.T)[np.ix_(rows, rows)]
         return turned

@@ -81,7 +81,7 @@ def cell(
         angle = 2.0 * np.pi * k / cameras
         at = distance / 1.5 * np.array([1.5 * np.cos(angle), 1.5 * np.sin(angle), 0.8]) + rng.normal(scale=0.1, size=3)
         Y[f"cam_{k}"] = _looking(MIDDLE, at) @ se3.expmap(rng.normal(scale=0.05, size=(1, 6)))[0]
-    true_shape = rng.normal(size=3) * shape
+    true_shape = np.append(rng.normal(size=3) * shape, 0.0)
     points, _ = shaped(board.corners(), true_shape)
     seen: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in Y}
     done = 0
@@ -102,7 +102,8 @@ def cell(
     for name in Y:
         off = np.zeros(len(truth)) if stated_off is None else stated_off
         if stated is not None:
-            off = off + rng.normal(size=len(truth)) * prior_of(camera, stated)[1]
+            root = np.linalg.cholesky(prior_of(camera, stated).precision)
+            off = off + np.linalg.solve(root.T, rng.normal(size=len(truth)))
         as_stated[name] = camera.with_parameters(truth + off)
     observations = Observations.of(
         as_stated,

@@ -20,11 +20,11 @@ def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = 
     names = small.observations.sensors
     model = Model(
         stacks, A, None if exact else A_NOISE, about, {name: name for name in names},  # type: ignore[arg-type]
-        {name: prior_of(cameras[name], "nominal") for name in names}, {"board": np.full(3, 1e-3)}, CORNER_PX,
+        {name: prior_of(cameras[name], "nominal") for name in names}, {"board": np.full(4, 1e-3)}, CORNER_PX,
         tuple(stack.known.astype(float) for stack in stacks),
     )  # fmt: skip
     rng = np.random.default_rng(7)
     moved = A if exact else A @ se3.expmap(rng.normal(size=(len(A), 6)) * A_NOISE)
     X, Y = small.near(rng, 1e-3)
     cameras_at = {name: cameras[name].parameters * (1.0 + 1e-3) for name in names}
-    return model, Point(X, Y, moved, cameras_at, {"board": np.full(3, 5e-4)})
+    return model, Point(X, Y, moved, cameras_at, {"board": np.full(4, 5e-4)})

@@ -13,6 +13,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corners_as_refined import OF_CARRIERS, consequences_of
 from gtsam_rwhec.fitting.pose_graph import optimise
+from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior
 
 EXACT = rw.CornerOptions(stated="calibration", carrier_noise="exact")
 
@@ -23,7 +24,7 @@ def test_a_pixel_of_the_centre_moves_the_extrinsics_as_said() -> None:
     said = {(one.frame, one.cause): one for one in consequences_of(refined)}
     kept = refined.intrinsics["cam_0"].camera.parameters + np.eye(8)[2]
     model = refined.graph.model
-    held = replace(model, camera_priors={"cam_0": (kept, np.full(8, 1e-7))})
+    held = replace(model, camera_priors={"cam_0": CameraPrior(kept, np.full(8, 1e-7))})
     graph = CornerGraph(held, replace(refined.point, cameras={"cam_0": kept}))
     moved = graph.point(optimise(graph.graph, graph.values(graph.start), 50).values)
     for name, before, after in (("cam_0", refined.Y, moved.Y), ("board", refined.X, moved.X)):

@@ -93,7 +93,7 @@ def test_the_sums_by_instant_have_the_graphs_information(small: Cell, about: str
     assert ("t", "cam_0") in reduced.slots
     joint, _ = graph.covariance(graph.values(point), reduced.slots)
     s2 = CORNER_PX**2
-    H = reduced.G / s2 + np.diag(reduced.prior)
+    H = reduced.G / s2 + reduced.prior
     for C, M in zip(reduced.C, reduced.M, strict=True):
         H -= C.T @ np.linalg.solve(np.diag(A_NOISE**-2.0) + M / s2, C) / s2**2
     size = np.sqrt(np.diagonal(joint))

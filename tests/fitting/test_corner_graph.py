@@ -27,9 +27,10 @@ def test_the_cost_is_half_the_sum_of_squares(small: Cell, about: str) -> None:
     if about == "sensorcarrier":
         xi = se3.logmap(point.A @ se3.inverse(model.A))
     expected = 0.5 * sum((error**2).sum() for error in model.errors(point)) + 0.5 * ((xi / A_NOISE) ** 2).sum()
-    expected += 0.5 * 3 * 0.5**2
-    for name, (mean, deviation) in model.camera_priors.items():
-        expected += 0.5 * (((point.cameras[name] - mean) / deviation) ** 2).sum()
+    expected += 0.5 * 4 * 0.5**2
+    for name, prior in model.camera_priors.items():
+        off = point.cameras[name] - prior.mean
+        expected += 0.5 * float(off @ prior.precision @ off)
     assert graph.graph.error(graph.values(point)) == pytest.approx(
         expected, rel=1e-5 if about == "sensorcarrier" else 1e-9
     )
@@ -59,7 +60,7 @@ def test_the_sums_by_instant_have_the_graphs_information(small: Cell, about: str
     reduced = Reduced.of(model, point)
     joint, last_step = graph.covariance(graph.values(point), reduced.slots)
     s2 = CORNER_PX**2
-    H = reduced.G / s2 + np.diag(reduced.prior)
+    H = reduced.G / s2 + reduced.prior
     for C, M in zip(reduced.C, reduced.M, strict=True):
         H -= C.T @ np.linalg.solve(np.diag(A_NOISE**-2.0) + M / s2, C) / s2**2
     size = np.sqrt(np.diagonal(joint))

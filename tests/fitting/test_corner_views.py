@@ -15,7 +15,7 @@ from gtsam_rwhec.fitting.corner_residuals import Stack, linearised, pixel_errors
 from gtsam_rwhec.fitting.observations import Observations
 
 Array = NDArray[np.float64]
-SHAPE = np.array([2e-3, 1e-3, -2e-3])
+SHAPE = np.array([2e-3, 1e-3, -2e-3, 3e-3])
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def stack(small: Cell) -> Stack:
 def test_pixels_of_the_truth_are_opencvs(small: Cell) -> None:
     stacks, A = stacks_of(small.observations)
     for stack in stacks:
-        errors = pixel_errors(stack, small.X["board"], small.Y[stack.sensor], A, CAMERA.parameters, np.zeros(3))
+        errors = pixel_errors(stack, small.X["board"], small.Y[stack.sensor], A, CAMERA.parameters, np.zeros(4))
         for v, i in enumerate(stack.instant):
             T = se3.inverse(small.Y[stack.sensor]) @ A[i] @ small.X["board"]
             seen, _ = cv2.projectPoints(BOARD.corners(), cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], CAMERA.K, CAMERA.D)
@@ -47,10 +47,10 @@ def test_equal_carrier_poses_are_one_instant(small: Cell) -> None:
 
 def test_a_warped_board_is_higher_at_its_edge_and_larger() -> None:
     points = BOARD.corners()
-    moved, _ = shaped(points, np.array([0.0, 1e-3, 0.0]))
+    moved, _ = shaped(points, np.array([0.0, 1e-3, 0.0, 0.0]))
     edge = np.abs(points[:, 0]).argmax()
     assert moved[edge, 2] == pytest.approx(1e-3 * (points[edge, 0] / np.linalg.norm(points[edge])) ** 2, rel=0.3)
-    assert shaped(points, np.array([0.01, 0.0, 0.0]))[0] == pytest.approx(1.01 * points)
+    assert shaped(points, np.array([0.01, 0.0, 0.0, 0.0]))[0] == pytest.approx(1.01 * points)
 
 
 def test_derivatives(small: Cell, stack: Stack) -> None:
@@ -73,7 +73,7 @@ def test_derivatives(small: Cell, stack: Stack) -> None:
     check(rows.by_Y, lambda xi: pixel_errors(stack, X, moved(Y, xi), A, p, SHAPE), 6, 1e-6)
     check(rows.by_A, lambda xi: pixel_errors(stack, X, Y, moved(A, xi), p, SHAPE), 6, 1e-6)
     check(rows.by_camera, lambda d: pixel_errors(stack, X, Y, A, p + d, SHAPE), len(p), 1e-5)
-    check(rows.by_shape, lambda d: pixel_errors(stack, X, Y, A, p, SHAPE + d), 3, 1e-6)
+    check(rows.by_shape, lambda d: pixel_errors(stack, X, Y, A, p, SHAPE + d), 4, 1e-6)
 
 
 def test_a_corner_that_was_not_seen_says_nothing(small: Cell) -> None:
@@ -83,7 +83,7 @@ def test_a_corner_that_was_not_seen_says_nothing(small: Cell) -> None:
     }
     hidden = Observations.of(small.observations.cameras, small.observations.corners, views)
     (stack, *_), A = stacks_of(hidden)
-    rows = linearised(stack, small.X["board"], small.Y[stack.sensor], A, CAMERA.parameters, np.zeros(3))
+    rows = linearised(stack, small.X["board"], small.Y[stack.sensor], A, CAMERA.parameters, np.zeros(4))
     for name in ("residual", "by_X", "by_Y", "by_A", "by_camera", "by_shape"):
         assert not getattr(rows, name)[:, :12].any()
         assert getattr(rows, name)[:, 12:].all(axis=0).any()
@@ -92,4 +92,4 @@ def test_a_corner_that_was_not_seen_says_nothing(small: Cell) -> None:
 def test_a_corner_behind_its_camera_is_infinitely_wrong(small: Cell, stack: Stack) -> None:
     _, A = stacks_of(small.observations)
     turned = small.Y[stack.sensor] @ np.diag([1.0, -1.0, -1.0, 1.0])
-    assert np.isinf(pixel_errors(stack, small.X["board"], turned, A, CAMERA.parameters, np.zeros(3))).all()
+    assert np.isinf(pixel_errors(stack, small.X["board"], turned, A, CAMERA.parameters, np.zeros(4))).all()

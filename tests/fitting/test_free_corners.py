@@ -43,7 +43,7 @@ def model_with_corners(small: Cell) -> tuple[Model, Point]:
 
 def test_derivatives_by_a_corners_place(small: Cell) -> None:
     (stack, *_), A = stacks_of(small.observations)
-    at = small.X["board"], small.Y["cam_0"], A, CAMERA.parameters, np.full(3, 1e-3), 0.0
+    at = small.X["board"], small.Y["cam_0"], A, CAMERA.parameters, np.full(4, 1e-3), 0.0
     off = np.random.default_rng(2).normal(scale=1e-3, size=(35, 3))
     by_corners = linearised(stack, *at, off).by_corners
     for i, step in enumerate(1e-7 * np.eye(3)):

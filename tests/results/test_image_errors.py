@@ -138,7 +138,7 @@ def test_a_board_is_as_it_was_found() -> None:
     given, corners, refined = two_cameras()
     flat = given.observations.corners["board"]
     found = board_of(refined, "board", flat)
-    size, warp_x, warp_y = corners.shapes["board"]
+    size, warp_x, warp_y, _ = corners.shapes["board"]
     assert refined.reprojection is not None
     np.testing.assert_allclose(found[:, :2], flat[:, :2] * (1.0 + size), rtol=1e-12)
     assert np.ptp(found[:, 2]) > 0.2 * max(abs(warp_x), abs(warp_y))

@@ -132,7 +132,9 @@ def test_every_form_of_intrinsics_says_where_they_come_from(source: str) -> None
     assert stated(f"{{{source}, stated: calibration}}") == "calibration"
     assert stated("left.yaml") == "nominal"
     assert parse_rig(MINIMAL, "rig.yaml").sensors["cam"].stated == "unknown"  # a driver's detections
-    with pytest.raises(RigError, match=r"line 2: sensors.cam.intrinsics.stated: 'factory'; give 'calibration' or"):
+    with pytest.raises(
+        RigError, match=r"line 2: sensors.cam.intrinsics.stated: 'factory'; give 'exact', 'calibration' or"
+    ):
         stated(f"{{{source}, stated: factory}}")
 
 

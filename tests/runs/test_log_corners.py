@@ -144,9 +144,10 @@ def test_the_log_road_chooses_what_predicts_left_out_images_of_other_people(circ
     assert reprojection.carrier_poses == "exact"
     held_out = reprojection.sensors["camera"].held_out_mm
     assert held_out is not None
-    assert held_out < 0.7 * 4.6
     assert held_out == pytest.approx(min(one.held_out_mm for one in reprojection.tried), rel=1e-12)
-    assert solved.judgement.grounds == (rw.Ground.NO_SIZE_FITS, rw.Ground.SYSTEMATIC)
+    assert held_out <= 1.91
+    grounds = rw.Ground.NO_SIZE_FITS, rw.Ground.INTRINSICS_ESTIMATED, rw.Ground.SYSTEMATIC
+    assert solved.judgement.grounds == grounds
 
 
 def test_velocities_are_those_of_the_path_where_it_moves() -> None:

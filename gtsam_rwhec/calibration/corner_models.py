@@ -1,0 +1,134 @@
+"""Which model of the corners predicts images that were left out: cameras, and whether A has noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, with_widest
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
+from gtsam_rwhec.fitting.held_out import LeftOut, left_out
+from gtsam_rwhec.fitting.observations import Observations, Views
+from gtsam_rwhec.geometry.poses import PoseLike
+
+#: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case.
+MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
+#: Number of cross-validation folds; below `FEW_IMAGES` images more folds, so that enough images remain to calibrate
+#: from.
+FOLDS, FEW_IMAGES, FOLDS_OF_FEW = 4, 50, 8
+#: A counts as exact if this lowers the held-out error to less than this share of the error with noise of A.
+BETTER_SHARE = 0.95
+#: If errors in held-out images are more than this many times what the covariances predict, the model is incomplete.
+UNEXPLAINED = 1.5
+
+
+@dataclass(frozen=True)
+class Score:
+    """A model, its error in held-out images, and the error that its covariances predict."""
+
+    words: str
+    px: float
+    mm: float
+    expected_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """The model that was chosen."""
+
+    options: CornerOptions
+    words: str  #: What it assumes about A and about sizes
+    evidence: str
+    scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
+    left_out: LeftOut  #: Of the chosen one; empty where images are too few
+    cameras: ChosenCameras  #: What is free of cameras, and how far blocks of images disagree
+
+    @property
+    def wider(self) -> dict[tuple[str, str], float]:
+        """By unknown: the factor on its standard deviations, where blocks of images disagree by more."""
+        found, times = dict(self.cameras.spread), self.unexplained
+        if times > 1.0:  # all are unexplained by as much, at least
+            found = {at: max(times, spread, found.get(at, 1.0)) for at, spread in self.left_out.spread.items()}
+        return {at: factor for at, factor in found.items() if factor > 1.0}
+
+    @property
+    def unexplained(self) -> float:
+        """The ratio of held-out errors to those that the covariances predict; 1 if it may be chance."""
+        times = self.scores[0].px / self.scores[0].expected_px if self.scores else 1.0
+        return times if times > UNEXPLAINED else 1.0
+
+
+def chosen_model(
+    observations: Observations,
+    X: Mapping[str, PoseLike],
+    Y: Mapping[str, PoseLike],
+    options: CornerOptions,
+    tell: Progress,
+    thin: CornersRefined | None = None,
+) -> Tried:
+    """The options that predict held-out images best: the simplest cameras, and A with its noise, or exact.
+
+    ``thin`` is the refinement of ``thinned(observations)`` with everything free that may be (`with_widest`).
+
+    Raises as ``refine_corners`` does.
+    """
+    some = thinned(observations)
+    if thin is None:
+        thin = refine_corners(some, X, Y, with_widest(options, some), tell)
+    cameras = chosen_cameras(thin, some, options)
+    options = cameras.options
+
+    def scored(of: CornerOptions) -> tuple[CornerOptions, Score, LeftOut]:
+        refined = refine_corners(some, X, Y, of, tell)
+        folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
+        found = left_out(refined, folds=folds, progress=tell)
+        errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.errors.values()])
+        weights = np.array([one.corners for one in found.errors.values()], dtype=float)
+        return of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found
+
+    try:
+        every = [scored(options)]
+    except CountError as error:
+        return Tried(options, in_words(options), f"no other was tried: {error}", (), LeftOut({}, {}), cameras)
+    if options.carrier_noise != "exact":
+        every.append(scored(replace(options, carrier_noise="exact")))
+        if every[1][1].mm < BETTER_SHARE * every[0][1].mm:
+            every.reverse()
+    chosen, score, found = every[0]
+    evidence = f"it predicts images that were left out to {score.px:.3g} px, and {score.mm:.3g} mm on the target"
+    for _, other, _ in every[1:]:
+        size = f"{other.mm:.3g} mm" if np.isfinite(other.mm) else "a target behind its camera"
+        evidence += f" ({size} with {other.words})"
+    return Tried(chosen, score.words, evidence, tuple(one for _, one, _ in every), found, cameras)
+
+
+def thinned(observations: Observations) -> Observations:
+    """At most so many images of each pair, evenly over their order."""
+    most = max(MOST_IMAGES // len(observations.views), FEWEST_OF_PAIR)
+
+    def some(view: Views) -> Views:
+        number = len(view.A)
+        at = np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))
+        return view.selected(at)
+
+    return replace(observations, views={pair: some(view) for pair, view in observations.views.items()})
+
+
+def in_words(options: CornerOptions) -> str:
+    """What the options assume about A and about sizes."""
+    noise = options.carrier_noise
+    if isinstance(noise, CarrierNoise):
+        of_A = f"A's noise as stated ({np.degrees(noise.rotation_rad):.2g}° and {1e3 * noise.translation_m:.2g} mm)"
+    else:
+        of_A = "A as exact" if noise == "exact" else "A's noise estimated"
+    if not isinstance(options.size_share, Mapping):
+        return f"{of_A} and sizes {'estimated' if options.size_share else 'as stated'}"
+    free = [name for name, share in options.size_share.items() if share]
+    sizes = f"the size of {free[0]} estimated" if len(free) == 1 else "some sizes estimated"
+    return f"{of_A} and {sizes if free else 'sizes as stated'}"

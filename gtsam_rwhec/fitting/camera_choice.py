@@ -1,0 +1,380 @@
+"""The simplest model that explains the images: what is free of a lens, which cameras share one, which boards are bent.
+
+Free coefficients that no image asks for take up errors of corners that go together, and move the poses. So cameras are
+compared by how well they predict images that were left out: the simplest one wins whose error is within one standard
+error of the best one's (Breiman et al. 1984, the rule of one standard error). Images are left out in blocks of time, of
+the carriers' configuration, and of the image's regions, so that a lens that extrapolates badly shows.
+
+All is linear about one refinement in which everything is free. A block b of instants has the sums H_b, h_b, c_b of its
+rows, the carriers' errors eliminated (`Reduced`). A camera model is a prior (P, mu), in which what is not free is held;
+cameras that share intrinsics have the unknowns theta = T phi + theta_0. Then
+
+    phi_b = -(T'(H - H_b)T + P)^-1 (T'(h - h_b) + P off),    error_b = c_b + 2 h_b' theta_b + theta_b' H_b theta_b,
+
+in the noise's units: what an image's corners say in spite of the noise of its A counts, and no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import get_args
+
+import numpy as np
+from rwhec_factors import se3
+from scipy.special import chdtri
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.fitting.corner_model import Model
+from gtsam_rwhec.fitting.corner_noise import Reduced
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.fit_options import CornerOptions, FreeLens
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.fitting.stated_intrinsics import is_free, prior_of
+from gtsam_rwhec.geometry.poses import Array
+
+#: Blocks of time and of configurations, and columns and rows of the image's regions.
+BLOCKS, REGIONS = 6, 3
+#: A lens model of so many coefficients has k3.
+K3 = 5
+#: A target of so many corners in one plane may be bent, with heights of this standard deviation, metres; flat ones are
+#: held to the second.
+BENT, WARP_M, FLAT_M = 9, 1e-3, 1e-8
+#: Without a block each camera and each target must keep so many images, or the block is not left out.
+FEWEST = 4
+#: The scatter of blocks' answers counts where chance gives it with less than this probability. Each frame's six numbers
+#: count as this many, since they go together.
+BY_CHANCE, NUMBERS = 0.1, 3
+#: Lengths and angles of configurations are alike where they are as far apart, m over rad.
+M_PER_RAD = 0.5
+
+WORDS: dict[FreeLens, str] = {
+    "focal": "one focal length and the centre",
+    "focals": "two focal lengths and the centre",
+    "k1": "with k1",
+    "k2": "with k1 and k2",
+    "p2": "with k1, k2, p1 and p2",
+    "k3": "with k1, k2, p1, p2 and k3",
+    "all": "with all coefficients of its lens model",
+}
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A model of some cameras or of a board that was tried, and its error in images that were left out."""
+
+    #: "camera model of cam_0", "shape of board": what was chosen.
+    what: str
+    #: What is free.
+    words: str
+    #: One camera for several sensors.
+    is_shared: bool
+    #: Root mean square length of a corner's error in images that were left out, pixels, beyond what the noise of A
+    #: explains; and one standard error of its difference from the best model's.
+    px: float
+    more_px: float
+    is_chosen: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenCameras:
+    """The options with the chosen cameras and boards, what was tried, and how far blocks of images disagree with it."""
+
+    options: CornerOptions
+    tried: tuple[Rival, ...]
+    #: By unknown: the jackknife's deviation over the claimed one, the larger of blocks of time and of configurations; 1
+    #: where chance explains it.
+    spread: Mapping[tuple[str, str], float]
+
+
+def with_widest(options: CornerOptions, observations: Observations) -> CornerOptions:
+    """The options with everything free that may be chosen to be so, where they leave the choice."""
+    if options.lens == "all":
+        of_k3 = (name for name, of in observations.cameras.items() if of.model == "pinhole" or is_short(of))
+        options = replace(options, lens=dict.fromkeys(of_k3, "k3"))
+    if options.warp_m == 0.0:
+        corners = {name: observations.corners[name] for name in observations.targets}
+        boards = [name for name, points in corners.items() if len(points) >= BENT and not points[:, 2].any()]
+        options = replace(options, warp_m=dict.fromkeys(boards, WARP_M))
+    return options
+
+
+def is_short(camera: Camera) -> bool:
+    """Whether a radtan camera has no coefficients after k3."""
+    return camera.model == "radtan" and len(camera.D) <= K3
+
+
+def alike(cameras: Mapping[str, Camera], options: CornerOptions) -> list[tuple[str, ...]]:
+    """Groups of two sensors and more that were stated alike, as nominal or by a calibration, and are in no group."""
+    groups: dict[tuple[object, ...], list[str]] = {}
+    grouped = {name for group in options.shared for name in group}
+    for name, camera in cameras.items():
+        stated = options.stated_of(name)
+        if stated in ("nominal", "calibration") and name not in grouped:
+            same = (camera.width, camera.height, camera.model, *camera.parameters.tolist(), stated)
+            groups.setdefault(same, []).append(name)
+    return [tuple(names) for names in groups.values() if len(names) > 1]
+
+
+def chosen_cameras(refined: CornersRefined, observations: Observations, options: CornerOptions) -> ChosenCameras:
+    """Choose which boards are bent, what is free of each camera, and which cameras share intrinsics.
+
+    Parameters
+    ----------
+    refined : CornersRefined
+        From the observations, under `with_widest` of the options.
+    observations : Observations
+        With the cameras as they are stated.
+    options : CornerOptions
+        What is free of cameras is chosen where ``lens`` is "all", and boards where ``warp_m`` is 0; groups of
+        ``shared`` stay, and others may be added.
+    """
+    blocks, widest = Blocks.of(refined), with_widest(options, observations)
+    choice = Choosing(blocks, observations.cameras, widest)
+    if len(blocks) > 1 and options.warp_m == 0.0:
+        choice.boards()
+    if len(blocks) > 1 and options.lens == "all":
+        choice.cameras()
+    model = LinearModel.of(refined, observations.cameras, choice.options)
+    return ChosenCameras(choice.options, tuple(choice.tried), blocks.spread(model))
+
+
+@dataclass(eq=False)
+class Choosing:
+    """The options as they are chosen, one thing after the other, with the rest as it is."""
+
+    blocks: Blocks
+    stated: Mapping[str, Camera]
+    options: CornerOptions
+    tried: list[Rival] = field(default_factory=list)
+
+    def boards(self) -> None:
+        """Flat, or bent."""
+        assert isinstance(self.options.warp_m, Mapping)
+        for name in self.options.warp_m:
+            flat = replace(self.options, warp_m={at: m for at, m in self.options.warp_m.items() if at != name})
+            self.options = self._simplest(f"shape of {name}", [("flat", flat), ("bent", self.options)])
+
+    def cameras(self) -> None:
+        """Sharing first, of each group; then what is free of each camera that is alone, with the others as they are."""
+        every_camera = self.blocks.refined.graph.model.camera_priors
+        alone = [name for name in every_camera if self.options.stated_of(name) != "exact"]
+        for names in alike({name: self.stated[name] for name in alone}, self.options):
+            levels = _levels(self.blocks.refined, names)
+            every = [(lens, is_shared) for lens in levels for is_shared in (True, False)]
+            rivals = [(WORDS[lens], self._with(names, lens, is_shared)) for lens, is_shared in every]
+            chosen = self._simplest(f"camera model of {', '.join(names)}", rivals)
+            if chosen.shared != self.options.shared:
+                self.options = chosen
+                alone = [name for name in alone if name not in names]
+        for name in alone:
+            rivals = [(WORDS[lens], self._with((name,), lens, False)) for lens in _levels(self.blocks.refined, (name,))]
+            self.options = self._simplest(f"camera model of {name}", rivals)
+
+    def _with(self, names: tuple[str, ...], lens: FreeLens, is_shared: bool) -> CornerOptions:
+        assert isinstance(self.options.lens, Mapping)
+        shared = (*self.options.shared, names) if is_shared else self.options.shared
+        return replace(self.options, lens={**self.options.lens, **dict.fromkeys(names, lens)}, shared=shared)
+
+    def _simplest(self, what: str, rivals: Sequence[tuple[str, CornerOptions]]) -> CornerOptions:
+        """The first that predicts as well as the best."""
+        models = [LinearModel.of(self.blocks.refined, self.stated, options) for _, options in rivals]
+        at, scores = self.blocks.simplest(models)
+        for i, ((words, options), (px, more_px)) in enumerate(zip(rivals, scores, strict=True)):
+            self.tried.append(Rival(what, words, options.shared != self.options.shared, px, more_px, i == at))
+        return rivals[at][1]
+
+
+def _levels(refined: CornersRefined, names: Sequence[str]) -> list[FreeLens]:
+    """What may be free of a camera, in order of freedom; each has more than the one before."""
+    camera = refined.intrinsics[names[0]].camera
+    found: dict[tuple[bool, ...], FreeLens] = {}
+    for lens in get_args(FreeLens):
+        found.setdefault((lens == "focal", *is_free(camera, lens).tolist()), lens)
+    return list(found.values())
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """theta = T phi + start, with the prior's precision P on phi, and how far phi = 0 is from the prior's mean."""
+
+    T: Array
+    start: Array
+    P: Array
+    off: Array
+
+    @staticmethod
+    def of(refined: CornersRefined, stated: Mapping[str, Camera], options: CornerOptions) -> LinearModel:
+        """The model of options about a refinement in which each camera has its own intrinsics."""
+        model, point = refined.graph.model, refined.point
+        slots, size = refined.slots, len(refined.joint)
+        T, start = np.eye(size), np.zeros(size)
+        P, off = np.zeros((size, size)), np.zeros(size)
+        vectors, gone = model.vectors(point), []
+        for at, prior in model.priors(point).items():
+            letter, name = at
+            rows = slots[at]
+            if letter == "k":
+                first = options.camera_of(name)
+                if first != name and ("k", first) in slots:
+                    T[rows, slots["k", first]] = np.eye(rows.stop - rows.start)
+                    start[rows] = point.cameras[first] - point.cameras[name]
+                    gone += list(range(rows.start, rows.stop))
+                    continue
+                lens = options.lens_of(name)
+                camera = refined.intrinsics[name].camera
+                given = stated[name].parameters
+                camera = camera.with_parameters(np.pad(given, (0, len(prior.mean) - len(given))))
+                now = prior_of(camera, options.stated_of(name), lens)
+                # where the images contradicted the prior it was widened, and stays so
+                wide = np.where(is_free(camera, lens), np.maximum(now.deviation, prior.deviation), now.deviation)
+                prior = now._replace(deviation=wide)
+            elif letter == "b" and options.warp_m_of(name) == 0.0:
+                is_warp = model.free_shape(name) > 0
+                prior = prior._replace(deviation=np.where(is_warp, FLAT_M, prior.deviation))
+            P[rows, rows] = prior.precision
+            off[rows] = vectors[at] - prior.mean
+        kept = np.setdiff1d(np.arange(size), gone)
+        return LinearModel(T[:, kept], start, P[np.ix_(kept, kept)], off[kept])
+
+    def theta(self, H: Array, h: Array) -> Array:
+        """The unknowns (d,) of least cost, for sums of rows."""
+        A, b = self.T.T @ H @ self.T + self.P, self.T.T @ (h + H @ self.start) + self.P @ self.off
+        size = np.sqrt(np.diagonal(A))
+        phi = -np.linalg.solve(A / size[:, None] / size, b / size) / size
+        found: Array = self.T @ phi + self.start
+        return found
+
+    def covariance(self, H: Array) -> Array:
+        """That of the unknowns (d, d)."""
+        A = self.T.T @ H @ self.T + self.P
+        size = np.sqrt(np.diagonal(A))
+        inverse = np.linalg.inv(A / size[:, None] / size) / size[:, None] / size
+        found: Array = self.T @ inverse @ self.T.T
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Sums of blocks of instants: H (b, d, d), h (b, d), c (b,), how many residuals, and the way each was cut."""
+
+    refined: CornersRefined
+    H: Array
+    h: Array
+    c: Array
+    count: Array
+    #: (b,): 0 by time, 1 by configuration, 2 by region.
+    way: np.ndarray
+    #: Of all images.
+    all_H: Array
+    all_h: Array
+
+    def __len__(self) -> int:
+        """The number of blocks."""
+        return len(self.c)
+
+    @staticmethod
+    def of(refined: CornersRefined) -> Blocks:
+        """The blocks of a refinement's images that can be left out."""
+        model, noise = refined.graph.model, refined.noise
+        whole = Reduced.of(model, refined.point).without_carriers(noise)
+        found, ways = [], []
+        for way, block in enumerate((_by_time(model), _by_configuration(model), _by_region(model))):
+            for number in range(block.max() + 1):
+                inside = block == number
+                if inside.any() and _leaves_enough(model, inside):
+                    reduced = Reduced.of(_part(model, inside), refined.point, refined.slots)
+                    sums = reduced.without_carriers(noise)
+                    found.append((sums.H, sums.h, sums.rr, reduced.count))
+                    ways.append(way)
+        H, h, c, count = (np.array(each) for each in zip(*found, strict=True)) if found else (np.zeros(0),) * 4
+        return Blocks(refined, H, h, c, count, np.array(ways), whole.H, whole.h)
+
+    def errors(self, model: LinearModel) -> Array:
+        """Squared errors (b,) of each block, predicted from the others."""
+        found = np.zeros(len(self))
+        for i in range(len(self)):
+            theta = model.theta(self.all_H - self.H[i], self.all_h - self.h[i])
+            found[i] = self.c[i] + 2.0 * self.h[i] @ theta + theta @ self.H[i] @ theta
+        return found
+
+    def simplest(self, models: Sequence[LinearModel]) -> tuple[int, list[tuple[float, float]]]:
+        """The first model that predicts as well as the best, within one standard error; and errors in pixels of all."""
+        errors, px2 = np.array([self.errors(model) for model in models]), self.refined.noise.corner_px**2
+        means = errors.sum(axis=1) / self.count.sum()
+        best = int(np.argmin(means))
+        more = (errors - errors[best]) / self.count  # of each block
+        weights = self.count / self.count.sum()
+        off = more - (more @ weights)[:, None]
+        standard_error = np.sqrt((weights**2 * off**2).sum(axis=1) * len(self) / max(len(self) - 1, 1))
+        good = means - means[best] <= standard_error
+        at = int(np.argmax(good))
+        px = np.sqrt(2.0 * px2 * means)
+        return at, list(zip(px.tolist(), (px2 * standard_error / px).tolist(), strict=True))
+
+    def spread(self, model: LinearModel) -> dict[tuple[str, str], float]:
+        """By unknown: the scatter of the blocks' answers over what the covariance claims; `ChosenCameras.spread`."""
+        claimed = np.diagonal(model.covariance(self.all_H))
+        found = dict.fromkeys(self.refined.slots, 1.0)
+        for way in (0, 1):
+            at = np.flatnonzero(self.way == way)
+            if len(at) < 3:
+                continue
+            theta = np.array([model.theta(self.all_H - self.H[i], self.all_h - self.h[i]) for i in at])
+            left = 1.0 - self.count[at] / self.count[at].sum()
+            variance = left @ (theta - theta.mean(axis=0)) ** 2
+            freedom = NUMBERS * (len(at) - 1)
+            for slot, rows in self.refined.slots.items():
+                ratio = float((variance[rows] / np.maximum(claimed[rows], 1e-300)).mean())
+                if ratio > chdtri(freedom, BY_CHANCE) / freedom:
+                    found[slot] = max(found[slot], float(np.sqrt(ratio)))
+        return found
+
+
+def _part(model: Model, inside: np.ndarray) -> Model:
+    """The model of some instants' images (I,), with all frames' priors."""
+    there = [inside[stack.instant] for stack in model.stacks]
+    return replace(
+        model,
+        stacks=tuple(stack.selected(at) for stack, at in zip(model.stacks, there, strict=True) if at.any()),
+        weights=tuple(weights[at] for weights, at in zip(model.weights, there, strict=True) if at.any()),
+    )
+
+
+def _leaves_enough(model: Model, inside: np.ndarray) -> bool:
+    """Whether without some instants (I,) each target and each sensor keeps enough images."""
+    left: dict[tuple[str, str], int] = {}
+    for stack in model.stacks:
+        number = int((~inside[stack.instant]).sum())
+        for at in (("x", stack.target), ("y", stack.sensor)):
+            left[at] = left.get(at, 0) + number
+    return min(left.values()) >= FEWEST
+
+
+def _by_time(model: Model) -> np.ndarray:
+    """The block (I,) of each instant, by its place among the images."""
+    number = len(model.A)
+    return np.arange(number) * min(BLOCKS, number) // number
+
+
+def _by_configuration(model: Model) -> np.ndarray:
+    """Blocks (I,) of instants whose carriers' poses are near each other: halved along the direction they vary most."""
+    features = se3.logmap(se3.inverse(model.A[:1]) @ model.A) * np.repeat([M_PER_RAD, 1.0], 3)
+    block = np.zeros(len(features), dtype=np.int64)
+    for number in range(1, min(BLOCKS, len(features))):
+        largest = np.flatnonzero(block == np.argmax(np.bincount(block)))
+        centred = features[largest] - features[largest].mean(axis=0)
+        along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+        block[largest[along > np.median(along)]] = number
+    return block
+
+
+def _by_region(model: Model) -> np.ndarray:
+    """Blocks (I,) of instants by where in the image the corners are, of the sensor that sees most of them first."""
+    place, count = np.zeros((len(model.A), 2)), np.zeros(len(model.A))
+    for stack in model.stacks:
+        size = np.array([stack.camera.width, stack.camera.height])
+        np.add.at(place, stack.instant, (stack.pixels * stack.known[..., None]).sum(axis=1) / size)
+        np.add.at(count, stack.instant, stack.known.sum(axis=1))
+    at = np.clip((REGIONS * place / np.maximum(count, 1.0)[:, None]).astype(int), 0, REGIONS - 1) @ [1, REGIONS]
+    return np.unique(at, return_inverse=True)[1]

@@ -1,0 +1,79 @@
+"""Images whose corners agree with the answer although their poses were left out as outliers.
+
+The pose of a board in one image is uncertain by its tilt, its distance and its place, and by intrinsics that are not
+yet known: that makes outliers of good images. Their corners tell better. An image's corners r (2n) have, about the
+answer and with the measured A, the covariance
+
+    F = s^2 I + J_A S J_A' + J C J',
+
+with the corners' noise s, that of A, S, and the covariance C of the answer's unknowns; r' F^-1 r is chi-square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from gtsam_rwhec.fitting.corner_residuals import Stack, stacks_of
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.observations import Observations
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Pair
+
+#: Of good images, one in so many is farther off by chance.
+BY_CHANCE = 1e-4
+
+
+def agreeing_by_corners(
+    observations: Observations, kept: Mapping[Pair, np.ndarray], refined: CornersRefined
+) -> dict[Pair, np.ndarray]:
+    """Which images (V,) of each pair agree: those that were kept, and those whose corners agree with the answer.
+
+    An image agrees that is no farther off than the farthest of its pair that was kept, or than chance has it.
+
+    Parameters
+    ----------
+    observations : Observations
+        All images, in the order of `kept`.
+    refined : CornersRefined
+        The answer from those that were kept.
+    """
+    cameras = {name: refined.intrinsics[name].camera for name in observations.sensors if name in refined.Y}
+    views = {at: v for at, v in observations.views.items() if at[0] in refined.X and at[1] in cameras}
+    stacks, A = stacks_of(replace(observations, cameras=cameras, views=views))
+    found = dict(kept)
+    for stack in stacks:
+        pair = Pair(stack.target, stack.sensor)
+        squares, size = _squares(stack, A, refined), 2 * stack.known.sum(axis=1)
+        share = squares / np.maximum(size, 1)
+        limit = np.maximum(chdtri(size, BY_CHANCE) / np.maximum(size, 1), share[kept[pair]].max(initial=0.0))
+        found[pair] = kept[pair] | (share <= limit)
+    return found
+
+
+def _squares(stack: Stack, A: Array, refined: CornersRefined) -> Array:
+    """r' F^-1 r (V,) of each image, by (I + M'M)^-1 with M = [J_A S^1/2, J C^1/2] / s."""
+    model = replace(refined.graph.model, stacks=(stack,), A=A)
+    rows = model.linearised(stack, replace(refined.point, A=A))
+    blocks = {
+        ("x", stack.target): rows.by_X,
+        ("y", stack.sensor): rows.by_Y,
+        ("k", model.camera_of[stack.sensor]): rows.by_camera,
+        ("b", stack.target): rows.by_shape,
+        ("t", stack.sensor): rows.by_time,
+    }
+    there = {at: block for at, block in blocks.items() if at in refined.slots}
+    index = np.concatenate([np.arange(refined.slots[at].start, refined.slots[at].stop) for at in there])
+    values, vectors = np.linalg.eigh(refined.joint[np.ix_(index, index)])
+    M = np.concatenate(list(there.values()), axis=2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    if refined.noise.carrier is not None:
+        M = np.concatenate([M, rows.by_A @ model.to_right[stack.instant] * refined.noise.carrier], axis=2)
+    M /= refined.noise.corner_px
+    r = np.where(np.isfinite(rows.residual), rows.residual, 1e6) / refined.noise.corner_px
+    Mr = np.einsum("vni,vn->vi", M, r)
+    inner = np.eye(M.shape[2]) + M.transpose(0, 2, 1) @ M
+    squares: Array = (r**2).sum(axis=1) - (Mr * np.linalg.solve(inner, Mr[..., None])[..., 0]).sum(axis=1)
+    return squares
