@@ -82,10 +82,11 @@ def is_free(camera: Camera, lens: FreeLens) -> np.ndarray:
 
 def free_model(camera: Camera, stated: Stated, lens: FreeLens = "all") -> Camera:
     """The camera with the lens model that is estimated: a pinhole may have distortion that nobody stated."""
-    if camera.model not in ("pinhole", "radtan") or stated == "exact" or (camera.model == "radtan" and lens != "k3"):
+    stays = stated == "exact" or camera.model not in ("pinhole", "radtan")
+    if stays or (camera.model == "pinhole" and not ADDED.get(lens, ("k1",))):
         return camera
-    more = {"k3": 5, "all": 4}.get(lens, 4)
-    return Camera(camera.width, camera.height, "radtan", camera.K, np.pad(camera.D, (0, max(more - len(camera.D), 0))))
+    number = max(len(camera.D), 5 if lens == "k3" else 4)
+    return Camera(camera.width, camera.height, "radtan", camera.K, np.pad(camera.D, (0, number - len(camera.D))))
 
 
 def prior_of(camera: Camera, stated: Stated, lens: FreeLens = "all") -> CameraPrior:

@@ -298,3 +298,39 @@ def test_the_targets_of_the_page_on_logs_are_read() -> None:
     rig = yaml.safe_load((CELL / "rig.yaml").read_text(encoding="utf-8")) | yaml.safe_load(targets[1])
     kinds = {type(target).__name__ for target in parse_rig(yaml.safe_dump(rig), "the page").target_list}
     assert kinds == {"Tag", "Charuco", "AprilGrid", "TagGrid", "Bundle", "Checkerboard", "CircleGrid"}
+
+
+CAMERAS = """\
+carriers: {sensors: base, targets: hand, poses: {frames: [base, hand]}}
+sensors:
+  left: {images: left, poses: poses, intrinsics: {K: [9, 9, 4, 4], size: [9, 9], stated: exact}}
+  right: {images: right, poses: poses, intrinsics: {shared: left}}
+targets:
+  board: {type: checkerboard, inner_corners: [3, 4], square_m: 0.05}
+"""
+
+
+def test_a_camera_that_is_shared_is_stated_as_the_other_one() -> None:
+    rig = parse_rig(CAMERAS, "rig.yaml")
+    assert rig.shared == (("left", "right"),)
+    assert rig.stated_of("right") == rig.stated_of("left") == "exact"
+    assert parse_rig(rig_text(rig), "rig.yaml") == rig
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "shared: left",
+            "shared: middle",
+            "line 4: sensors.right.intrinsics.shared: middle states no intrinsics of its own",
+        ),
+        ("shared: left", "shared: right", "right states no intrinsics of its own; these sensors do: left"),
+        ("shared: left", "shared: left, stated: nominal", "stated: nominal, and left has the intrinsics; say it there"),
+        ("shared: left", "shared: left, file: a.yaml", "give one of"),
+    ],
+)
+def test_shared_cameras_that_are_none(old: str, new: str, words: str) -> None:
+    with pytest.raises(RigError) as caught:
+        parse_rig(CAMERAS.replace(old, new), "rig.yaml")
+    assert words in str(caught.value)

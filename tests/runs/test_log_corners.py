@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from cells_of_others import CIRCLES, WORKCELL
@@ -79,6 +81,28 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_l
         read = read_pairs(log, solved.rig)
     for pair, measured in solved.pairs.items():
         np.testing.assert_array_equal(measured.B, read[pair].B)
+
+
+def test_two_sensors_with_one_camera_have_one_set_of_intrinsics(workcell_camera2: Path, tmp_path: Path) -> None:
+    """The same images stand for two cameras that share intrinsics; one of another size is refused by name."""
+    for name in ("left", "right"):
+        shutil.copytree(workcell_camera2 / "image", tmp_path / "cell" / name)
+    shutil.copytree(workcell_camera2 / "pose", tmp_path / "cell" / "pose")
+    shutil.copy(workcell_camera2 / "intrinsic_pars_file.yaml", tmp_path / "cell")
+    one = "  camera2: {images: image, poses: pose, intrinsics: intrinsic_pars_file.yaml}\n"
+    two = (
+        "  left: {images: left, poses: pose, intrinsics: intrinsic_pars_file.yaml}\n"
+        "  right: {images: right, poses: pose, intrinsics: {shared: left}}\n"
+    )
+    corners_of(tmp_path / "cell", WORKCELL.replace(one, two), tmp_path)
+    refined = solve_log(tmp_path / "calibration.mcap").refined
+    assert refined.intrinsics["left"].shared_with == ("right",)
+    assert refined.intrinsics["left"].values == refined.intrinsics["right"].values
+    for path in (tmp_path / "cell" / "right").iterdir():
+        cv2.imwrite(str(path), np.zeros((480, 640), np.uint8))
+    (tmp_path / "small").mkdir()
+    with pytest.raises(LogError, match=r"right.*640 x 480"):
+        corners_of(tmp_path / "cell", WORKCELL.replace(one, two), tmp_path / "small")
 
 
 def test_measurements_without_corners_beside_others_are_counted(workcell_log: Path) -> None:
