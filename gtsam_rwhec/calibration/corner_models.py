@@ -13,7 +13,7 @@ from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, wit
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
-from gtsam_rwhec.fitting.held_out import LeftOut, left_out
+from gtsam_rwhec.fitting.held_out import HeldOut, held_out_errors
 from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.geometry.poses import PoseLike
 
@@ -46,15 +46,14 @@ class Tried:
     words: str  #: What it assumes about A and about sizes
     evidence: str
     scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
-    left_out: LeftOut  #: Of the chosen one; empty where images are too few
+    held_out: dict[str, HeldOut]  #: Of the chosen one, by sensor; empty where images are too few
     cameras: ChosenCameras  #: What is free of cameras, and how far blocks of images disagree
 
     @property
     def wider(self) -> dict[tuple[str, str], float]:
         """By unknown: the factor on its standard deviations, where blocks of images disagree by more."""
-        found, times = dict(self.cameras.spread), self.unexplained
-        if times > 1.0:  # all are unexplained by as much, at least
-            found = {at: max(times, spread, found.get(at, 1.0)) for at, spread in self.left_out.spread.items()}
+        # where errors are unexplained, all are so by as much, at least
+        found = {at: max(self.unexplained, spread) for at, spread in self.cameras.spread.items()}
         return {at: factor for at, factor in found.items() if factor > 1.0}
 
     @property
@@ -84,18 +83,18 @@ def chosen_model(
     cameras = chosen_cameras(thin, some, options)
     options = cameras.options
 
-    def scored(of: CornerOptions) -> tuple[CornerOptions, Score, LeftOut]:
+    def scored(of: CornerOptions) -> tuple[CornerOptions, Score, dict[str, HeldOut]]:
         refined = refine_corners(some, X, Y, of, tell)
         folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
-        found = left_out(refined, folds=folds, progress=tell)
-        errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.errors.values()])
-        weights = np.array([one.corners for one in found.errors.values()], dtype=float)
+        found = held_out_errors(refined, folds=folds, progress=tell)
+        errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.values()])
+        weights = np.array([one.corners for one in found.values()], dtype=float)
         return of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found
 
     try:
         every = [scored(options)]
     except CountError as error:
-        return Tried(options, in_words(options), f"no other was tried: {error}", (), LeftOut({}, {}), cameras)
+        return Tried(options, in_words(options), f"no other was tried: {error}", (), {}, cameras)
     if options.carrier_noise != "exact":
         every.append(scored(replace(options, carrier_noise="exact")))
         if every[1][1].mm < BETTER_SHARE * every[0][1].mm:

@@ -149,7 +149,7 @@ def corners_found(
     return CornersFound(
         corners,
         intrinsics,
-        numbers_of(observations, corners, tried.options, tried.left_out.errors, models),
+        numbers_of(observations, corners, tried.options, tried.held_out, models),
         tuple(_corner_choices(observations, corners, tried, intrinsics, far_off)),
         (*_corner_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
         {slot: factor for slot, factor in tried.wider.items() if slot in corners.slots},

@@ -7,7 +7,6 @@ a tenth of a pixel, whatever is wrong with the arm: its residuals prove nothing,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -44,24 +43,9 @@ class HeldOut:
     regions_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """What leaving images out in blocks shows."""
-
-    #: By sensor.
-    errors: dict[str, HeldOut]
-    #: By unknown: the scatter of the blocks' estimates (jackknife), divided by that which their covariance predicts.
-    spread: dict[tuple[str, str], float]
-
-
-def held_out_errors(refined: CornersRefined, *, folds: int = 5, progress: Progress | None = None) -> dict[str, HeldOut]:
-    """Errors of corners in images that were left out, by sensor: `left_out` without the spread."""
-    return left_out(refined, folds=folds, progress=progress).errors
-
-
 @one_blas_thread()
-def left_out(refined: CornersRefined, *, folds: int = 5, progress: Progress | None = None) -> LeftOut:
-    """Leave images out in blocks: their corners' errors, and how much the estimates differ.
+def held_out_errors(refined: CornersRefined, *, folds: int = 5, progress: Progress | None = None) -> dict[str, HeldOut]:
+    """Errors of corners in images that were left out in blocks, by sensor.
 
     Parameters
     ----------
@@ -94,20 +78,18 @@ def left_out(refined: CornersRefined, *, folds: int = 5, progress: Progress | No
     )
     block = _blocks(stacks, len(model.A), folds)
     found: dict[str, list[tuple[Array, Array, Array, Array]]] = {name: [] for name in model.sensors}
-    parts = []
     for fold in range(folds):
         tell(f"predicting images that were left out: block {fold + 1} of {folds}")
-        parts.append(_refined_from(refined, block != fold))
+        part = _refined_from(refined, block != fold)
         for stack in stacks:
             if (seen := block[stack.instant] == fold).any():
-                found[stack.sensor].append(_predicted(stack.selected(seen), model.A, parts[-1]))
-    errors = {
+                found[stack.sensor].append(_predicted(stack.selected(seen), model.A, part))
+    return {
         name: _of_sensor(
             *(np.concatenate(values) for values in zip(*each, strict=True)), camera=refined.intrinsics[name].camera
         )
         for name, each in found.items()
     }
-    return LeftOut(errors, spread_over_claims(refined, parts))
 
 
 def _refined_from(refined: CornersRefined, kept: np.ndarray) -> CornersRefined:
@@ -210,33 +192,3 @@ def _of_sensor(length: Array, on_target: Array, expected: Array, pixels: Array, 
         float(np.sqrt(expected.mean())),
         rms_by_region(camera, pixels, length),
     )
-
-
-def spread_over_claims(refined: CornersRefined, parts: Sequence[CornersRefined]) -> dict[tuple[str, str], float]:
-    """By unknown: the jackknife's deviation over the claimed one, root mean square of its numbers.
-
-    Parameters
-    ----------
-    refined : CornersRefined
-        From all images.
-    parts : sequence of CornersRefined
-        From all but one block each.
-    """
-    m = len(parts)
-    found = {}
-    for slot, rows in refined.slots.items():
-        off = np.array([_off(refined, part, slot) for part in parts])
-        variances = (m - 1) / m * ((off - off.mean(axis=0)) ** 2).sum(axis=0)
-        found[slot] = float(np.sqrt((variances / np.diagonal(refined.joint)[rows]).mean()))
-    return found
-
-
-def _off(refined: CornersRefined, part: CornersRefined, slot: tuple[str, str]) -> Array:
-    """How far a part's unknown is from that of all images."""
-    letter, name = slot
-    if letter in "xy":
-        first, second = (each.X if letter == "x" else each.Y for each in (refined, part))
-        moved: Array = gtsam.Pose3.Logmap(first[name].between(second[name]))
-        return moved
-    vectors = refined.graph.model.vectors
-    return vectors(part.point)[slot] - vectors(refined.point)[slot]

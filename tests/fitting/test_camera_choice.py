@@ -133,3 +133,19 @@ def test_no_lens_that_is_sold_has_other_focal_lengths() -> None:
     row = np.array([-1.0, 1.0]) / prior.mean[:2]
     assert np.sqrt(row @ covariance[:2, :2] @ row) == pytest.approx(ASPECT, rel=0.01)
     assert np.sqrt(covariance[0, 0]) / prior.mean[0] == pytest.approx(0.03 / np.sqrt(2.0), rel=0.01)
+
+
+def test_blocks_of_images_disagree_as_covariances_say_unless_the_arm_is_bent() -> None:
+    given = cell(5, images=48)
+    exact = rw.CornerOptions(carrier_noise="exact")
+    _, chosen = wide_and_chosen(given, exact)
+    assert set(chosen.spread) == {("x", "board"), ("b", "board"), *((k, f"cam_{i}") for k in "yk" for i in range(2))}
+    assert max(chosen.spread.values()) < 2.0
+    views = {}
+    for pair, view in given.observations.views.items():
+        xi = np.zeros((len(view.A), 6))
+        xi[:, 3:] = 4e-3 * np.tanh((view.A[:, :3, 3] - view.A[:, :3, 3].mean(axis=0))[:, [1, 2, 0]] / 0.2)
+        views[pair] = (view.A @ se3.expmap(xi), view.pixels)
+    bent = rw.Observations.of(given.observations.cameras, given.observations.corners, views)
+    wide = rw.refine_corners(bent, given.X, given.Y, with_widest(exact, bent))
+    assert max(chosen_cameras(wide, bent, exact).spread.values()) > 2.0
