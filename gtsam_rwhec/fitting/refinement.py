@@ -15,6 +15,7 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corners_as_refined import as_refined, intrinsics_of, numbers_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.detector_bias import covariance_of_bias
 from gtsam_rwhec.fitting.fit_options import CornerOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
@@ -209,7 +210,7 @@ def beyond_independent_errors(
         for (letter, _), rows in corners.slots.items():
             if letter in letters:  # both see errors that neighbours share
                 scale[rows] = np.maximum(scale[rows], of_poses)
-    more: Array = corners.joint * (np.outer(scale, scale) - 1.0)
+    more: Array = corners.joint * (np.outer(scale, scale) - 1.0) + covariance_of_bias(corners)
     if found is None:
         return more
     carriers: tuple[tuple[str, dict[str, gtsam.Pose3]], ...] = (("x", corners.X), ("y", corners.Y))
