@@ -19,12 +19,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 #: What the sources may weigh. Lower a number when they become lighter; raise it only with a reason in the commit.
 BUDGET = {
-    "lines": 82_300,
-    "code": 51_150,
-    "files": 364,
+    # the simplest camera, bent boards and biases of detectors: 700 lines
+    "lines": 83_100,
+    "code": 51_600,
+    "files": 366,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 63_200,
+    "lines of tests and benchmarks": 63_850,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

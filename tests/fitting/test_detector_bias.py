@@ -34,13 +34,13 @@ def test_a_bias_moves_the_answer_as_said(which: int) -> None:
 
 
 def test_the_covariance_does_not_shrink_with_more_images() -> None:
-    """Of the middle of the image, whose bias no number of images shows."""
+    """Of the principal point, whose shift by a bias no number of images makes vanish."""
     few, many = (
         rw.refine_corners(given.observations, given.X, given.Y, EXACT)
         for given in (cell(1, images=20, cameras=1), cell(1, images=80, cameras=1))
     )
     deviations = [np.sqrt(np.diagonal(covariance_of_bias(each))[each.slots["k", "cam_0"]][2:4]) for each in (few, many)]
-    assert (deviations[1] > 0.5 * deviations[0]).all()
+    assert np.linalg.norm(deviations[1]) > 0.4 * np.linalg.norm(deviations[0])  # of independent errors a half, or less
     assert (deviations[0] > BIAS_PX / 10).all()
     covariance = covariance_of_bias(many)
     assert covariance == pytest.approx(covariance.T)
