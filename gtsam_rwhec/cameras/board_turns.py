@@ -17,6 +17,7 @@ from gtsam_rwhec.cameras.plane_ambiguity import (
     MOST_OF_A_LINK,
     MOST_OF_AN_IMAGE,
     SIGMA_TURN_RAD,
+    agrees_with_none,
     extrinsic_rotations,
     first_rotation,
     nearest_rotation,
@@ -37,7 +38,9 @@ class Turns:
     """The turns of n images of a track."""
 
     which: np.ndarray  #: (n,): turns about the board's z, in steps of 2 pi / ways
-    margin: Array  #: (n,): by how much the track's log-likelihood exceeds that with another turn of this image
+    #: (n,): by how much the track's log-likelihood exceeds that with another turn of this image; infinite where no turn
+    #: agrees with the others
+    margin: Array
     #: (n, 3, 3): rotations of the carriers and of the turned board, of the images whose carriers' poses are known
     R_A: Array
     R_B: Array
@@ -97,6 +100,7 @@ def choose_turns(T: Array, covariance: Array, squared_px: Array, corner_px: floa
         shift = np.bincount((chosen - best) % ways, minlength=ways).argmax()
         differs = (chosen - best - shift) % ways != 0
         sure[differs] = np.minimum(sure[differs], float(cost.min(axis=1).sum()) - total)
+    sure[agrees_with_none(best_cost, image, MOST_OF_A_LINK)] = np.inf
     which[known], margin[known] = (best - best[0]) % ways, sure
     picked = R_B[np.arange(len(R_B)), np.argmin(best_cost, axis=1)] @ turns_about_z(ways)[-best[0] % ways]
     return Turns(which, margin, R_A, picked)

@@ -39,7 +39,7 @@ class Choice:
 
     which: np.ndarray  #: (n,): the chosen candidate, 0 or 1
     #: (n,): by how much the chosen track's log-likelihood exceeds that of the best track with this image's other
-    #: candidate
+    #: candidate; infinite where neither agrees with the others
     margin: Array
 
 
@@ -192,7 +192,17 @@ def choose_by_agreement(
     for other in answers:
         differs = other.which != best.which
         margin[differs] = np.minimum(margin[differs], other.total - best.total)
+    margin[agrees_with_none(best.cost, image, most)] = np.inf
     return best.which, margin
+
+
+def agrees_with_none(cost: Array, image: Array, most: float) -> np.ndarray:
+    """Images (n,) of which no candidate (n, c) agrees with the others, of costs with those in the image alone.
+
+    They are not ambiguous: they contradict the others, and what looks for outliers must see them.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray((~np.isfinite(image) | (cost - image > most - 1e-9)).all(axis=1))
 
 
 def _starts(track: _Track) -> list[np.ndarray]:

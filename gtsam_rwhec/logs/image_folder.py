@@ -205,6 +205,11 @@ def _number(name: str) -> str:
 
 
 def _enough(matched: Matched, files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
+    if len(files) < 2:
+        raise LogError(
+            f"{where}: there is one image, {files[0].name}; a calibration needs images at three poses and more that "
+            "turn about two axes: take more"
+        )
     if len(matched.images) < 2:
         raise LogError(
             f"{where}: {len(matched.images)} of {len(files)} images have one of the {len(poses.T)} poses; the first "

@@ -13,6 +13,7 @@ from gtsam_rwhec.calibration.outliers import LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.sizes import is_size_doubted, is_size_uncertain
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.file_record import Count, FileRecord, NotNegative, Positive
+from gtsam_rwhec.results.removed_measurements import OF_THE_MOTION
 
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
 Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]
@@ -141,4 +142,11 @@ class LogFields(FileRecord):
 
         Their poses are not to be used.
         """
-        return contradicted_frames({count.pair: (count.used, count.used + count.left_out) for count in self.outliers})
+        return contradicted_frames(self.agreement)
+
+    @property
+    def agreement(self) -> dict[Pair, tuple[int, int]]:
+        """By pair: measurements in the answer, and these with all that contradict it, in cleaning or as outliers."""
+        off = {track.pair: sum(track.removed.get(why, 0) for why in OF_THE_MOTION) for track in self.cleaning.tracks}
+        every = {count.pair: count.used + count.left_out + off.get(count.pair, 0) for count in self.outliers}
+        return {count.pair: (count.used, every[count.pair]) for count in self.outliers}

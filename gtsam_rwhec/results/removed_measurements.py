@@ -31,6 +31,10 @@ class RemovalReason(StrEnum):
     FIRST_SENSOR_STEP_RAD = "step of the first sensor (rad)"
 
 
+#: Reasons for which cleaning removes a measurement that does not agree with the carriers' motion.
+OF_THE_MOTION = (RemovalReason.NO_CONSENSUS, RemovalReason.ROTATION_OFF, RemovalReason.TRANSLATION_OFF)
+
+
 @dataclass(frozen=True)
 class Removed:
     """One measurement that a step removed."""

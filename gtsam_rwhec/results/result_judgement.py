@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, LeftOut, contradicted_frames
+import numpy as np
+
+from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, MANY, LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.fitting.refined import RefinedPoses
@@ -53,6 +55,10 @@ def judge(
             Finding(Ground.CONTRADICTED if one.frame in sensors else Ground.TARGET_CONTRADICTED, str(one))
             for one in log.contradicted
         ]
+        used_of, all_of = np.array([*log.agreement.values(), (0, 0)]).sum(axis=0).tolist()
+        if not log.contradicted and all_of - used_of > MANY * all_of:
+            words = f"{all_of - used_of} of {all_of} measurements contradict the answer and were left out"
+            found.append(Finding(Ground.MANY_OUTLIERS, words))
         used = {count.sensor for count in log.outliers if count.used}
         found += [Finding(Ground.NO_ANSWER, shortage(log, name)) for name in log.detection.images if name not in used]
         stated = [size for size in log.sizes if not size.is_free]

@@ -29,7 +29,7 @@ from gtsam_rwhec.logs.mcap_reader import Log, open_log
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.results.log_history import CleaningReport, LogFields, OutlierCount, SizeFields, TimeOffsetFields
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.removed_measurements import OF_THE_MOTION, RemovalReason
 from gtsam_rwhec.results.result_judgement import judge, short_of_measurements
 from gtsam_rwhec.rig.odometry_sections import GivenSection
 from gtsam_rwhec.rig.rig import Rig
@@ -57,8 +57,6 @@ from gtsam_rwhec.runs.measured_pairs import (
 from gtsam_rwhec.runs.run_log import CLEANING_METADATA, LogMetadata, read_cleaning_report, read_metadata
 from gtsam_rwhec.solver.solution import Solution, solve
 
-#: Reasons for which cleaning removes a measurement that does not agree with the carriers' motion.
-OF_THE_MOTION = (RemovalReason.NO_CONSENSUS, RemovalReason.ROTATION_OFF, RemovalReason.TRANSLATION_OFF)
 #: Findings of ``calibrate`` that this stage words anew, with the lines of the rig file and the images.
 SAID_BY_THE_LOG = frozenset({
     Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS, Ground.SIZE_DOUBTED, Ground.SIZE_UNCERTAIN, Ground.SIZE_ESTIMATED,

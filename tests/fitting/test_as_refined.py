@@ -9,6 +9,7 @@ import pytest
 from made_as_refined import made
 
 from gtsam_rwhec.fitting.corners_as_refined import as_refined, boards_of, intrinsics_of
+from gtsam_rwhec.fitting.detector_bias import covariance_of_bias
 from gtsam_rwhec.fitting.projection_uncertainty import projection_deviations
 from gtsam_rwhec.fitting.refinement import beyond_independent_errors
 from gtsam_rwhec.fitting.reprojection_record import Reprojection
@@ -68,7 +69,8 @@ def test_intrinsics_that_no_camera_has_say_so() -> None:
 def test_deviations_in_numbers_are_those_of_the_widened_covariance() -> None:
     _, base, _, corners, _ = made()
     intrinsics = intrinsics_of(corners, dict.fromkeys(corners.Y, "calibration"))
-    more = beyond_independent_errors(corners, None, dict.fromkeys(corners.slots, 3.0))
+    bias = covariance_of_bias(corners)
+    more = beyond_independent_errors(corners, None, dict.fromkeys(corners.slots, 3.0)) - bias
     found = Reprojection(0.1, 0.1, "estimated", 5e-4, 2e-4, {}, boards_of(corners), (), ())
     wide = as_refined(base, corners, found, intrinsics, more)
     assert wide.reprojection is not None
@@ -80,7 +82,7 @@ def test_deviations_in_numbers_are_those_of_the_widened_covariance() -> None:
 
 def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
     _, base, noise, corners, _ = made()
-    more = beyond_independent_errors(corners, noise, {})
+    more = beyond_independent_errors(corners, noise, {}) - covariance_of_bias(corners)
     assert np.linalg.eigvalsh(corners.joint + more).min() > 0.0
     wider = corners.joint + more
     for letter, name in corners.slots:
@@ -92,7 +94,7 @@ def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
             np.testing.assert_allclose(after, before)
     # what nothing explains widens all alike, and deviations in numbers with it
     twice = corners.joint + beyond_independent_errors(corners, None, dict.fromkeys(corners.slots, 2.0))
-    np.testing.assert_allclose(twice, 4.0 * corners.joint)
+    np.testing.assert_allclose(twice, 4.0 * corners.joint + covariance_of_bias(corners))
     # a constant error moves all frames of a carrier together: two cameras to each other are as before
     both = as_refined(base, corners, Reprojection(0.1, 0.1, "estimated", 0.0, 0.0, {}, {}, (), ()), {}, more)
     before_deg, _ = np.sqrt(np.diagonal(corners.covariance("cam_0"))[:2])

@@ -48,7 +48,7 @@ def model_with_clocks(small: Cell, about: str) -> tuple[Model, Point]:
 def test_derivatives_by_the_offset_and_by_the_pose_at_the_instant(offset_s: float) -> None:
     small = moving(cell(3, images=6), 1, LATE)
     (stack, *_), A = stacks_of(small.observations)
-    p, shape = CAMERA.parameters, np.zeros(3)
+    p, shape = CAMERA.parameters, np.zeros(4)
     X, Y = small.X["board"], small.Y["cam_0"]
     rows = linearised(stack, X, Y, A, p, shape, offset_s)
     for by, analytic in (("time", rows.by_time), ("A", rows.by_A)):

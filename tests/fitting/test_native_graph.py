@@ -37,7 +37,7 @@ def optimum(graph: CornerGraph | NativeGraph, start: Point) -> gtsam.Values:
 
 def flat(model: Model, point: Point) -> tuple[Model, Point]:
     """The same with a board of the stated shape."""
-    return replace(model, shape_priors={}), replace(point, shapes={"board": np.zeros(3)})
+    return replace(model, shape_priors={}), replace(point, shapes={"board": np.zeros(4)})
 
 
 @pytest.fixture(params=LENSES, scope="module")

@@ -105,6 +105,20 @@ def test_two_sensors_with_one_camera_have_one_set_of_intrinsics(workcell_camera2
         corners_of(tmp_path / "cell", WORKCELL.replace(one, two), tmp_path / "small")
 
 
+def test_images_of_two_cameras_in_one_folder_are_not_to_be_used(workcell_camera2: Path, tmp_path: Path) -> None:
+    """Some images are as from another place: their boards agreed with no turn, and were ambiguous, without a word."""
+    shutil.copytree(workcell_camera2, tmp_path / "cell")
+    elsewhere = se3.expmap(np.array([[0.3, 1.2, -0.5, 0.4, -0.2, 0.3]]))[0]
+    for path in sorted((tmp_path / "cell" / "pose").iterdir())[:14]:
+        np.savetxt(path, elsewhere @ np.loadtxt(path))
+    corners_of(tmp_path / "cell", WORKCELL, tmp_path)
+    solved = solve_log(tmp_path / "calibration.mcap")
+    assert solved.judgement.verdict is rw.Verdict.DO_NOT_USE
+    assert set(solved.judgement.grounds) <= {rw.Ground.MOVED, rw.Ground.CONTRADICTED}
+    assert solved.log.detection.tracks[0].removed == {}
+    assert solved.log.agreement == {rw.Pair("board", "camera2"): (22, 34)}
+
+
 def test_measurements_without_corners_beside_others_are_counted(workcell_log: Path) -> None:
     with open_log(workcell_log) as opened:
         log = CleanedLog.read(opened, None)
