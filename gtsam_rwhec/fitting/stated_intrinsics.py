@@ -32,7 +32,7 @@ CENTRE_OF_WIDTH = {"exact": 0.0, "calibration": 0.0, "nominal": 0.02, "unknown":
 LENS_PX = {"exact": 1e-5, "calibration": 3.0}
 LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
 #: Deviations of fy / fx and of p1 and p2 from what is stated; those of published calibrations: docs/lens_priors.md.
-ASPECT, TANGENTIAL = 2e-3, 1e-3
+ASPECT, TANGENTIAL = 2.7e-3, 2.6e-3
 #: That of fy / fx where they are one focal length. Where it is 1e-8, GTSAM's Levenberg-Marquardt takes a hundred steps.
 SQUARE = 1e-6
 #: Where a parameter is off its mean by more than 1 / this of its deviations, it is held, and begins at the mean.

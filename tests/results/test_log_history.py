@@ -6,11 +6,13 @@ import pytest
 from pydantic import ValidationError
 
 from gtsam_rwhec.calibration.outliers import LeftOut
-from gtsam_rwhec.results.log_history import LogFields, OutlierCount, TrackCount
+from gtsam_rwhec.results.log_history import CleaningReport, LogFields, OutlierCount, TrackCount
+from gtsam_rwhec.results.removed_measurements import RemovalReason
 
 
-def contradicted(*outliers: OutlierCount) -> tuple[LeftOut, ...]:
-    return LogFields.model_construct(outliers=outliers).contradicted
+def contradicted(*outliers: OutlierCount, cleaned: tuple[TrackCount, ...] = ()) -> tuple[LeftOut, ...]:
+    cleaning = CleaningReport.model_construct(tracks=cleaned)
+    return LogFields.model_construct(outliers=outliers, cleaning=cleaning).contradicted
 
 
 def names(*outliers: OutlierCount) -> list[str]:
@@ -46,6 +48,16 @@ def test_nearly_half_of_many_measurements_is_enough() -> None:
     assert names(board(5, 3)) == []
     half_of_the_board = OutlierCount(target="board", sensor="late", used=25, left_out=50)
     assert names(board(25, 0), half_of_the_board) == ["late"]
+
+
+def test_what_cleaning_removes_for_the_motion_counts_with_the_outliers() -> None:
+    """37 of 76 images of another camera: 18 by cleaning, 19 as outliers, and none of these alone was many."""
+    kept = OutlierCount(target="board", sensor="camera", used=39, left_out=19)
+    off = {RemovalReason.ROTATION_OFF.value: 18, RemovalReason.STANDSTILL.value: 100}
+    cleaned = TrackCount(target="board", sensor="camera", used=58, removed=off)
+    assert contradicted(kept) == ()
+    found = contradicted(kept, cleaned=(cleaned,))
+    assert LeftOut(frame="camera", left_out=37, measurements=76) in found
 
 
 def test_unknown_fields_are_refused() -> None:
