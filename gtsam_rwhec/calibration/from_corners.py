@@ -70,6 +70,7 @@ class CornersFound:
     #: The factor on each unknown's standard deviations, where images that were left out show them to be too small
     wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
     start: Refined | None = None  #: The answer from poses that was its start
+    tried: Tried | None = None  #: The models that were compared
     without: dict[Pair, int] = field(default_factory=dict)  #: How many measurements have no corners, by pair
 
     @staticmethod
@@ -102,6 +103,7 @@ def corners_found(
     tell: Progress,
     thin: CornersRefined | None = None,
     far_off: Collection[str] = (),
+    tried: Tried | None = None,
 ) -> CornersFound:
     """Refine from corners with the given options, or with A as exact if this predicts held-out images better.
 
@@ -116,9 +118,11 @@ def corners_found(
         The refinement of ``thinned(observations)`` with everything free, where it was made already.
     far_off : collection of str
         Sensors whose stated intrinsics do not fit their corners, and count as unknown.
+    tried : Tried, optional
+        The models that were compared before, on most of these images; left out, they are compared.
     """
     try:
-        tried = chosen_model(observations, X, Y, options, tell, thin)
+        tried = tried or chosen_model(observations, X, Y, options, tell, thin)
         tell("refining from corners")
         corners = refine_corners(observations, X, Y, tried.options, tell)
     except OutlierError as error:
@@ -153,6 +157,7 @@ def corners_found(
         tuple(_corner_choices(observations, corners, tried, intrinsics, far_off)),
         (*_corner_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
         {slot: factor for slot, factor in tried.wider.items() if slot in corners.slots},
+        tried=tried,
     )
 
 
@@ -332,14 +337,18 @@ def with_better_poses(run: Run, found: Answer) -> tuple[Run | None, CornersRefin
 
 
 def _from_corners(
-    run: Run, base: Refined, noise: NoiseInData | None = None, thin: CornersRefined | None = None
+    run: Run,
+    base: Refined,
+    noise: NoiseInData | None = None,
+    thin: CornersRefined | None = None,
+    tried: Tried | None = None,
 ) -> CornersFound:
     """What the corners of the images give that agree with an answer from their poses, with the noise of these."""
     if why := _why_not(run, base):
         return replace(CornersFound.none(why), start=base)
     observations, options, without = _observed(run, base, noise)
     far_off = () if run.recording is None else run.recording.far_off
-    found = corners_found(base.X, base.Y, observations, options, run.tell, thin, far_off)
+    found = corners_found(base.X, base.Y, observations, options, run.tell, thin, far_off, tried)
     return replace(found, start=base, without=without)
 
 
@@ -355,7 +364,7 @@ def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tupl
         if more is None:
             break
         run.tell("refining from corners, with images whose corners agree")
-        again = _from_corners(replace(run, problem=agreeing(run.problem, more)), base)
+        again = _from_corners(replace(run, problem=agreeing(run.problem, more)), base, tried=found.tried)
         if again.corners is None:
             break
         found, inliers = again, more
