@@ -10,8 +10,8 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.corner_models import chosen_model, in_words, thinned
-from gtsam_rwhec.calibration.from_corners import MEASUREMENTS, corners_found, growth_by_intrinsics
+from gtsam_rwhec.calibration.corner_models import chosen_model, growth_by_intrinsics, in_words, thinned
+from gtsam_rwhec.calibration.from_corners import MEASUREMENTS, corners_found
 from gtsam_rwhec.calibration.verdict import Ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fitting"))

@@ -32,16 +32,27 @@ def test_what_the_images_do_not_tell_is_named_and_no_more_is_claimed(
 ) -> None:
     given = cell(4, images=16, facing=UNDETERMINED[where], stated=stated)
     result = refined(given, stated)
-    for sensor, camera in result.intrinsics.items():
+    for camera in result.intrinsics.values():
         assert set(names) <= set(camera.held_by_prior)
         deviations = np.sqrt(np.diagonal(camera.covariance))
         assert (deviations <= camera.stated_deviations * (1.0 + 1e-9)).all()
-        off = CAMERA.parameters - camera.camera.parameters
-        squared = off @ np.linalg.solve(camera.covariance, off)
-        # of 80 such cameras 2 are outside 99.9 %: where f and the distance go together, the answer is not linear
-        assert squared < result.squared_radius(f"intrinsics:{sensor}", 0.9999)
         said = ", ".join(camera.held_by_prior)
         assert any(f"The images do not tell {said} of" in words for words in result.findings)
+
+
+@pytest.mark.parametrize(("where", "stated"), [("nearly fronto-parallel at one depth", "calibration"),
+    ("nearly fronto-parallel at one depth", "nominal"), ("in a corner of the image", "calibration"),
+])  # fmt: skip
+def test_the_truth_is_where_the_covariance_says(where: str, stated: Stated) -> None:
+    """Of 24 cameras at most one is outside 99.9 %: where f and the distance go together, the answer is not linear."""
+    outside = 0
+    for seed in range(12):
+        result = refined(cell(seed, images=16, facing=UNDETERMINED[where], stated=stated), stated)
+        for sensor, camera in result.intrinsics.items():
+            off = CAMERA.parameters - camera.camera.parameters
+            squared = off @ np.linalg.solve(camera.covariance, off)
+            outside += squared > result.squared_radius(f"intrinsics:{sensor}", 0.999)
+    assert outside <= 1
 
 
 def test_images_at_all_tilts_and_places_tell_all() -> None:
