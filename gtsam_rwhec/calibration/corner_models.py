@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gtsam_rwhec.calibration.verdict import Choice
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, with_widest
@@ -131,3 +132,48 @@ def in_words(options: CornerOptions) -> str:
     free = [name for name, share in options.size_share.items() if share]
     sizes = f"the size of {free[0]} estimated" if len(free) == 1 else "some sizes estimated"
     return f"{of_A} and {sizes if free else 'sizes as stated'}"
+
+
+#: A growth of standard deviations below this factor is not reported.
+SEEN_GROWTH = 1.05
+
+
+def choices_of(tried: Tried) -> Iterator[Choice]:
+    """What is free of cameras and boards, with its rivals; and by how much blocks of images widen the deviations."""
+    for what in dict.fromkeys(one.what for one in tried.cameras.tried):
+        every = [one for one in tried.cameras.tried if one.what == what]
+        chosen = next(one for one in every if one.is_chosen)
+        others = [one for one in every if one.is_shared != chosen.is_shared]
+        if others and not chosen.is_shared:
+            continue  # they are no one camera, and what is free of each is said of it
+        rivals = [f"{one.px:.4g} px {one.words}" for one in every if one not in others and one is not chosen]
+        if others:
+            rivals.append(f"{min(one.px for one in others):.4g} px each camera by itself, at best")
+        words = f"one camera for all of them, {chosen.words}" if chosen.is_shared else chosen.words
+        evidence = f"the simplest that predicts images that were left out as well as any: {chosen.px:.4g} px"
+        yield Choice(what, words, f"{evidence} ({', '.join(rivals)})")
+    frames = [(name, factor) for (letter, name), factor in tried.wider.items() if letter in "xy"]
+    said = ", ".join(f"{name} {factor:.2g}" for name, factor in frames if factor > SEEN_GROWTH)
+    if said:
+        evidence = "answers without blocks of images, by time and by pose, scatter by more than corners' errors explain"
+        yield Choice("standard deviations", f"widened by these factors: {said}", evidence)
+
+
+def growth_by_intrinsics(corners: CornersRefined) -> dict[str, float]:
+    """By sensor: the largest ratio of a standard deviation of its pose to that with exact intrinsics.
+
+    With exact intrinsics k the covariance of the rest e is C_ee - C_ek C_kk^-1 C_ke.
+    """
+    held = [np.arange(at.start, at.stop) for (letter, _), at in corners.slots.items() if letter == "k"]
+    if not held:
+        return dict.fromkeys(corners.Y, 1.0)
+    k, C = np.concatenate(held), corners.joint
+    size = np.sqrt(np.diagonal(C)[k])
+    found = {}
+    for name in corners.Y:
+        e = np.arange(corners.slots["y", name].start, corners.slots["y", name].stop)
+        across = C[np.ix_(e, k)] / size
+        by_k = across @ np.linalg.solve(C[np.ix_(k, k)] / np.outer(size, size), across.T)
+        known = np.diagonal(C)[e] - np.diagonal(by_k)
+        found[name] = float(np.sqrt((np.diagonal(C)[e] / np.maximum(known, 1e-300)).max()))
+    return found

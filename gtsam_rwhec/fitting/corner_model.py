@@ -91,6 +91,16 @@ class Model:
         rows = linearised(stack, *self._arguments(stack, point))
         return replace(rows, shapes=rows.shapes[..., self.free_shape(stack.target)])
 
+    def by_unknown(self, stack: Stack, rows: Linear) -> dict[tuple[str, str], Array]:
+        """Derivatives (V, 2n, m) of a stack's rows by letter and name of each unknown but A and single corners."""
+        found = {("x", stack.target): rows.by_X, ("y", stack.sensor): rows.by_Y}
+        found["k", self.camera_of[stack.sensor]] = rows.by_camera
+        if stack.target in self.shape_priors:
+            found["b", stack.target] = rows.by_shape
+        if stack.sensor in self.offset_priors:
+            found["t", stack.sensor] = rows.by_time
+        return found
+
     def seen(self, stack: Stack, point: Point) -> Seen:
         """A stack's corners on their way to the camera."""
         X, Y, A, _, shape, offset_s, corners = self._arguments(stack, point)

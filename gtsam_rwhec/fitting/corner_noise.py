@@ -107,12 +107,7 @@ class Reduced:
         off_A = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
         for stack, weights in zip(model.stacks, model.weights, strict=True):
             rows = model.linearised(stack, point)
-            parts = {("x", stack.target): rows.by_X, ("y", stack.sensor): rows.by_Y}
-            parts["k", model.camera_of[stack.sensor]] = rows.by_camera
-            if ("b", stack.target) in slots:
-                parts["b", stack.target] = rows.by_shape
-            if ("t", stack.sensor) in slots:
-                parts["t", stack.sensor] = rows.by_time
+            parts = model.by_unknown(stack, rows)
             names = list(parts) + [("p", stack.target)] * (("p", stack.target) in slots)
             where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in names])
             root = np.repeat(np.sqrt(weights), 2, axis=1)

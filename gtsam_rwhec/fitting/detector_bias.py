@@ -22,8 +22,8 @@ from gtsam_rwhec.fitting.corner_residuals import Stack
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.geometry.poses import Array
 
-#: Standard deviation of each pattern, pixels: of the biases that rendered checkerboards, ChArUco boards, tags and
-#: circles show, the root mean square.
+#: Standard deviation of each pattern, pixels, for every kind of target: the largest pattern of rendered checkerboards
+#: and ChArUco boards has 0.001 to 0.002, that of tags and circles 0.003 to 0.011.
 BIAS_PX = 0.004
 
 #: A pattern (V, n, 2) of a stack: its pixels and unit directions (V, n, 2) along the target's x, its y, and away.

@@ -136,14 +136,7 @@ def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, 
     rows = model.linearised(seen, point)
     length = np.linalg.norm(rows.residual.reshape(*known.shape, 2), axis=2)[known]
     on_target = length * model.seen(seen, point).z[known] / camera.focal_px
-    blocks = {
-        ("x", stack.target): rows.by_X,
-        ("y", stack.sensor): rows.by_Y,
-        ("k", model.camera_of[stack.sensor]): rows.by_camera,
-        ("b", stack.target): rows.by_shape,
-        ("t", stack.sensor): rows.by_time,
-    }
-    there = {name: block for name, block in blocks.items() if name in refined.slots}
+    there = model.by_unknown(stack, rows)
     J = np.concatenate(list(there.values()), axis=2)
     index = np.concatenate([np.arange(refined.slots[name].start, refined.slots[name].stop) for name in there])
     squares = np.einsum("vri,ij,vrj->vr", J, refined.joint[np.ix_(index, index)], J, optimize=True)

@@ -58,14 +58,7 @@ def _squares(stack: Stack, A: Array, refined: CornersRefined) -> Array:
     """r' F^-1 r (V,) of each image, by (I + M'M)^-1 with M = [J_A S^1/2, J C^1/2] / s."""
     model = replace(refined.graph.model, stacks=(stack,), A=A)
     rows = model.linearised(stack, replace(refined.point, A=A))
-    blocks = {
-        ("x", stack.target): rows.by_X,
-        ("y", stack.sensor): rows.by_Y,
-        ("k", model.camera_of[stack.sensor]): rows.by_camera,
-        ("b", stack.target): rows.by_shape,
-        ("t", stack.sensor): rows.by_time,
-    }
-    there = {at: block for at, block in blocks.items() if at in refined.slots}
+    there = model.by_unknown(stack, rows)
     index = np.concatenate([np.arange(refined.slots[at].start, refined.slots[at].stop) for at in there])
     values, vectors = np.linalg.eigh(refined.joint[np.ix_(index, index)])
     M = np.concatenate(list(there.values()), axis=2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -35,8 +35,8 @@ LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
 ASPECT, TANGENTIAL = 2.7e-3, 2.6e-3
 #: That of fy / fx where they are one focal length. Where it is 1e-8, GTSAM's Levenberg-Marquardt takes a hundred steps.
 SQUARE = 1e-6
-#: Where a parameter is off its mean by more than 1 / this of its deviations, it is held, and begins at the mean.
-NOTHING = 1e-3
+#: A parameter that is further than this many of its prior's deviations from the mean is held: it begins at the mean.
+FAR_OFF = 1e3
 #: xi of a nominal unified camera is right to this share of 1 + xi. It bends the image as k1 does, but along a curve:
 #: where xi is as free as the other coefficients, their linear deviations hold the truth in 78 to 88 % of simulations.
 XI_OF_NOMINAL = 0.05
@@ -65,7 +65,7 @@ class CameraPrior(NamedTuple):
 
     def start(self, parameters: Array) -> Array:
         """Parameters (m,) to begin with: the mean of those that are held."""
-        return np.where(self.deviation < NOTHING * np.abs(parameters - self.mean), self.mean, parameters)
+        return np.where(FAR_OFF * self.deviation < np.abs(parameters - self.mean), self.mean, parameters)
 
     @property
     def precision(self) -> Array:
