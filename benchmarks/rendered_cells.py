@@ -15,7 +15,7 @@ bent board's frame is in its middle where its bend was estimated, else in the pl
 not the same in all images, and has no bar. Images count as left out where their board was read and is not used.
 
 ``--each`` prints a line a cell, ``--keep`` adds each to a file and goes on from it, ``--folder`` is where cells are
-rendered, and stay; else each is removed.
+rendered and the log of their corners is written, once, and stay; else each is removed.
 """
 
 from __future__ import annotations
@@ -79,6 +79,11 @@ class Cell:
     bend: Array
     sign: float
     drawn: dict[str, Any]
+
+    @property
+    def corners(self) -> Path:
+        """The log of the corners that were found in its images."""
+        return self.folder / "corners.mcap"
 
     def height(self, x: Array, y: Array) -> Array:
         """Of the board over its middle, metres."""
@@ -176,6 +181,8 @@ def made_cell(kind: str, seed: int, number: int, folder: Path) -> Cell:
     X, Y = (inverse(beside[0]), [carried]) if kind == "hand" else (carried, list(beside))
     sign = float(rng.choice([-1.0, 1.0]))
     cell = Cell(kind, folder, board, cameras, of_stated, X, dict(zip(names, Y, strict=True)), bend, sign, drawn)
+    if cell.corners.exists():
+        return cell
     shutil.rmtree(folder, ignore_errors=True)
     for name in names:
         _write_images(cell, name, rng)
@@ -235,15 +242,24 @@ def run(kind: str, seed: int, number: int, folder: Path | None) -> dict[str, Any
         begun = time.monotonic()
         cell = made_cell(kind, seed, number, (folder or Path(temporary)) / f"{kind}_{seed}_{number}")
         rendered, out = time.monotonic(), cell.folder / "out"
-        command = [sys.executable, "-m", "gtsam_rwhec", "calibrate", str(cell.folder), "--workers", "1"]
-        command += ["--rig", str(cell.folder / "rig.yaml"), "-o", str(out)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        shutil.rmtree(out, ignore_errors=True)
+        done = None
+        if not cell.corners.exists():
+            rig = ["--rig", str(cell.folder / "rig.yaml"), "--workers", "1"]
+            done = _command("detect", str(cell.folder), *rig, "-o", str(cell.corners))
+        if done is None or done.returncode == 0:
+            done = _command("calibrate", str(cell.corners), "-o", str(out))
         one = {"kind": kind, "seed": seed, "number": number, **cell.drawn, "status": done.returncode}
         one |= {"render_s": rendered - begun, "calibrate_s": time.monotonic() - rendered}
         try:
             return one | compared(cell, rw.results.read_calibration(out))
         except RwhecError as error:
             return one | {"verdict": None, "said": f"{error}\n{done.stderr[-1500:]}"}
+
+
+def _command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gtsam_rwhec", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def compared(cell: Cell, result: rw.results.Result) -> dict[str, Any]:
