@@ -283,7 +283,7 @@ class Blocks:
             for number in range(block.max() + 1):
                 inside = block == number
                 if inside.any() and _leaves_enough(model, inside):
-                    reduced = Reduced.of(_part(model, inside), refined.point, refined.slots)
+                    reduced = Reduced.of(model.of_instants(inside), refined.point, refined.slots)
                     sums = reduced.without_carriers(noise)
                     found.append((sums.H, sums.h, sums.rr, reduced.count))
                     ways.append(way)
@@ -329,16 +329,6 @@ class Blocks:
                 if ratio > chdtri(freedom, BY_CHANCE) / freedom:
                     found[slot] = max(found[slot], float(np.sqrt(ratio)))
         return found
-
-
-def _part(model: Model, inside: np.ndarray) -> Model:
-    """The model of some instants' images (I,), with all frames' priors."""
-    there = [inside[stack.instant] for stack in model.stacks]
-    return replace(
-        model,
-        stacks=tuple(stack.selected(at) for stack, at in zip(model.stacks, there, strict=True) if at.any()),
-        weights=tuple(weights[at] for weights, at in zip(model.weights, there, strict=True) if at.any()),
-    )
 
 
 def _leaves_enough(model: Model, inside: np.ndarray) -> bool:

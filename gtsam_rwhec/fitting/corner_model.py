@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.fitting.common_errors import whitened
 from gtsam_rwhec.fitting.corner_residuals import Linear, Seen, Stack, linearised, pixel_errors, seen
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior
@@ -61,6 +63,8 @@ class Model:
     corner_priors: dict[str, float] = field(default_factory=dict)
     #: Standard deviation of a corner as it was stated: it counts where corners are too few to tell theirs.
     stated_px: float = 0.1
+    #: (V, 2n, k) each. One deviation of what the corners of an image share, pixels, by stack; empty: nothing.
+    common: tuple[Array, ...] = ()
 
     @property
     def to_right(self) -> Array:
@@ -82,9 +86,24 @@ class Model:
     def errors(self, point: Point) -> list[Array]:
         """Residuals (V, 2n) of every stack, weighted, over the corners' deviation."""
         return [
-            _finite(pixel_errors(stack, *self._arguments(stack, point)), root)
-            for stack, root in zip(self.stacks, self._roots, strict=True)
+            self._whitened(s, _finite(pixel_errors(stack, *self._arguments(stack, point)), root)[..., None])[..., 0]
+            for s, (stack, root) in enumerate(zip(self.stacks, self._roots, strict=True))
         ]
+
+    def of_instants(self, which: np.ndarray) -> Model:
+        """The model of some instants' images (I,), with all frames' priors."""
+        there = [which[stack.instant] for stack in self.stacks]
+        kept = [s for s, at in enumerate(there) if at.any()]
+        return replace(
+            self,
+            stacks=tuple(self.stacks[s].selected(there[s]) for s in kept),
+            weights=tuple(self.weights[s][there[s]] for s in kept),
+            common=tuple(self.common[s][there[s]] for s in kept) if self.common else (),
+        )
+
+    def _whitened(self, s: int, rows: Array) -> Array:
+        """Weighted rows (V, 2n, m) of a stack, of unit noise."""
+        return whitened(rows, self.common[s] * self._roots[s][..., None]) if self.common else rows
 
     def linearised(self, stack: Stack, point: Point) -> Linear:
         """Rows of a stack, in pixels; by the numbers of the board's shape that are free."""
@@ -112,14 +131,14 @@ class Model:
         of_board = point.shapes[stack.target], point.offsets_s.get(stack.sensor, 0.0), point.corners.get(stack.target)
         return *poses, camera, *of_board
 
-    @property
+    @cached_property
     def _roots(self) -> list[Array]:
         return [np.repeat(np.sqrt(weights), 2, axis=1) / self.corner_px for weights in self.weights]
 
     def few_rows(self, point: Point) -> list[FewRows]:
         """Rows of every stack with the same cost and the same information as all of them, by stack."""
         result = []
-        for stack, root in zip(self.stacks, self._roots, strict=True):
+        for s, (stack, root) in enumerate(zip(self.stacks, self._roots, strict=True)):
             rows = self.linearised(stack, point)
             variables = self.variables_of(stack)
             blocks = {name: getattr(rows, f"by_{name}") for name in variables if name not in ("corners", "A")}
@@ -127,10 +146,11 @@ class Model:
             number = [block.shape[2] for block in blocks.values()] + [3 * len(stack.points)] * has["corners"]
             ends = np.cumsum(number).tolist()
             columns = {name: slice(a, b) for name, a, b in zip(variables, [0, *ends], ends, strict=False)}
-            J = np.concatenate(list(blocks.values()), axis=2) * root[..., None]
+            J = self._whitened(s, np.concatenate(list(blocks.values()), axis=2) * root[..., None])
             B = rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if has["corners"] else None
-            J_A = rows.by_A * root[..., None] if has["A"] else None
-            result.append(FewRows(*few_rows(Rows(J, B, _finite(rows.residual, root)), J_A), columns))
+            J_A = self._whitened(s, rows.by_A * root[..., None]) if has["A"] else None
+            r = self._whitened(s, _finite(rows.residual, root)[..., None])[..., 0]
+            result.append(FewRows(*few_rows(Rows(J, B, r), J_A), columns))
         return result
 
     def vectors(self, point: Point) -> dict[tuple[str, str], Array]:

@@ -3,9 +3,10 @@
 All sums are in pixels: rows are not divided by the corners' deviation. With the common unknowns theta (poses, cameras,
 shapes) and the carriers' errors a_i at the instants, to first order
 
-    r = r_0 + J theta + J_i a_i + noise,    a_i ~ N(0, S),
+    r = r_0 + J theta + J_i a_i + P c + noise,    a_i ~ N(0, S),
 
-so the sums G = J'J, C_i = J_i'J, M_i = J_i'J_i, g = J'r_0, b_i = J_i'r_0 and r_0'r_0 are all.
+so the sums G = J'J, C_i = J_i'J, M_i = J_i'J_i, g = J'r_0, b_i = J_i'r_0 and r_0'r_0 are all, with what the errors c
+that an image's corners share take from them (`common_errors`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from typing import TypeAlias
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows
+from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -27,15 +30,22 @@ CORNER_PX = (1e-3, 30.0)
 CARRIER = (1e-7, 0.1)
 #: Deviations below this (rad, m) move no corner.
 NOTHING = 1e-6
+#: What an image's corners share is looked for from this share of a corner's deviation to so many pixels, and counts from
+#: twice that share: more is no detector's.
+LEAST_COMMON, MOST_COMMON_PX = 0.02, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations: of a corner (pixels), and of A's right perturbation (rad, m); 0: A is exact."""
+    """Standard deviations: of a corner (pixels), and of A's right perturbation (rad, m); 0: A is exact.
+
+    And of each pattern in which an image's corners are off together (pixels).
+    """
 
     corner_px: float
     carrier_rad: float
     carrier_m: float
+    common_px: float = 0.0
 
     @property
     def carrier(self) -> Array | None:
@@ -85,6 +95,7 @@ class Reduced:
     #: (d, d): The precision of the prior on theta, and `prior_off` (d,) how far the point is from its mean.
     prior: Array
     prior_off: Array
+    common: CommonErrors
 
     @staticmethod
     def of(model: Model, point: Point, slots: Mapping[tuple[str, str], slice] | None = None) -> Reduced:
@@ -102,7 +113,7 @@ class Reduced:
         count = len(model.A)
         G, g = np.zeros((size, size)), np.zeros(size)
         C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
-        rr = number = 0.0
+        rr, number, common = 0.0, 0.0, []
         to_right = model.to_right
         off_A = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
         for stack, weights in zip(model.stacks, model.weights, strict=True):
@@ -128,14 +139,20 @@ class Reduced:
             np.add.at(C, stack.instant, of_view)
             np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
             np.add.at(b, stack.instant, of_A[..., -1])
+            P = patterns(model, stack, point, OF_AN_IMAGE) * root[..., None]
+            of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
+            of_theta = np.zeros((*of_P.shape[:2], size))
+            of_theta[:, :, where] = of_P[..., :-1]
+            common.append((stack.instant, of_theta, Pt @ J_A, of_P[..., -1], Pt @ P))
         prior, off = np.zeros((size, size)), np.zeros(size)
         for at, of in model.priors(point).items():
             prior[slots[at], slots[at]] = of.precision
             off[slots[at]] = vectors[at] - of.mean
-        return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
+        shared = CommonErrors(*map(np.concatenate, zip(*common, strict=True)))
+        return Reduced(slots, G, g, C, M, b, rr, number, prior, off, shared)
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
-        """Restricted: theta integrated out; and its derivatives by the logarithms of the three deviations.
+        """Restricted: theta integrated out; and its derivatives by the logarithms of the deviations.
 
         With K_i = (S^-1 + M_i / s^2)^-1 the carriers' errors are eliminated:
 
@@ -145,45 +162,66 @@ class Reduced:
         its variance (Patterson and Thompson's equations).
         """
         s2, S = noise.corner_px**2, noise.carrier
+        sums, _ = self.without_common(noise)
         at = self.without_carriers(noise)
         H, h, K, KC, Kb = at.H + self.prior, at.h + self.prior @ self.prior_off, at.K, at.KC, at.Kb
         size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
         sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
         if sign <= 0.0:
-            return np.inf, np.zeros(3)
+            return np.inf, np.zeros(4)
         inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
         theta = -inverse @ h
         off = float(self.prior_off @ self.prior @ self.prior_off)
         value = at.rr + off + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
         free = len(H) - float((self.prior * inverse).sum())
-        squares = self.rr + 2.0 * float(self.g @ theta) + float(theta @ self.G @ theta)
-        gradient = np.zeros(3)
+        squares = sums.rr + 2.0 * float(sums.g @ theta) + float(theta @ sums.G @ theta)
+        gradient, a = np.zeros(4), -(Kb + KC @ theta)
         if S is not None:
-            a = -(Kb + KC @ theta)
             variances = np.diagonal(K, axis1=1, axis2=2) + np.einsum("nid,de,nie->ni", KC, inverse, KC, optimize=True)
-            squares += float(np.einsum("ni,nij,nj->", a, self.M, a)) + 2.0 * float(
-                (a * (self.b + self.C @ theta)).sum()
+            squares += float(np.einsum("ni,nij,nj->", a, sums.M, a)) + 2.0 * float(
+                (a * (sums.b + sums.C @ theta)).sum()
             )
             free += float((1.0 - variances / S**2).sum())
             off = 2.0 * (len(a) - (a**2 + variances).sum(axis=0) / S**2)
-            gradient[1:] = off[:3].sum(), off[3:].sum()
+            gradient[1:3] = off[:3].sum(), off[3:].sum()
+        # with t / s as it is, the sums without common errors are those of white noise
         gradient[0] = 2.0 * (self.count - squares / s2 - free)
+        if noise.common_px:
+            gradient[3] = self.common.twice_by_log(noise.common_px, s2, theta, inverse, Carriers(a, K, KC))
+            gradient[0] -= gradient[3]
         return value, gradient
+
+    def without_common(self, noise: Noise) -> tuple[Reduced, float]:
+        """The sums without what images' corners share, and the gain of the logarithm of the determinant."""
+        if not noise.common_px:
+            return self, 0.0
+        of, s2 = self.common, noise.corner_px**2
+        K, log_det = of.inverse(noise.common_px, s2)
+        KJ, KA, Kr = K @ of.of_unknowns / s2, K @ of.of_A / s2, (K @ of.of_residual[..., None])[..., 0] / s2
+        C, M, b, d = self.C.copy(), self.M.copy(), self.b.copy(), len(self.G)
+        to_A = of.of_A.transpose(0, 2, 1)
+        np.subtract.at(C, of.instant, to_A @ KJ)
+        np.subtract.at(M, of.instant, to_A @ KA)
+        np.subtract.at(b, of.instant, (to_A @ Kr[..., None])[..., 0])
+        flat = of.of_unknowns.reshape(-1, d)
+        G, g = self.G - flat.T @ KJ.reshape(-1, d), self.g - flat.T @ Kr.ravel()
+        return replace(self, G=G, g=g, C=C, M=M, b=b, rr=self.rr - float((of.of_residual * Kr).sum())), log_det
 
     def without_carriers(self, noise: Noise) -> WithoutCarriers:
         """The sums of the measurements under a noise, the carriers' errors eliminated."""
         s2, S = noise.corner_px**2, noise.carrier
-        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, self.count * np.log(s2)
+        sums, log_det = self.without_common(noise)
+        H, h, rr, log_det = sums.G / s2, sums.g / s2, sums.rr / s2, log_det + self.count * np.log(s2)
         K, KC, Kb = np.zeros_like(self.M), np.zeros_like(self.C), np.zeros_like(self.b)
         if S is not None:
             # K = D (I + D M D / s2)^-1 D, D = diag(S)
-            inner = np.eye(6) + self.M * S[:, None] * S / s2
+            inner = np.eye(6) + sums.M * S[:, None] * S / s2
             K = np.linalg.inv(inner) * S[:, None] * S
-            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
-            flat = self.C.reshape(-1, len(H))
+            KC, Kb = K @ sums.C / s2, (K @ sums.b[..., None])[..., 0] / s2
+            flat = sums.C.reshape(-1, len(H))
             H = H - flat.T @ KC.reshape(flat.shape) / s2
             h = h - flat.T @ Kb.ravel() / s2
-            rr -= float((self.b * Kb).sum()) / s2
+            rr -= float((sums.b * Kb).sum()) / s2
             log_det += float(np.linalg.slogdet(inner)[1].sum())
         return WithoutCarriers(H, h, rr, log_det, K, KC, Kb)
 
@@ -193,22 +231,39 @@ class Reduced:
 
     def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
         """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""
-        number = 3 if carrier else 1
-        begin = np.log([start.corner_px, max(start.carrier_rad, 1e-5), max(start.carrier_m, 1e-5)])[:number]
+        deviations, free = deviations_of(start), self.free(start, carrier=carrier)
+        begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free]
 
         def noise(x: Vector) -> Noise:
-            px, *of_carrier = np.exp(x).tolist()
-            return Noise(px, *of_carrier) if carrier else replace(start, corner_px=px)
+            found = deviations.copy()
+            found[free] = np.exp(x)
+            return Noise(*found.tolist())
 
         def cost(x: Vector) -> tuple[float, Array]:
             value, gradient = self.minus_two_log_likelihood(noise(x))
-            return value, gradient[:number]
+            return value, gradient[free]
 
-        bounds = [(np.log(low), np.log(high)) for low, high in (CORNER_PX, CARRIER, CARRIER)[:number]]
+        shared = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
+        bounds = [np.log([CORNER_PX, CARRIER, CARRIER, shared][i]) for i in free]
         from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
 
-        found = minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11})
-        return noise(found.x)
+        found = noise(minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11}).x)
+        return found if found.common_px > 2.0 * LEAST_COMMON * found.corner_px else replace(found, common_px=0.0)
+
+    def free(self, noise: Noise, *, carrier: bool) -> list[int]:
+        """Which deviations are estimated.
+
+        Images' corners share nothing where A counts as exact, since that would be A's noise by another name, nor where
+        each corner's own place is free.
+        """
+        shares = noise.carrier is not None and not any(letter == "p" for letter, _ in self.slots)
+        shares &= 2.0 * LEAST_COMMON * noise.corner_px < MOST_COMMON_PX
+        return [0, *((1, 2) if carrier else ()), *((3,) if shares else ())]
+
+
+def deviations_of(noise: Noise) -> Array:
+    """All of them (4,)."""
+    return np.array([getattr(noise, field.name) for field in fields(noise)])
 
 
 #: The step of numeric derivatives by the logarithm of a deviation.
@@ -219,8 +274,8 @@ FEWEST = 3.0
 
 def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict[tuple[str, str], float]:
     """Of each unknown's covariance; with `carrier` false only the corners' noise was estimated."""
-    deviations = np.array([noise.corner_px, noise.carrier_rad, noise.carrier_m])
-    free = [0, *(i for i in (1, 2) if carrier and deviations[i] > NOTHING)]
+    deviations = deviations_of(noise)
+    free = [i for i in reduced.free(noise, carrier=carrier) if i == 0 or deviations[i] > NOTHING]
 
     def at(step: Array) -> Noise:
         moved = deviations.copy()
@@ -259,7 +314,7 @@ MEDIAN = 1.1774
 
 def errors_px(model: Model, point: Point) -> list[Array]:
     """Lengths (V, n) of all corners' errors, in pixels, by stack; zero where a corner was not seen."""
-    every = replace(model, weights=tuple(stack.known.astype(float) for stack in model.stacks), corner_px=1.0)
+    every = replace(model, weights=tuple(stack.known.astype(float) for stack in model.stacks), corner_px=1.0, common=())
     return [
         np.linalg.norm(error.reshape(*stack.known.shape, 2), axis=2)
         for stack, error in zip(model.stacks, every.errors(point), strict=True)

@@ -32,6 +32,7 @@ from gtsam_rwhec.fitting.corner_findings import findings_of
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corner_model import BEHIND, Model, Point
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, degrees_of_freedom, weights_of
+from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.fitting.corner_residuals import SHAPE, shaped, stacks_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions, RefineOptions
@@ -239,7 +240,11 @@ def _settled(
         same = not has_outliers and all(np.array_equal(a, b) for a, b in zip(weights, model.weights, strict=True))
         if same and noise.change(before) < SETTLED:
             break
-        model = replace(model, A_noise=noise.carrier, corner_px=noise.corner_px, weights=weights)
+        common = tuple(noise.common_px * patterns(model, stack, point, OF_AN_IMAGE) for stack in model.stacks)
+        model = replace(
+            model, A_noise=noise.carrier, corner_px=noise.corner_px, weights=weights,
+            common=common if noise.common_px else (),
+        )  # fmt: skip
     check_corners(model, point)
     with told_where_it_fails(model, point):
         joint, last_step = graph.covariance(values, reduced.slots)
@@ -289,7 +294,7 @@ def _innovations(settled: _Settled, priors: Mapping[str, CameraPrior]) -> dict[s
 def _rms(settled: _Settled) -> dict[str, float]:
     """Of the corners that count, along each axis, by sensor."""
     sums: dict[str, Array] = {}
-    model = settled.model
+    model = replace(settled.model, common=())
     for stack, error, weights in zip(model.stacks, model.errors(settled.point), model.weights, strict=True):
         of_stack = np.array([(error**2).sum() * model.corner_px**2, 2.0 * weights.sum()])
         sums[stack.sensor] = sums.get(stack.sensor, np.zeros(2)) + of_stack

@@ -230,6 +230,7 @@ def numbers_of(
     return Reprojection(
         rms_px=float(np.sqrt(squares / max(sum(one.corners for one in sensors.values()), 1))),
         corner_px=corners.noise.corner_px,
+        common_px=corners.noise.common_px,
         carrier_poses="exact" if corners.noise.carrier is None else "given" if given else "estimated",
         carrier_rotation_rad=corners.noise.carrier_rad,
         carrier_translation_m=corners.noise.carrier_m,

@@ -11,31 +11,19 @@ and adds its square to the covariance. A hundredth of a pixel is enough to move 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
-from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.corner_patterns import PATTERNS, patterns
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.geometry.poses import Array
 
 #: Standard deviation of each pattern, pixels, for every kind of target: the largest pattern of rendered checkerboards
 #: and ChArUco boards has 0.001 to 0.002, that of tags and circles 0.003 to 0.011.
 BIAS_PX = 0.004
-
-#: A pattern (V, n, 2) of a stack: its pixels and unit directions (V, n, 2) along the target's x, its y, and away.
-Pattern = Callable[[Array, Array, Array, Array], Array]
-PATTERNS: dict[str, Pattern] = {
-    "along the image's x": lambda pixels, x, y, away: np.broadcast_to([1.0, 0.0], pixels.shape),
-    "along the image's y": lambda pixels, x, y, away: np.broadcast_to([0.0, 1.0], pixels.shape),
-    "along the target's x": lambda pixels, x, y, away: x,
-    "along the target's y": lambda pixels, x, y, away: y,
-    "from the target's middle": lambda pixels, x, y, away: _from_middle(pixels),
-    "away from the camera": lambda pixels, x, y, away: away,
-}
 
 
 def covariance_of_bias(refined: CornersRefined) -> Array:
@@ -51,33 +39,13 @@ def covariance_of_bias(refined: CornersRefined) -> Array:
 
 def gradients_of_bias(model: Model, point: Point, noise: Noise) -> Array:
     """h (patterns, d) of one pixel of each pattern."""
-    directions = [_directions(model, stack, point) for stack in model.stacks]
     whole = Reduced.of(model, point).without_carriers(noise).h
+    every = [patterns(model, stack, point) for stack in model.stacks]
     found = []
-    for pattern in PATTERNS.values():
+    for k in range(len(PATTERNS)):
         stacks = tuple(
-            replace(stack, pixels=stack.pixels - np.where(stack.known[..., None], pattern(stack.pixels, *of), 0.0))
-            for stack, of in zip(model.stacks, directions, strict=True)
+            replace(stack, pixels=stack.pixels - pattern[..., k].reshape(stack.pixels.shape))
+            for stack, pattern in zip(model.stacks, every, strict=True)
         )
         found.append(Reduced.of(replace(model, stacks=stacks), point).without_carriers(noise).h - whole)
     return np.array(found)
-
-
-def _directions(model: Model, stack: Stack, point: Point) -> tuple[Array, Array, Array]:
-    """Unit vectors (V, n, 2) in the image along the target's x, its y, and to where the target is farther away."""
-    rows = model.linearised(stack, point)
-    by_place = rows.by_corners  # by a corner's place in the target's frame, (V, n, 2, 3)
-    slope = rows.B[:, None, 2:3, :2].transpose(0, 1, 3, 2)  # of the depth by the target's x and y
-    along = by_place[..., 0], by_place[..., 1], (by_place[..., :2] @ slope)[..., 0]
-    x, y, away = (each / np.maximum(np.linalg.norm(each, axis=-1, keepdims=True), 1e-12) for each in along)
-    tilt = np.linalg.norm(slope, axis=2)  # the sine of the tilt: what faces the camera has no far side
-    return x, y, away * tilt
-
-
-def _from_middle(pixels: Array) -> Array:
-    """Away from the mean of an image's corners, 1 at the farthest."""
-    seen = np.abs(pixels).sum(axis=-1, keepdims=True) > 0.0
-    middle = (pixels * seen).sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
-    off = np.where(seen, pixels - middle, 0.0)
-    far = np.linalg.norm(off, axis=-1).max(axis=1)[:, None, None]
-    return np.asarray(off / np.maximum(far, 1e-12))

@@ -18,6 +18,7 @@ from gtsam_rwhec.errors import CountError, OptionError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.corner_checks import check_determined, told_where_it_fails
+from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.fitting.corner_refinement import optimum
 from gtsam_rwhec.fitting.corner_residuals import Stack
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
@@ -95,12 +96,7 @@ def held_out_errors(refined: CornersRefined, *, folds: int = 5, progress: Progre
 def _refined_from(refined: CornersRefined, kept: np.ndarray) -> CornersRefined:
     """The optimum of the images of some instants (I,) under the noise and the priors of all."""
     model, slots = refined.graph.model, refined.slots
-    there = [kept[stack.instant] for stack in model.stacks]
-    rest = replace(
-        model,
-        stacks=tuple(stack.selected(at) for stack, at in zip(model.stacks, there, strict=True) if at.any()),
-        weights=tuple(weights[at] for weights, at in zip(model.weights, there, strict=True) if at.any()),
-    )
+    rest = model.of_instants(kept)
     gone = [("target", name) for name in model.targets if name not in rest.targets]
     gone += [("sensor", name) for name in model.sensors if name not in rest.sensors]
     for what, name in gone:
@@ -154,6 +150,7 @@ def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, 
         if model.about == "sensorcarrier":
             by_A = by_A @ se3.adjoint(se3.inverse(A))[stack.instant]
         squares += np.einsum("vri,i->vr", by_A**2, noise**2)
+    squares += refined.noise.common_px**2 * (patterns(model, seen, point, OF_AN_IMAGE) ** 2).sum(axis=2)
     expected = 2.0 * refined.noise.corner_px**2 + squares.reshape(*known.shape, 2).sum(axis=2)[known]
     return length, on_target, expected, stack.pixels[known]
 

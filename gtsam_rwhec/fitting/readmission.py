@@ -4,9 +4,10 @@ The pose of a board in one image is uncertain by its tilt, its distance and its 
 yet known: that makes outliers of good images. Their corners tell better. An image's corners r (2n) have, about the
 answer and with the measured A, the covariance
 
-    F = s^2 I + J_A S J_A' + J C J',
+    F = s^2 I + t^2 P P' + J_A S J_A' + J C J',
 
-with the corners' noise s, that of A, S, and the covariance C of the answer's unknowns; r' F^-1 r is chi-square.
+with the corners' own noise s, what they share, t P, the noise S of A, and the covariance C of the answer's unknowns;
+r' F^-1 r is chi-square.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.fitting.corner_residuals import Stack, stacks_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.observations import Observations
@@ -57,14 +59,16 @@ def agreeing_by_corners(
 def _squares(stack: Stack, A: Array, refined: CornersRefined) -> Array:
     """r' F^-1 r (V,) of each image, by (I + M'M)^-1 with M = [J_A S^1/2, J C^1/2] / s."""
     model = replace(refined.graph.model, stacks=(stack,), A=A)
-    rows = model.linearised(stack, replace(refined.point, A=A))
+    point = replace(refined.point, A=A)
+    rows = model.linearised(stack, point)
     there = model.by_unknown(stack, rows)
     index = np.concatenate([np.arange(refined.slots[at].start, refined.slots[at].stop) for at in there])
     values, vectors = np.linalg.eigh(refined.joint[np.ix_(index, index)])
     M = np.concatenate(list(there.values()), axis=2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     if refined.noise.carrier is not None:
         M = np.concatenate([M, rows.by_A @ model.to_right[stack.instant] * refined.noise.carrier], axis=2)
-    M /= refined.noise.corner_px
+    common = refined.noise.common_px * patterns(model, stack, point, OF_AN_IMAGE)
+    M = np.concatenate([M, common], axis=2) / refined.noise.corner_px
     r = np.where(np.isfinite(rows.residual), rows.residual, 1e6) / refined.noise.corner_px
     Mr = np.einsum("vni,vn->vi", M, r)
     inner = np.eye(M.shape[2]) + M.transpose(0, 2, 1) @ M

@@ -138,6 +138,8 @@ class Reprojection:
     tried: tuple[TriedModel, ...]
     #: What errors of kept intrinsics, and of A, would do to each frame.
     consequences: tuple[Consequence, ...]
+    #: Standard deviation of what the corners of an image share (`corner_patterns`), as estimated.
+    common_px: float = 0.0
 
     def __str__(self) -> str:
         """What was refined, and how well it fits, in two sentences."""
@@ -150,9 +152,10 @@ class Reprojection:
             "estimated": f"The carriers' poses A were refined too; their noise, as the corners show it: {noise}.",
             "given": f"The carriers' poses A were refined too, within the noise that was given: {noise}.",
         }[self.carrier_poses]
+        shared = f", and all corners of an image are off together by {self.common_px:.2g} px" if self.common_px else ""
         return (
             f"The poses are refined from {corners} corners in {images} images: rms {self.rms_px:.3f} px along each "
-            f"axis, where the noise of a corner is {self.corner_px:.3f} px. {of_A}"
+            f"axis, where the noise of a corner is {self.corner_px:.3f} px{shared}. {of_A}"
         )
 
 

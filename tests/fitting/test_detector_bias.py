@@ -10,7 +10,8 @@ from rwhec_factors import se3
 from simulated_cells import cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.fitting.detector_bias import PATTERNS, covariance_of_bias, gradients_of_bias
+from gtsam_rwhec.fitting.corner_patterns import PATTERNS
+from gtsam_rwhec.fitting.detector_bias import covariance_of_bias, gradients_of_bias
 from gtsam_rwhec.fitting.observations import Views
 
 EXACT = rw.CornerOptions(carrier_noise="exact", outliers=False)
