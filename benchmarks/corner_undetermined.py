@@ -86,7 +86,7 @@ def one(name: str, seed: int) -> dict[str, bool]:
             for camera in result.intrinsics.values()
         )
     found["no deviation above the prior's"] = all(
-        (np.sqrt(np.diagonal(camera.covariance)) <= (1.0 + 1e-6) * camera.stated_deviations).all()
+        (np.sqrt(np.diagonal(camera.covariance)) <= (1.0 + 1e-6) * camera.prior.deviation).all()
         for camera in result.intrinsics.values()
     )
     return found

@@ -148,12 +148,12 @@ def one(case: str, seed: int) -> Found:
 
 def _told_deviations(refined: RefinedIntrinsics, stated: Camera, told: Stated) -> float:
     """How far off stated intrinsics are, of what the images tell: the worst part's innovation deviations."""
-    mean, deviation, _ = prior_of(free_model(stated, told), told)
+    prior = prior_of(free_model(stated, told), told)
     truth = simulated_cells.CAMERA.parameters
     # the posterior had the prior not been widened
-    information = np.linalg.inv(refined.covariance) + np.diag(deviation**-2.0 - refined.stated_deviations**-2.0)
-    gain = np.eye(len(mean)) - np.linalg.inv(information) / np.outer(deviation, deviation)
-    shown = gain @ ((truth - mean) / deviation)
+    information = np.linalg.inv(refined.covariance) + prior.precision - refined.prior.precision
+    gain = np.eye(len(truth)) - prior.root @ np.linalg.inv(information) @ prior.root.T
+    shown = gain @ (prior.root @ (truth - prior.mean))
     worst = 0.0
     for at in PARTS.values():
         values, vectors = np.linalg.eigh(gain[at, at])

@@ -82,6 +82,9 @@ def chosen_model(
     if thin is None:
         thin = refine_corners(some, X, Y, with_widest(options, some), tell)
     cameras = chosen_cameras(thin, some, options)
+    if options.lens == "all" and cameras.asking:
+        wide = refine_corners(some, thin.X, thin.Y, with_widest(options, some, cameras), tell)
+        cameras = chosen_cameras(wide, some, options, cameras)
     options = cameras.options
 
     def scored(of: CornerOptions) -> tuple[CornerOptions, Score, dict[str, HeldOut]]:

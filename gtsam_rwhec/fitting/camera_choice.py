@@ -55,6 +55,7 @@ WORDS: dict[FreeLens, str] = {
     "k2": "with k1 and k2",
     "p2": "with k1, k2, p1 and p2",
     "k3": "with k1, k2, p1, p2 and k3",
+    "rational": "a rational lens, with k1 to k6, p1 and p2",
     "all": "with all coefficients of its lens model",
 }
 
@@ -86,12 +87,24 @@ class ChosenCameras:
     #: where chance explains it.
     spread: Mapping[tuple[str, str], float]
 
+    @property
+    def asking(self) -> tuple[str, ...]:
+        """Sensors whose images ask for k3, and perhaps for more."""
+        lens = self.options.lens
+        return tuple(name for name, of in lens.items() if of == "k3") if isinstance(lens, Mapping) else ()
 
-def with_widest(options: CornerOptions, observations: Observations) -> CornerOptions:
-    """The options with everything free that may be chosen to be so, where they leave the choice."""
+
+def with_widest(
+    options: CornerOptions, observations: Observations, before: ChosenCameras | None = None
+) -> CornerOptions:
+    """The options with everything free that may be chosen to be so, where they leave the choice.
+
+    A rational lens is so where k3 was chosen before.
+    """
     if options.lens == "all":
-        of_k3 = (name for name, of in observations.cameras.items() if of.model == "pinhole" or is_short(of))
-        options = replace(options, lens=dict.fromkeys(of_k3, "k3"))
+        short = (name for name, of in observations.cameras.items() if of.model == "pinhole" or is_short(of))
+        asking = before.asking if before else ()
+        options = replace(options, lens={name: "rational" if name in asking else "k3" for name in short})
     if options.warp_m == 0.0:
         corners = {name: observations.corners[name] for name in observations.targets}
         boards = [name for name, points in corners.items() if len(points) >= BENT and not points[:, 2].any()]
@@ -116,7 +129,9 @@ def alike(cameras: Mapping[str, Camera], options: CornerOptions) -> list[tuple[s
     return [tuple(names) for names in groups.values() if len(names) > 1]
 
 
-def chosen_cameras(refined: CornersRefined, observations: Observations, options: CornerOptions) -> ChosenCameras:
+def chosen_cameras(
+    refined: CornersRefined, observations: Observations, options: CornerOptions, before: ChosenCameras | None = None
+) -> ChosenCameras:
     """Choose which boards are bent, what is free of each camera, and which cameras share intrinsics.
 
     Parameters
@@ -128,8 +143,10 @@ def chosen_cameras(refined: CornersRefined, observations: Observations, options:
     options : CornerOptions
         What is free of cameras is chosen where ``lens`` is "all", and boards where ``warp_m`` is 0; groups of
         ``shared`` stay, and others may be added.
+    before : ChosenCameras, optional
+        What was chosen where less was free.
     """
-    blocks, widest = Blocks.of(refined), with_widest(options, observations)
+    blocks, widest = Blocks.of(refined), with_widest(options, observations, before)
     choice = Choosing(blocks, observations.cameras, widest)
     if len(blocks) > 1 and options.warp_m == 0.0:
         choice.boards()

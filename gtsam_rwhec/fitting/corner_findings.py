@@ -132,7 +132,7 @@ def _of_boards(refined: CornersRefined) -> Iterator[str]:
     for name, deviation in refined.graph.model.corner_priors.items():
         off = refined.point.corners[name]
         posterior = refined.covariance(f"corners:{name}")
-        if chance_of(off.ravel(), np.full(off.size, deviation), posterior) < CONTRADICTED:
+        if chance_of(off.ravel(), np.eye(off.size) / deviation, posterior) < CONTRADICTED:
             length = np.linalg.norm(off, axis=1)
             worst = int(np.argmax(length))
             yield (

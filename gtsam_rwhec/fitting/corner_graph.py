@@ -128,7 +128,7 @@ class CornerGraph:
                 self.graph.add(gtsam.PriorFactorPose3(key_of("a", i), gtsam.Pose3(T), noise))
         for at, prior in model.priors(self.start).items():
             # an infinite deviation is a weight of zero, and small ones are no constraints either
-            noise = gtsam.noiseModel.Diagonal.Precisions(prior.deviation**-2.0)
+            noise = gtsam.noiseModel.Gaussian.SqrtInformation(prior.root, False)
             self.graph.add(gtsam.PriorFactorVector(self.keys[at], prior.mean, noise))
             if np.isfinite(prior.aspect):
                 rows = np.zeros((len(prior.mean), len(prior.mean)))

@@ -30,8 +30,8 @@ CORNER_PX = (1e-3, 30.0)
 CARRIER = (1e-7, 0.1)
 #: Deviations below this (rad, m) move no corner.
 NOTHING = 1e-6
-#: What an image's corners share is looked for from this share of a corner's deviation to so many pixels, and counts from
-#: twice that share: more is no detector's.
+#: What an image's corners share is looked for from this share of a corner's deviation to so many pixels, since more is
+#: no detector's; it counts from twice that share.
 LEAST_COMMON, MOST_COMMON_PX = 0.02, 0.3
 
 

@@ -144,7 +144,7 @@ def refine_corners(
             name: RefinedIntrinsics(
                 camera.with_parameters(point.cameras[first[name]]),
                 _block(settled, ("k", first[name])),
-                settled.model.camera_priors[first[name]].deviation,
+                settled.model.camera_priors[first[name]],
                 float((settled.model.camera_priors[first[name]].deviation / priors[first[name]].deviation).max()),
                 tests[first[name]],
                 rms[name],
@@ -286,7 +286,7 @@ def _block(settled: _Settled, name: tuple[str, str]) -> Array:
 
 def _innovations(settled: _Settled, priors: Mapping[str, CameraPrior]) -> dict[str, Innovation]:
     return {
-        name: innovation_of(settled.point.cameras[name] - prior.mean, prior.deviation, _block(settled, ("k", name)))
+        name: innovation_of(settled.point.cameras[name], prior, _block(settled, ("k", name)))
         for name, prior in priors.items()
     }
 

@@ -148,7 +148,7 @@ def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict
             values=tuple(corners.point.cameras[camera_of[name]].tolist()),
             standard_deviations=refined.standard_deviations,
             stated=tuple(mean.tolist()),
-            stated_deviations=tuple(refined.stated_deviations.tolist()),
+            stated_deviations=tuple(refined.prior.deviation.tolist()),
             stated_as=stated[name],
             widened=refined.widened,
             innovation_deviations=refined.innovation.deviations,

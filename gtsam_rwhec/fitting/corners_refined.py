@@ -16,7 +16,7 @@ from gtsam_rwhec.fitting.corner_graph import CornerGraph
 from gtsam_rwhec.fitting.corner_model import Point
 from gtsam_rwhec.fitting.corner_noise import Noise
 from gtsam_rwhec.fitting.fit_options import FreeLens
-from gtsam_rwhec.fitting.stated_intrinsics import Innovation, held_by_prior, is_free
+from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior, Innovation, held_by_prior, is_free
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 
@@ -28,8 +28,8 @@ class RefinedIntrinsics:
     camera: Camera
     #: (m, m): Covariance of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
     covariance: Array
-    #: (m,): Standard deviations of the prior, as widened.
-    stated_deviations: Array
+    #: What was known of them, as widened.
+    prior: CameraPrior
     #: The factor by which they were widened: 1 where the images do not contradict what was stated.
     widened: float
     #: The test of the intrinsics as they were stated.
@@ -57,7 +57,7 @@ class RefinedIntrinsics:
     @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Parameters that the images do not determine: what is known of them is what was stated."""
-        held = held_by_prior(self.stated_deviations, self.covariance) & is_free(self.camera, self.lens)
+        held = held_by_prior(self.prior.root, self.covariance) & is_free(self.camera, self.lens)
         return tuple(name for name, is_held in zip(self.names, held, strict=True) if is_held)
 
 

@@ -26,7 +26,7 @@ ObservationKind = Literal["poses", "corners"]
 Stated = Literal["exact", "calibration", "nominal", "unknown"]
 #: What is free of a camera, each with what comes before it: one focal length and the centre; fx and fy apart; and the
 #: coefficients of the lens in this order. "all": what its lens model has.
-FreeLens = Literal["focal", "focals", "k1", "k2", "p2", "k3", "all"]
+FreeLens = Literal["focal", "focals", "k1", "k2", "p2", "k3", "rational", "all"]
 
 
 @dataclass(frozen=True)

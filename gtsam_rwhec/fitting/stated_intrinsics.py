@@ -3,7 +3,8 @@
 Intrinsics are stated by a calibration, or they are nominal: from a data sheet, a simulator, another camera of the same
 kind. A calibration without a covariance is taken to be right to 0.3 % of the focal length and 3 pixels of the centre;
 nominal intrinsics to 3 %, and to 30 pixels or 2 % of the image's width, whichever is more. Coefficients of the
-lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length. Unknown ones
+lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length; k1 and k2 go
+against each other, as those of published calibrations do (docs/lens_priors.md). Unknown ones
 are right to the focal length itself and half the width: the images must say them. Exact ones are held: their
 deviations are so small that no number of corners tells anything of them.
 """
@@ -31,6 +32,8 @@ CENTRE_PX = {"exact": 1e-5, "calibration": 3.0, "nominal": 30.0, "unknown": 30.0
 CENTRE_OF_WIDTH = {"exact": 0.0, "calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
 LENS_PX = {"exact": 1e-5, "calibration": 3.0}
 LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
+#: Nominal ones of a radtan lens with k1 and k2, and the correlation of how far these two move the image's corner.
+NOMINAL_BEND, OPPOSED = {"k1": 0.079, "k2": 0.059, "k3": 0.031}, -0.86
 #: Deviations of fy / fx and of p1 and p2 from what is stated; those of published calibrations: docs/lens_priors.md.
 ASPECT, TANGENTIAL = 2.7e-3, 2.6e-3
 #: That of fy / fx where they are one focal length. Where it is 1e-8, GTSAM's Levenberg-Marquardt takes a hundred steps.
@@ -45,15 +48,34 @@ XI_OF_NOMINAL = 0.05
 #: The coefficients that each `FreeLens` adds to what is free; those that none adds are free with "all".
 ADDED: dict[FreeLens, tuple[str, ...]] = {
     "focal": (), "focals": (), "k1": ("xi", "k1"), "k2": ("k2",), "p2": ("p1", "p2"), "k3": ("k3",),
+    "rational": ("k4", "k5", "k6"),
 }  # fmt: skip
 
 
 class CameraPrior(NamedTuple):
-    """What is known of a camera's parameters: mean (m,), standard deviations (m,), and that of fy / fx."""
+    """What is known of a camera's parameters: mean (m,), standard deviations (m,), and that of fy / fx.
+
+    ``opposed`` are the places of k1 and k2 where these go against each other.
+    """
 
     mean: Array
     deviation: Array
     aspect: float = np.inf
+    opposed: tuple[int, ...] = ()
+
+    @property
+    def correlation(self) -> Array:
+        """(m, m): Of the parameters, without the tie of fx and fy."""
+        found = np.eye(len(self.mean))
+        if self.opposed:
+            found[self.opposed, self.opposed[::-1]] = OPPOSED
+        return found
+
+    @property
+    def root(self) -> Array:
+        """R (m, m), upper triangular: R'R is the covariance's inverse, without the tie. Deviations may be infinite."""
+        R: Array = np.linalg.cholesky(np.linalg.inv(self.correlation)).T / self.deviation
+        return R
 
     @property
     def tie(self) -> Array:
@@ -70,7 +92,8 @@ class CameraPrior(NamedTuple):
     @property
     def precision(self) -> Array:
         """(m, m): The inverse of the covariance."""
-        return np.diag(self.deviation**-2.0) + np.outer(self.tie, self.tie)
+        found: Array = self.root.T @ self.root + np.outer(self.tie, self.tie)
+        return found
 
 
 def is_free(camera: Camera, lens: FreeLens) -> np.ndarray:
@@ -85,7 +108,7 @@ def free_model(camera: Camera, stated: Stated, lens: FreeLens = "all") -> Camera
     stays = stated == "exact" or camera.model not in ("pinhole", "radtan")
     if stays or (camera.model == "pinhole" and not ADDED.get(lens, ("k1",))):
         return camera
-    number = max(len(camera.D), 5 if lens == "k3" else 4)
+    number = max(len(camera.D), {"k3": 5, "rational": 8}.get(lens, 4))
     return Camera(camera.width, camera.height, "radtan", camera.K, np.pad(camera.D, (0, number - len(camera.D))))
 
 
@@ -99,16 +122,23 @@ def prior_of(camera: Camera, stated: Stated, lens: FreeLens = "all") -> CameraPr
     corner = 0.5 * np.array([camera.width, camera.height]) / f
     bend_px = np.linalg.norm(pixels_and_derivatives(camera, mean, corner)[2][:, PINHOLE:], axis=0)
     deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / bend_px])
+    names, free = camera.parameter_names, is_free(camera, lens)
+    opposed = tuple(at for at, name in enumerate(names) if name in ("k1", "k2") and free[at])
+    if camera.model != "radtan" or stated not in ("nominal", "calibration") or len(opposed) < 2:
+        opposed = ()
+    elif stated == "nominal":
+        share = np.array([NOMINAL_BEND.get(name, LENS_OF_FOCAL[stated]) for name in names[PINHOLE:]])
+        deviation[PINHOLE:] *= share / LENS_OF_FOCAL[stated]
     if camera.model == "unified" and stated == "nominal":
         deviation[PINHOLE] = min(deviation[PINHOLE], XI_OF_NOMINAL * (1.0 + camera.D[0]))
     assert len(deviation) == PINHOLE + len(camera.D)
     if stated == "exact":
         return CameraPrior(mean, deviation)
-    for at in (at for at, name in enumerate(camera.parameter_names) if name in ("p1", "p2")):
+    for at in (at for at, name in enumerate(names) if name in ("p1", "p2")):
         deviation[at] = min(deviation[at], TANGENTIAL)
-    held = ~is_free(camera, lens)[PINHOLE:]
+    held = ~free[PINHOLE:]
     deviation[PINHOLE:][held] = LENS_PX["exact"] / bend_px[held]
-    return CameraPrior(mean, deviation, SQUARE if lens == "focal" else ASPECT)
+    return CameraPrior(mean, deviation, SQUARE if lens == "focal" else ASPECT, opposed)
 
 
 #: Directions count in which the images say at least this share of what the prior and the images say together.
@@ -165,24 +195,25 @@ def deviations_of(probability: float) -> float:
     return float(np.sqrt(chdtri(1.0, max(probability, 1e-300))))
 
 
-def innovation_of(off: Array, prior: Array, posterior: Array) -> Innovation:
-    """The test of estimated less stated parameters (m,), with the prior's deviations (m,) and the posterior (m, m)."""
+def innovation_of(estimate: Array, prior: CameraPrior, posterior: Array) -> Innovation:
+    """The test of estimated parameters (m,) against the stated ones, with their posterior covariance (m, m)."""
+    off, R = estimate - prior.mean, prior.root
     return Innovation(
-        off, {part: chance_of(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])}
+        off, {part: chance_of(off[at], R[at, at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])}
     )
 
 
-def chance_of(off: Array, prior: Array, posterior: Array) -> float:
-    """The probability that chance gives as much; `off` (m,), the prior's deviations (m,) and the posterior (m, m).
+def chance_of(off: Array, R: Array, posterior: Array) -> float:
+    """The probability that chance gives as much; `off` (m,), the prior's root and the posterior, (m, m).
 
-    Before the images, `off` has the covariance prior^2 - posterior: z^2 of its principal parts is chi-square.
+    Before the images, R `off` has the covariance 1 - R posterior R': z^2 of its principal parts is chi-square.
     """
-    covariance = np.eye(len(off)) - posterior / np.outer(prior, prior)
+    covariance = np.eye(len(off)) - R @ posterior @ R.T
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     told = values > TOLD
     if not told.any():
         return 1.0
-    z2 = float(((vectors.T @ (off / prior))[told] ** 2 / values[told]).sum())
+    z2 = float(((vectors.T @ (R @ off))[told] ** 2 / values[told]).sum())
     return float(chdtrc(told.sum(), z2))
 
 
@@ -194,14 +225,14 @@ def wider(prior: CameraPrior, innovation: Innovation) -> CameraPrior:
     return prior._replace(deviation=deviation)
 
 
-def held_by_prior(prior: Array, posterior: Array) -> np.ndarray:
+def held_by_prior(R: Array, posterior: Array) -> np.ndarray:
     """Which parameters (m,) only the prior holds: alone, or in a direction that the images do not tell.
 
     A focal length that only the prior holds leaves fx and fy each a deviation that is smaller than the prior's, since
     the images tell that they are equal. So principal directions are asked, in the prior's deviations; a direction
-    names the parameters that have half of its largest part and more.
+    names the parameters that have half of its largest part and more. ``R`` (m, m) is the prior's root.
     """
-    scaled = posterior / np.outer(prior, prior)
+    scaled = R @ posterior @ R.T
     values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
     parts = np.abs(vectors[:, values > HELD**2])
     of_directions = (parts >= 0.5 * parts.max(axis=0, initial=0.0)).any(axis=1)

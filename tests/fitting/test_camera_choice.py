@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
 from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.corner_models import chosen_model
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
+from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.fitting.camera_choice import Blocks, ChosenCameras, LinearModel, chosen_cameras, with_widest
 from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
-from gtsam_rwhec.fitting.stated_intrinsics import ASPECT, prior_of
+from gtsam_rwhec.fitting.stated_intrinsics import ASPECT, free_model, prior_of
 
 PINHOLE = Camera.of(
     1920, 1080, "pinhole", [[1371.0, 0.0, 959.5], [0.0, 1371.0, 539.5], [0.0, 0.0, 1.0]], [], "a camera"
@@ -82,6 +86,33 @@ def test_a_lens_that_the_images_show_is_free() -> None:
     assert not set(found.held_by_prior) & set(found.not_free)
     errors_px = {one.words: one.px for one in chosen.tried if one.what == "camera model of cam_0"}
     assert errors_px["one focal length and the centre"] > 1.5 * min(errors_px.values())
+
+
+def test_a_rational_lens_is_tried_where_k3_is_not_enough() -> None:
+    wide = [1.2, 0.4, 0.0, 0.0, 0.02, 1.6, 0.9, 0.1]
+    rational = Camera.of(1280, 960, "radtan", [[640.0, 0, 640], [0, 640.0, 480], [0, 0, 1]], wide, "a camera")
+    given = cell(3, images=80, cameras=1, camera=rational, corner_px=0.02, distance=0.7)
+    pinhole = Camera.of(1280, 960, "pinhole", rational.K, [], "a camera")
+    observations = replace(given.observations, cameras={"cam_0": pinhole})
+    tried = chosen_model(observations, given.X, given.Y, rw.CornerOptions(), silent)
+    assert tried.options.lens_of("cam_0") == "rational"
+    px = {one.words: one.px for one in tried.cameras.tried if one.what == "camera model of cam_0"}
+    assert px["a rational lens, with k1 to k6, p1 and p2"] < px["with k1, k2, p1, p2 and k3"]
+    found = rw.refine_corners(observations, given.X, given.Y, tried.options)
+    assert np.linalg.norm(errors(found, given)[:, 3:]) < 1e-3
+    assert len(found.intrinsics["cam_0"].camera.D) == 8
+
+
+def test_k1_and_k2_go_against_each_other() -> None:
+    prior = prior_of(free_model(PINHOLE, "nominal", "k3"), "nominal", "k3")
+    C = np.linalg.inv(prior.precision)
+    k1, k2, k3 = 4, 5, 8
+    size = np.sqrt(np.diagonal(C))
+    assert size[k1:] == pytest.approx(prior.deviation[k1:])
+    assert C[k1, k2] / size[k1] / size[k2] == pytest.approx(-0.86)
+    assert C[k1, k3] == pytest.approx(0.0, abs=1e-12)
+    alone = prior_of(free_model(PINHOLE, "nominal", "k1"), "nominal", "k1")
+    assert alone.opposed == ()
 
 
 def test_a_bent_board_is_found_bent_and_a_flat_one_flat() -> None:

@@ -108,7 +108,7 @@ def test_files_for_others_have_the_estimated_intrinsics(text: str, tmp_path: Pat
         assert f"# {name}, on base: intrinsics estimated from the corners, standard deviations fx {fx:.2g}, " in of_ros
         assert f" px, k1 {k1:.2g}, " in of_ros
         assert read_calibration_yaml(tmp_path / "camera_info" / f"{name}.yaml").width == 1920
-    assert "what was stated holds k2, not the images" in of_ros
+    assert "what was stated holds k1, k2, not the images" in of_ros
 
 
 def test_exact_intrinsics_are_not_called_estimated() -> None:

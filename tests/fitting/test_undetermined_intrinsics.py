@@ -35,7 +35,7 @@ def test_what_the_images_do_not_tell_is_named_and_no_more_is_claimed(
     for camera in result.intrinsics.values():
         assert set(names) <= set(camera.held_by_prior)
         deviations = np.sqrt(np.diagonal(camera.covariance))
-        assert (deviations <= camera.stated_deviations * (1.0 + 1e-9)).all()
+        assert (deviations <= camera.prior.deviation * (1.0 + 1e-9)).all()
         said = ", ".join(camera.held_by_prior)
         assert any(f"The images do not tell {said} of" in words for words in result.findings)
 
@@ -81,4 +81,4 @@ def test_a_direction_that_only_the_prior_holds_names_its_parameters() -> None:
     posterior[:2, :2] = 0.48 * 9.0 * np.array([[1.0, 0.999], [0.999, 1.0]])
     posterior[2, 2] = 0.01
     assert (np.sqrt(np.diagonal(posterior)) < 0.7 * prior).all()
-    assert held_by_prior(prior, posterior).tolist() == [True, True, False]
+    assert held_by_prior(np.diag(1.0 / prior), posterior).tolist() == [True, True, False]
