@@ -246,9 +246,9 @@ def run(kind: str, seed: int, number: int, folder: Path | None) -> dict[str, Any
         done = None
         if not cell.corners.exists():
             rig = ["--rig", str(cell.folder / "rig.yaml"), "--workers", "1"]
-            done = _command("detect", str(cell.folder), *rig, "-o", str(cell.corners))
+            done = command("detect", str(cell.folder), *rig, "-o", str(cell.corners))
         if done is None or done.returncode == 0:
-            done = _command("calibrate", str(cell.corners), "-o", str(out))
+            done = command("calibrate", str(cell.corners), "-o", str(out))
         one = {"kind": kind, "seed": seed, "number": number, **cell.drawn, "status": done.returncode}
         one |= {"render_s": rendered - begun, "calibrate_s": time.monotonic() - rendered}
         try:
@@ -257,9 +257,11 @@ def run(kind: str, seed: int, number: int, folder: Path | None) -> dict[str, Any
             return one | {"verdict": None, "said": f"{error}\n{done.stderr[-1500:]}"}
 
 
-def _command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "gtsam_rwhec", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command."""
+    return subprocess.run(
+        [sys.executable, "-m", "gtsam_rwhec", *arguments], capture_output=True, text=True, check=False
+    )
 
 
 def compared(cell: Cell, result: rw.results.Result) -> dict[str, Any]:
