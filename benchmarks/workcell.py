@@ -1,21 +1,29 @@
 """Boards of a real workcell that are read right and wrong, and how long it takes.
 
-    python benchmarks/workcell.py [--repetitions 3]
+    python benchmarks/workcell.py [--repetitions 3] [--splits 0]
 
 39 images of 1080p of a checkerboard of 3 x 4 corners on an arm, five of them without it (davidea97's
 Multi-Camera-Hand-Eye-Calibration, Apache-2.0, ``shared/data/workcell_camera2``; GTSAM_RWHEC_DATA names another folder).
 A board is read right if each corner is within a pixel of where the joint solution of A X = Y B has it, with all hand
 poses. The peer is OpenCV's classic detector with its fast check, in turns with ours, on one thread.
+
+With ``--splits N`` the images are divided at random N times, and both halves are calibrated by the command, with the
+data set's intrinsics as nominal ones: do the answers agree within what they claim together?
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from bars import SHARED, Row, at_most, in_words, interleaved, run_script
+from rich.progress import track
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.camera import Camera
@@ -33,6 +41,13 @@ WRONG_PX = 1.0
 TIMES_OVER = 12
 #: Images that show no board (looked at).
 WITHOUT_A_BOARD = ("0001", "0020", "0140", "0150", "0160")
+
+RIG = """carriers: {{sensors: base, targets: hand, poses: {{frames: [base, hand]}}}}
+sensors: {{camera2: {{images: image, poses: pose, intrinsics: {{K: {K}, size: [1920, 1080]}}}}}}
+targets: {{board: {{type: checkerboard, inner_corners: [3, 4], square_m: 0.05}}}}
+"""
+#: Halves agree where their difference is within what both claim at this level.
+LEVEL = 0.99
 
 Gray = npt.NDArray[np.uint8]
 
@@ -72,8 +87,38 @@ def decoded(data: bytes) -> Gray:
     return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
-def rows(repetitions: int) -> list[Row]:
-    """What is read, and times."""
+def squared_difference(split: int) -> float:
+    """Of the camera's poses from two random halves of the images: over the bound that their covariances claim."""
+    names = np.random.default_rng(split).permutation(sorted(path.stem for path in (FOLDER / "image").glob("*.png")))
+    found = []
+    for half in np.array_split(names, 2):
+        with TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            for part, ending in (("image", "png"), ("pose", "csv")):
+                (folder / part).mkdir()
+                for name in half:
+                    (folder / part / f"{name}.{ending}").symlink_to((FOLDER / part / f"{name}.{ending}").resolve())
+            (folder / "rig.yaml").write_text(RIG.format(K=the_camera().parameters.tolist()), encoding="utf-8")
+            command = ["calibrate", str(folder), "--rig", str(folder / "rig.yaml"), "-o", str(folder / "out")]
+            subprocess.run([sys.executable, "-m", "gtsam_rwhec", *command], capture_output=True, check=False)
+            refined = rw.results.read_calibration(folder / "out").refined
+            assert refined is not None
+            found.append(refined)
+    covariance = sum(one.covariance("camera2") for one in found)
+    error = rw.pose_covariances.error_of(found[0].Y["camera2"], found[1].Y["camera2"].matrix())
+    return float(error @ np.linalg.solve(covariance, error)) / max(one.squared_radius(6, LEVEL) for one in found)
+
+
+def rows_of_halves(splits: int) -> list[Row]:
+    """How many splits agree."""
+    ratios = [squared_difference(split) for split in track(range(splits), "splits")]
+    agree, least = sum(ratio <= 1.0 for ratio in ratios), int(np.ceil(0.95 * splits))
+    figure = f"{agree} of {splits}; median of squares over the bound {np.median(ratios):.2f}, largest {max(ratios):.2f}"
+    return [Row(f"halves of the images agree within {LEVEL:.0%}", figure, f">= {least}", agree >= least)]
+
+
+def rows(repetitions: int, splits: int) -> list[Row]:
+    """What is read, and times; whether halves agree."""
     if not FOLDER.is_dir():
         raise SystemExit(f"{FOLDER} does not exist: set GTSAM_RWHEC_DATA to the folder that holds workcell_camera2")
     cv2.setNumThreads(1)
@@ -114,8 +159,9 @@ def rows(repetitions: int) -> list[Row]:
     makers = {"camera2": partial(Detector, camera, [BOARD])}
     times = interleaved(1, {"ours": lambda: sum(1 for _ in detect_in_images(many, makers, workers=2))})
     rate = len(many) / times.median("ours")
+    result += rows_of_halves(splits) if splits else []
     return [*result, Row("images a second, two workers, from files' bytes", f"{rate:.0f}", ">= 20", rate >= 20.0)]
 
 
 if __name__ == "__main__":
-    run_script("Workcell", rows, repetitions=3)
+    run_script("Workcell", rows, repetitions=3, splits=0)
