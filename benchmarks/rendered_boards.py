@@ -55,6 +55,8 @@ class Outcome:
     corners: int = 0
     sums: Array = field(default_factory=lambda: np.zeros(len(DIRECTIONS)))
     squares: float = 0.0
+    tilt_deg: float = 0.0
+    blur_px: float = 0.0
     ours_s: float = 0.0
     peer_s: float = 0.0
 
@@ -64,8 +66,8 @@ class Outcome:
         return self.refused is None
 
 
-def pictured(kind: Kind, rng: np.random.Generator) -> tuple[Gray, scenes.Pose, bool]:
-    """An image, its truth, and whether something covers a part of the target."""
+def pictured(kind: Kind, rng: np.random.Generator) -> tuple[Gray, scenes.Pose, scenes.Light, bool]:
+    """An image, its truth, its light, and whether something covers a part of the target."""
     outline = kind.outline()
     most_px = 0.9 * scenes.HEIGHT * kind.element_m / (2.0 * max(kind.half_m))
     sides_px = (0.9 * kind.least_px, max(min(5.0 * kind.least_px, most_px), 1.5 * kind.least_px))
@@ -90,7 +92,7 @@ def pictured(kind: Kind, rng: np.random.Generator) -> tuple[Gray, scenes.Pose, b
         covered = bool(hidden[inside > 0].sum() > LEAST_COVERED * max(int(inside.sum()), 1))
     if rng.random() < SHADED:
         image *= scenes.shade(rng, hull)
-    return scenes.seen_by_camera(rng, image, light), pose, covered
+    return scenes.seen_by_camera(rng, image, light), pose, light, covered
 
 
 def per_unit(unit_m: float, pose: scenes.Pose, outline: Array) -> int:
@@ -101,7 +103,7 @@ def per_unit(unit_m: float, pose: scenes.Pose, outline: Array) -> int:
 def run_image(kind: Kind, name: str, seed: int, number: int, keep: Path | None = None) -> Outcome:
     """Render, detect, compare."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
-    gray, pose, covered = pictured(kind, rng)
+    gray, pose, light, covered = pictured(kind, rng)
     elements = scenes.projected(pose.camera, kind.elements(), pose.T)
     side_px = min(float(np.linalg.norm(np.diff(elements, axis=axis), axis=-1).min()) for axis in (0, 1))
     start = time.perf_counter()
@@ -110,6 +112,7 @@ def run_image(kind: Kind, name: str, seed: int, number: int, keep: Path | None =
     kind.peer(gray)
     times = {"ours_s": middle - start, "peer_s": time.perf_counter() - middle}
     about = {"whole": scenes.is_whole(pose, kind.outline()), "covered": covered, "side_px": side_px}
+    about |= {"tilt_deg": pose.tilt_deg, "blur_px": light.blur_px}
     outcome = Outcome(number, refused="nothing found", **about, **times)
     used = [one for one in found.detections if one.rejection is None]
     if used:
@@ -196,7 +199,7 @@ def rows(found: list[Outcome], kind: Kind) -> list[Row]:
     wrong = [one.number for one in found if one.wrong]
     corners = max(sum(one.corners for one in right), 1)
     rms = float(np.sqrt(sum(one.squares for one in right) / (2 * corners)))
-    bias = sum((one.sums for one in right), start=np.zeros(len(DIRECTIONS))) / corners
+    bias = _bias(right)
     ours, peer = (float(np.sum([getattr(one, of) for one in found])) for of in ("ours_s", "peer_s"))
     result = [
         Row(f"recall, whole and {kind.least_px:g} px or more", str(recall), ">= 98 %", recall.value >= 0.98)
@@ -209,12 +212,23 @@ def rows(found: list[Outcome], kind: Kind) -> list[Row]:
         Row("largest bias", f"{np.abs(bias).max():.4f} px", "<= 0.01 px", bool(np.abs(bias).max() <= 0.01)),
         *(Row(f" {name}", f"{value:+.4f} px") for name, value in zip(DIRECTIONS, bias, strict=True)),
     ]
+    for what, word in (("side_px", "larger"), ("tilt_deg", "more tilted"), ("blur_px", "more blurred")):
+        order = sorted(right, key=lambda one: float(getattr(one, what)))
+        halves = [float(np.abs(_bias(half)).max()) for half in (order[: len(order) // 2], order[len(order) // 2 :])]
+        words = f"{halves[0]:.4f}, {halves[1]:.4f} px"
+        result.append(Row(f" largest of the half that is less, and of that which is {word}", words))
     for words, of in (("covered", covered), ("cut or small", others)):
         count = sum(one.wrong for one in of)
         refused = Share.of([not one.is_read for one in of])
         result += [Row(f"{words}: misread", f"{count} of {len(of)}", "0", count == 0), Row(" refused", str(refused))]
     each = f"{1e3 * ours / len(found):.1f} ms over {1e3 * peer / len(found):.1f} ms"
     return [*result, Row("time over OpenCV's own", f"{ours / max(peer, 1e-9):.2f}x ({each})")]
+
+
+def _bias(right: list[Outcome]) -> Array:
+    """The mean error along `DIRECTIONS` of images that were read right."""
+    sums = sum((one.sums for one in right), start=np.zeros(len(DIRECTIONS)))
+    return np.asarray(sums / max(sum(one.corners for one in right), 1))
 
 
 def main() -> int:

@@ -1,5 +1,8 @@
 """Targets and the places of their corners: tags, boards of tags, checkerboards and grids of circles.
 
+``bias_px`` is the standard deviation of what all its corners share as our detector finds them, pixels: the largest mean
+error along an axis in rendered images (`benchmarks/rendered_boards.py`).
+
 All targets have the same frame: the origin is the middle of the tag or of the board's pattern, x points to the right
 and y up as printed, z out of the paper. OpenCV orders a tag's corners: top left, top right, bottom right, bottom left.
 """
@@ -74,6 +77,7 @@ class TagGrid:
     the tags' corners in that order.
     """
 
+    bias_px: ClassVar[float] = 0.004
     name: str
     family: str  #: A key of `FAMILIES`
     #: Numbers of tags
@@ -134,6 +138,7 @@ class Bundle:
     tags' corners in the order of the tags.
     """
 
+    bias_px: ClassVar[float] = 0.01
     name: str
     family: str  #: A key of `FAMILIES`
     tags: tuple[BundleTag, ...]
@@ -174,6 +179,7 @@ CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 class Tag:
     """A single tag."""
 
+    bias_px: ClassVar[float] = 0.01
     name: str
     family: str  #: A key of `FAMILIES`
     id: int
@@ -204,6 +210,7 @@ class Charuco:
     Its corners are the inner corners of the chessboard in OpenCV's order: left to right, from the top.
     """
 
+    bias_px: ClassVar[float] = 0.002
     name: str
     family: str  #: A key of `FAMILIES`
     #: Numbers of squares
@@ -242,6 +249,7 @@ class AprilGrid:
     Ids count from first_id at the bottom left, to the right, then up. Corners are the tags' corners in that order.
     """
 
+    bias_px: ClassVar[float] = 0.002
     name: str
     family: str  #: A key of `FAMILIES`
     #: Numbers of tags
@@ -286,6 +294,7 @@ class Checkerboard:
     `ways`): only the motion shows its orientation in each image.
     """
 
+    bias_px: ClassVar[float] = 0.002
     name: str
     #: Numbers of inner corners
     columns: int
@@ -329,6 +338,7 @@ class CircleGrid:
     A grid may look the same after a turn (see `ways`): then only the motion shows its orientation.
     """
 
+    bias_px: ClassVar[float] = 0.008
     name: str
     #: Numbers of circles: in a row, and rows. OpenCV's patternSize (4, 11) is 4 columns and 11 rows.
     columns: int

@@ -63,6 +63,8 @@ class Model:
     corner_priors: dict[str, float] = field(default_factory=dict)
     #: Standard deviation of a corner as it was stated: it counts where corners are too few to tell theirs.
     stated_px: float = 0.1
+    #: Of a bias that all corners of a target share, as the detector finds them, pixels.
+    bias_px: dict[str, float] = field(default_factory=dict)
     #: (V, 2n, k) each. One deviation of what the corners of an image share, pixels, by stack; empty: nothing.
     common: tuple[Array, ...] = ()
 

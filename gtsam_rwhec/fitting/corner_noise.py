@@ -244,7 +244,8 @@ class Reduced:
             return value, gradient[free]
 
         shared = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
-        bounds = [np.log([CORNER_PX, CARRIER, CARRIER, shared][i]) for i in free]
+        limits = [(CORNER_PX, CARRIER, CARRIER, shared)[i] for i in free]
+        bounds = [(float(np.log(low)), float(np.log(high))) for low, high in limits]
         from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
 
         found = noise(minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11}).x)

@@ -202,7 +202,7 @@ def _stated(
         noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
         dict.fromkeys(options.time_offsets, OFFSET_S),
         dict.fromkeys(observations.targets, options.corners_m) if options.corners_m else {},
-        observations.corner_px,
+        observations.corner_px, {name: options.bias_px_of(name) for name in observations.targets},
     )  # fmt: skip
     point = Point(
         {name: one_transform(X[name], f"start of {name}") for name in observations.targets},

@@ -261,6 +261,8 @@ class CornerOptions:
     #: Standard deviation of each corner's place on its board along each axis, metres, such as a printer's 1e-4; 0: they
     #: are where the board has them. With n corners there are 3n more unknowns: time grows with their square.
     corners_m: float = 0.0
+    #: Standard deviation of a bias that all corners share as the detector finds them, pixels. `calibrate` counts it.
+    bias_px: float | Mapping[str, float] = 0.004
     #: The noise of the carriers' poses A: given (standard deviations), estimated, or none.
     carrier_noise: CarrierNoise | CarrierPoses = "estimate"
     #: The carrier whose axes and origin A's noise has, where it is estimated: the one that moves.
@@ -289,7 +291,9 @@ class CornerOptions:
                 )
         shares = self.size_share.values() if isinstance(self.size_share, Mapping) else (self.size_share,)
         warps = self.warp_m.values() if isinstance(self.warp_m, Mapping) else (self.warp_m,)
+        biases = self.bias_px.values() if isinstance(self.bias_px, Mapping) else (self.bias_px,)
         others = (*(("warp_m", each) for each in warps), ("corners_m", self.corners_m))
+        others += tuple(("bias_px", each) for each in biases)
         for name, deviation in (*(("size_share", each) for each in shares), *others):
             if not (is_real(deviation) and 0.0 <= deviation < np.inf):
                 raise OptionError(f"CornerOptions.{name}={brief(deviation)}; give a standard deviation, or 0")
@@ -323,6 +327,12 @@ class CornerOptions:
     def warp_m_of(self, target: str) -> float:
         """The standard deviation of a target's bend, metres."""
         return self.warp_m.get(target, 0.0) if isinstance(self.warp_m, Mapping) else self.warp_m
+
+    def bias_px_of(self, target: str) -> float:
+        """The standard deviation of the bias of a target's corners, pixels; 0.004 where a dict lacks it."""
+        if isinstance(self.bias_px, Mapping):
+            return self.bias_px.get(target, CornerOptions.bias_px)  # type: ignore[arg-type]
+        return self.bias_px
 
     def camera_of(self, sensor: str) -> str:
         """The sensor whose intrinsics this sensor has: its own, or the first one's of its group."""

@@ -137,6 +137,11 @@ class CleanedLog:
         """Stated intrinsics by sensor."""
         return self.metadata.cameras
 
+    @property
+    def is_detected(self) -> bool:
+        """Whether the targets were found in the sensors' images, by our detector."""
+        return all(sensor.images is not None for sensor in self.rig.sensors.values())
+
     def problem_of(self, pairs: Pairs) -> Problem:
         """The used measurements, with stamps on the carriers' clock."""
         problem = problem_of(pairs, self.rig, self.cleaning.time_offsets_s)
@@ -146,6 +151,7 @@ class CleanedLog:
     def options(self) -> CalibrateOptions:
         """The options of ``calibrate`` that the rig file states."""
         rig, noise = self.rig, self.motion.noise
+        bias_px = {target.name: target.bias_px for target in rig.target_list} if self.is_detected else {}
         return CalibrateOptions(
             noise="estimate" if rig.noise == "estimate" else "given",
             robust="gnc" if rig.cleaning.robust == "gnc" else "none",
@@ -158,6 +164,7 @@ class CleanedLog:
                 shared=rig.shared,
                 carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
                 about=self.motion.about,
+                bias_px=bias_px,
             ),
         )
 
@@ -168,7 +175,7 @@ class CleanedLog:
         stated = {name: offsets_s.get(name, 0.0) for name in rig.sensors if name in used and name not in self.estimated}
         return Recording(
             uncleaned=self.problem_of(without_marks(pairs, OF_THE_MOTION)),
-            is_detected=all(sensor.images is not None for sensor in rig.sensors.values()),
+            is_detected=self.is_detected,
             is_inverse=rig.carriers.poses.parent_and_child[0] == rig.carriers.targets,
             late=tuple(late_clocks(pairs, self.motion.trajectory, rig, stated)),
             far_off=tuple(name for name, one in self.doubted.items() if one.is_far_off),
