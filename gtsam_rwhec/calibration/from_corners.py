@@ -322,16 +322,7 @@ def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tupl
     ``base`` is an answer from the poses of the inliers. Images whose corners agree are inliers, too. If the corners
     contradict the stated intrinsics, the run starts again.
     """
-    found = _from_corners(replace(run, problem=agreeing(run.problem, inliers)), base)
-    for _ in range(MOST_TIMES):
-        more = None if found.corners is None else _readmitted(run, base, inliers, found.corners)
-        if more is None:
-            break
-        run.tell("refining from corners, with images whose corners agree")
-        again = _from_corners(replace(run, problem=agreeing(run.problem, more)), base, tried=found.tried)
-        if again.corners is None:
-            break
-        found, inliers = again, more
+    found, inliers = _with_readmitted(run, base, inliers)
     corners = found.corners
     if corners is None:
         return run, found, inliers
@@ -346,11 +337,29 @@ def with_estimated_intrinsics(run: Run, base: Refined, inliers: Inliers) -> tupl
     return replace(run, problem=better, cameras=cameras), found, inliers
 
 
+def _with_readmitted(
+    run: Run, base: Refined, inliers: Inliers, noise: NoiseInData | None = None, thin: CornersRefined | None = None
+) -> tuple[CornersFound, Inliers]:
+    """What the corners of the inliers give, and of images that their poses left out and whose corners agree."""
+    every = replace(base, inliers={})
+    found = _from_corners(replace(run, problem=agreeing(run.problem, inliers)), every, noise, thin)
+    for _ in range(MOST_TIMES):
+        more = None if found.corners is None else _readmitted(run, every, inliers, found.corners)
+        if more is None:
+            break
+        run.tell("refining from corners, with images whose corners agree")
+        again = _from_corners(replace(run, problem=agreeing(run.problem, more)), every, noise, tried=found.tried)
+        if again.corners is None:
+            break
+        found, inliers = again, more
+    return replace(found, start=base), inliers
+
+
 def _readmitted(run: Run, base: Refined, inliers: Inliers, corners: CornersRefined) -> Inliers | None:
     """The inliers, with images that their poses left out and whose corners agree; None if there is none of these."""
     if not inliers or all(mask.all() for mask in inliers.values()):
         return None
-    observations, _, _ = _observed(run, replace(base, inliers={}), None)
+    observations, _, _ = _observed(run, base, None)
     has = _with_corners(run.problem)
     kept = {pair: inliers[pair][has[pair]] for pair in map(Pair._make, observations.views)}
     found = agreeing_by_corners(observations, kept, corners)
@@ -372,8 +381,12 @@ def answered_by_corners(
     base = found.refined
     if base is None or run.options.observations == "poses" or not (run.problem.boards or run.recording):
         return found
+    inliers, solution = found.inliers, found.solution
     if by is None:
-        by = _from_corners(run, base, found.noise.model, thin)
+        by, inliers = _with_readmitted(run, base, inliers, found.noise.model, thin)
+        if by.corners is not None and inliers is not found.inliers:
+            solution = solve(agreeing(run.problem, inliers), options=run.options.solve, progress=run.tell)
+            base = replace(base, inliers=inliers)
     elif base.free_directions and by.corners is not None:
         by = CornersFound.none("the motion leaves poses free")
     run.record.choices += by.choices
@@ -383,7 +396,8 @@ def answered_by_corners(
     if by.without:
         counts = ", ".join(f"{number} of {pair}" for pair, number in by.without.items())
         run.record.choose("measurements without corners", f"{counts} do not count in the poses", "the others have some")
-    return replace(found, refined=as_stated(by.refined(base, found.noise.model), by.start, by.corners))
+    refined = as_stated(by.refined(base, found.noise.model), by.start, by.corners)
+    return replace(found, refined=refined, inliers=inliers, solution=solution)
 
 
 def _why_not(run: Run, base: Refined) -> str:
