@@ -80,6 +80,8 @@ def finding_against(sensor: str, found: IntrinsicsEvidence, rig: Rig, estimated:
     give_or_take = f"standard deviations {found.sigma[:2].max():.2g} and {found.sigma[2:4].max():.2g} px"
     words += f"{numbers(found.fitted)} would leave {found.fitted_px:.2f} px ({give_or_take})"
     words += _of_another_resolution(found.stated, found.fitted)
+    if (shared := rig.sensors[sensor].shared) is not None:
+        words += f"; they are those of {shared} (shared), and {sensor} is another camera: give it its own"
     return Finding(Ground.INTRINSICS_DOUBTED if found.is_far_off else Ground.INTRINSICS_UNCERTAIN, words)
 
 

@@ -60,6 +60,15 @@ def test_wrong_intrinsics_are_named_with_their_line_and_what_fits(tmp_path: Path
     assert "px rms in 20 images, and fx, fy = " in finding.words
 
 
+def test_a_shared_camera_of_another_lens_is_told_so(tmp_path: Path) -> None:
+    first = RIG.splitlines()[2]
+    other = first.replace("camera:", "left:").replace("images: images", "images: left")
+    shared = "  camera: {images: images, poses: poses, intrinsics: {shared: left}}"
+    rig = parse_rig(RIG.replace(first, f"{other}\n{shared}"), "rig.yaml")
+    (finding,) = found_in(tmp_path, rig, camera_of(500.0, 215.0), "grid")
+    assert finding.words.endswith("; they are those of left (shared), and camera is another camera: give it its own")
+
+
 def test_slightly_wrong_ones_ask_for_care(tmp_path: Path) -> None:
     (finding,) = found_in(tmp_path, parse_rig(RIG, "rig.yaml"), camera_of(550.0, 247.0), "grid")
     assert finding.ground is Ground.INTRINSICS_UNCERTAIN
