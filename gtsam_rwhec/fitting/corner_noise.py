@@ -269,8 +269,8 @@ def deviations_of(noise: Noise) -> Array:
 
 #: The step of numeric derivatives by the logarithm of a deviation.
 STEP = 1e-3
-#: Fewer degrees of freedom than this are not told from noise.
-FEWEST = 3.0
+#: Fewer degrees of freedom than this are not told from noise; and no deviation is known less than from one.
+FEWEST, LEAST_KNOWN = 3.0, 1.0
 
 
 def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict[tuple[str, str], float]:
@@ -291,7 +291,7 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     # by log v = 2 log s
     hessian = np.array(gradients) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-    V = (vectors * (2.0 / np.maximum(values, 1e-6))) @ vectors.T
+    V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
     above, below = ([np.linalg.inv(reduced.information(at(sign * step))) for step in steps] for sign in (1.0, -1.0))
     result = {}
     for name, rows in reduced.slots.items():

@@ -115,8 +115,10 @@ def free_model(camera: Camera, stated: Stated, lens: FreeLens = "all") -> Camera
 def prior_of(camera: Camera, stated: Stated, lens: FreeLens = "all") -> CameraPrior:
     """What is known of a camera's parameters before the images, with those held that are not free."""
     mean = camera.parameters
-    if stated == "unknown" and camera.model == "radtan":
-        mean[PINHOLE:] = 0.0  # an estimate from boards alone states nothing
+    if stated == "unknown":  # an estimate from boards alone states nothing
+        mean[:2] = mean[:2].mean()
+        if camera.model == "radtan":
+            mean[PINHOLE:] = 0.0
     f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
     lens_px = LENS_PX[stated] if stated in LENS_PX else LENS_OF_FOCAL[stated] * float(f.mean())
     corner = 0.5 * np.array([camera.width, camera.height]) / f
