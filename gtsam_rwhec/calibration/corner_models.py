@@ -16,7 +16,7 @@ from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
 from gtsam_rwhec.fitting.held_out import HeldOut, held_out_errors
 from gtsam_rwhec.fitting.observations import Observations, Views
-from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.geometry.poses import Array, PoseLike
 
 #: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
@@ -49,6 +49,7 @@ class Tried:
     scores: tuple[Score, ...]  #: Of all models, the chosen one first; empty where images are too few
     held_out: dict[str, HeldOut]  #: Of the chosen one, by sensor; empty where images are too few
     cameras: ChosenCameras  #: What is free of cameras, and how far blocks of images disagree
+    images: int  #: How many were looked at
 
     @property
     def wider(self) -> dict[tuple[str, str], float]:
@@ -56,6 +57,22 @@ class Tried:
         # where errors are unexplained, all are so by as much, at least
         found = {at: max(self.unexplained, spread) for at, spread in self.cameras.spread.items()}
         return {at: factor for at, factor in found.items() if factor > 1.0}
+
+    def covariance_of_rivals(self, corners: CornersRefined) -> Array:
+        """The covariance (d, d) of the corners' unknowns from models that predict nearly as well as the chosen one.
+
+        They were compared on some of the images; what noise does to their answers shrinks with more.
+        """
+        share = np.sqrt(min(self.images / max(sum(len(s.instant) for s in corners.graph.model.stacks), 1), 1.0))
+        found = np.zeros_like(corners.joint)
+        for rival in self.cameras.rivals:
+            off = np.zeros(len(found))
+            for slot, rows in corners.slots.items():
+                if slot in rival:  # a pinhole's are the first of a lens's
+                    number = min(rows.stop - rows.start, len(rival[slot]))
+                    off[rows.start : rows.start + number] = share * rival[slot][:number]
+            found += np.outer(off, off)
+        return found
 
     @property
     def unexplained(self) -> float:
@@ -79,6 +96,7 @@ def chosen_model(
     Raises as ``refine_corners`` does.
     """
     some = thinned(observations)
+    images = sum(len(view.A) for view in some.views.values())
     if thin is None:
         thin = refine_corners(some, X, Y, with_widest(options, some), tell)
     cameras = chosen_cameras(thin, some, options)
@@ -98,7 +116,7 @@ def chosen_model(
     try:
         every = [scored(options)]
     except CountError as error:
-        return Tried(options, in_words(options), f"no other was tried: {error}", (), {}, cameras)
+        return Tried(options, in_words(options), f"no other was tried: {error}", (), {}, cameras, images)
     if options.carrier_noise != "exact":
         every.append(scored(replace(options, carrier_noise="exact")))
         if every[1][1].mm < BETTER_SHARE * every[0][1].mm:
@@ -108,7 +126,7 @@ def chosen_model(
     for _, other, _ in every[1:]:
         size = f"{other.mm:.3g} mm" if np.isfinite(other.mm) else "a target behind its camera"
         evidence += f" ({size} with {other.words})"
-    return Tried(chosen, score.words, evidence, tuple(one for _, one, _ in every), found, cameras)
+    return Tried(chosen, score.words, evidence, tuple(one for _, one, _ in every), found, cameras, images)
 
 
 def thinned(observations: Observations) -> Observations:

@@ -97,6 +97,8 @@ class CornersFound:
         if self.corners is None or self.reprojection is None:
             return base
         more = beyond_independent_errors(self.corners, noise, self.wider)
+        if self.tried is not None:
+            more = more + self.tried.covariance_of_rivals(self.corners)
         return as_refined(base, self.corners, self.reprojection, self.intrinsics, more)
 
 

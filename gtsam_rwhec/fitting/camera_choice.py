@@ -12,6 +12,10 @@ cameras that share intrinsics have the unknowns theta = T phi + theta_0. Then
     phi_b = -(T'(H - H_b)T + P)^-1 (T'(h - h_b) + P off),    error_b = c_b + 2 h_b' theta_b + theta_b' H_b theta_b,
 
 in the noise's units: what an image's corners say in spite of the noise of its A counts, and no more.
+
+The simplest model may lack what is there, and images that tell it not for sure. So how far its rivals' answers are from
+its own is in the covariance, each weighed by how well it predicts, exp(-error / 2) (Buckland, Burnham and Augustin
+1997).
 """
 
 from __future__ import annotations
@@ -35,6 +39,8 @@ from gtsam_rwhec.geometry.poses import Array
 
 #: Blocks of time and of configurations, and columns and rows of the image's regions.
 BLOCKS, REGIONS = 6, 3
+#: Each image is left out so often: by time, by configuration, by region.
+WAYS = 3
 #: A lens model of so many coefficients has k3.
 K3 = 5
 #: A target of so many corners in one plane may be bent, with heights of this standard deviation, metres; flat ones are
@@ -86,6 +92,8 @@ class ChosenCameras:
     #: By unknown: the jackknife's deviation over the claimed one, the larger of blocks of time and of configurations; 1
     #: where chance explains it.
     spread: Mapping[tuple[str, str], float]
+    #: By unknown, each: how far the answer of a rival is from that of the chosen model, times the root of its weight.
+    rivals: tuple[Mapping[tuple[str, str], Array], ...] = ()
 
     @property
     def asking(self) -> tuple[str, ...]:
@@ -153,7 +161,7 @@ def chosen_cameras(
     if len(blocks) > 1 and options.lens == "all":
         choice.cameras()
     model = LinearModel.of(refined, observations.cameras, choice.options)
-    return ChosenCameras(choice.options, tuple(choice.tried), blocks.spread(model))
+    return ChosenCameras(choice.options, tuple(choice.tried), blocks.spread(model), tuple(choice.rivals))
 
 
 @dataclass(eq=False)
@@ -164,6 +172,7 @@ class Choosing:
     stated: Mapping[str, Camera]
     options: CornerOptions
     tried: list[Rival] = field(default_factory=list)
+    rivals: list[Mapping[tuple[str, str], Array]] = field(default_factory=list)
 
     def boards(self) -> None:
         """Flat, or bent."""
@@ -196,7 +205,11 @@ class Choosing:
     def _simplest(self, what: str, rivals: Sequence[tuple[str, CornerOptions]]) -> CornerOptions:
         """The first that predicts as well as the best."""
         models = [LinearModel.of(self.blocks.refined, self.stated, options) for _, options in rivals]
-        at, scores = self.blocks.simplest(models)
+        at, scores, weights = self.blocks.simplest(models)
+        answers = [model.theta(self.blocks.all_H, self.blocks.all_h) for model in models]
+        for weight, answer in zip(weights.tolist(), answers, strict=True):
+            off = np.sqrt(weight) * (answer - answers[at])
+            self.rivals.append({slot: off[rows] for slot, rows in self.blocks.refined.slots.items()})
         for i, ((words, options), (px, more_px)) in enumerate(zip(rivals, scores, strict=True)):
             self.tried.append(Rival(what, words, options.shared != self.options.shared, px, more_px, i == at))
         return rivals[at][1]
@@ -315,8 +328,8 @@ class Blocks:
             found[i] = self.c[i] + 2.0 * self.h[i] @ theta + theta @ self.H[i] @ theta
         return found
 
-    def simplest(self, models: Sequence[LinearModel]) -> tuple[int, list[tuple[float, float]]]:
-        """The first model that predicts as well as the best, within one standard error; and errors in pixels of all."""
+    def simplest(self, models: Sequence[LinearModel]) -> tuple[int, list[tuple[float, float]], Array]:
+        """The first model that predicts as well as the best, within one standard error; errors (pixels); weights."""
         errors, px2 = np.array([self.errors(model) for model in models]), self.refined.noise.corner_px**2
         means = errors.sum(axis=1) / self.count.sum()
         best = int(np.argmin(means))
@@ -327,7 +340,8 @@ class Blocks:
         good = means - means[best] <= standard_error
         at = int(np.argmax(good))
         px = np.sqrt(2.0 * px2 * means)
-        return at, list(zip(px.tolist(), (px2 * standard_error / px).tolist(), strict=True))
+        weights = np.exp(-0.5 * (errors.sum(axis=1) - errors.sum(axis=1).min()) / WAYS)
+        return at, list(zip(px.tolist(), (px2 * standard_error / px).tolist(), strict=True)), weights / weights.sum()
 
     def spread(self, model: LinearModel) -> dict[tuple[str, str], float]:
         """By unknown: the scatter of the blocks' answers over what the covariance claims; `ChosenCameras.spread`."""

@@ -115,6 +115,24 @@ def test_k1_and_k2_go_against_each_other() -> None:
     assert alone.opposed == ()
 
 
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_what_the_simplest_lens_lacks_is_in_the_covariance(seed: int) -> None:
+    """p1 and p2 that images hardly tell are left out, and how far they would move the camera is counted."""
+    bending = Camera.of(1920, 1080, "radtan", PINHOLE.K, [-0.12, 0.03, 2e-4, -2e-4], "a camera")
+    given = cell(seed, images=16, cameras=1, camera=bending, board=SMALL, carrier=(2e-4, 1e-4), corner_px=0.03)
+    pinhole = replace(given.observations, cameras={"cam_0": PINHOLE})
+    tried = chosen_model(pinhole, given.X, given.Y, rw.CornerOptions(stated="unknown"), silent)
+    assert tried.options.lens_of("cam_0") == "k1"
+    corners = rw.refine_corners(pinhole, given.X, given.Y, tried.options)
+    more, pose = tried.covariance_of_rivals(corners), corners.slots["y", "cam_0"]
+    xi = se3.logmap(se3.inverse(corners.Y["cam_0"].matrix())[None] @ given.Y["cam_0"])[0]
+    alone, with_rivals = (float(xi @ np.linalg.solve(C[pose, pose], xi)) for C in (corners.joint, corners.joint + more))
+    assert with_rivals < 0.8 * alone
+    # noise moves rivals less where more images are refined from than were looked at
+    twice_as_many = replace(tried, images=tried.images // 2).covariance_of_rivals(corners)
+    np.testing.assert_allclose(twice_as_many, 0.5 * more, rtol=1e-9, atol=1e-20)
+
+
 def test_a_bent_board_is_found_bent_and_a_flat_one_flat() -> None:
     bent = cell(2, images=60, shape=(0.0, 1e-3, 1e-3), carrier=(2e-4, 1e-4))
     _, chosen = wide_and_chosen(bent, rw.CornerOptions())
