@@ -322,13 +322,14 @@ def errors_px(model: Model, point: Point) -> list[Array]:
     ]
 
 
-def weights_of(model: Model, point: Point, corner_px: float, *, first: bool) -> tuple[Array, ...]:
+def weights_of(model: Model, point: Point, noise: Noise, *, first: bool) -> tuple[Array, ...]:
     """1 for corners that count, 0 for outliers and for corners that were not seen, by stack.
 
-    In the first round the corners' deviation is told by the median error, which outliers hardly move.
+    In the first round the corners' deviation is told by the median error, which outliers hardly move. An error has what
+    the image's corners share in it, too: along each axis up to two patterns.
     """
     errors = errors_px(model, point)
-    limit = LIMIT * corner_px
+    limit = LIMIT * float(np.sqrt(noise.corner_px**2 + 2.0 * noise.common_px**2))
     if first:
         seen = np.concatenate([error[stack.known] for error, stack in zip(errors, model.stacks, strict=True)])
         limit = LOOSE * LIMIT * float(np.median(seen)) / MEDIAN

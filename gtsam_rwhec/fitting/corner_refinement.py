@@ -50,6 +50,8 @@ from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3
+#: After so many rounds corners that are out stay out. Two images of one instant that disagree may come and go together.
+COMING_BACK = 4
 #: Steps end where the cost falls by less than this share; with outliers in the fit, which only tells which corners they
 #: are, by less than ``ROUGHLY``.
 EXACTLY, ROUGHLY = 1e-9, 1e-2
@@ -228,7 +230,7 @@ def _settled(
         point, iterations = graph.point(values), iterations + steps
         before = noise
         if has_outliers:  # the noise is that of the corners that agree
-            model = replace(model, weights=weights_of(model, point, noise.corner_px, first=True))
+            model = replace(model, weights=weights_of(model, point, noise, first=True))
         with told_where_it_fails(model, point):
             reduced = Reduced.of(model, point)
             noise = reduced.likeliest(noise, carrier=options.carrier_noise == "estimate")
@@ -236,7 +238,9 @@ def _settled(
             noise = replace(noise, corner_px=max(noise.corner_px, model.stated_px))
         weights = model.weights
         if options.outliers and not has_outliers:
-            weights = weights_of(model, point, noise.corner_px, first=False)
+            weights = weights_of(model, point, noise, first=False)
+            if number > COMING_BACK:
+                weights = tuple(np.minimum(now, before) for now, before in zip(weights, model.weights, strict=True))
         same = not has_outliers and all(np.array_equal(a, b) for a, b in zip(weights, model.weights, strict=True))
         if same and noise.change(before) < SETTLED:
             break

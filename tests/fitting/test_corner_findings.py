@@ -130,3 +130,20 @@ def test_an_optimiser_that_stopped_early_is_named(good: Cell) -> None:
     assert "The optimiser has not converged: one more step would move the answer by 0.37" in words
     assert "max_iterations=1" in words
     assert "not converged" in " ".join(findings_of(replace(result, last_step=float("nan")), once))
+
+
+def test_images_of_one_instant_that_disagree_do_not_come_and_go() -> None:
+    """Two cameras at one place: three images of one are half a pixel off, and the noise settles all the same."""
+    given = cell(1, images=40, cameras=1, carrier=(1e-3, 5e-4), corner_px=0.02)
+    of, view, rng = given.observations, given.observations.views["board", "cam_0"], np.random.default_rng(1)
+    pixels = view.pixels + rng.normal(0.0, 0.02, view.pixels.shape)
+    pixels[:3] += 0.5
+    cameras = dict.fromkeys(("cam_0", "cam_1"), of.cameras["cam_0"])
+    views = {("board", "cam_0"): (view.A, view.pixels), ("board", "cam_1"): (view.A, pixels)}
+    said: list[str] = []
+    result = rw.refine_corners(
+        rw.Observations.of(cameras, of.corners, views), given.X, dict.fromkeys(cameras, given.Y["cam_0"]),
+        progress=said.append,
+    )  # fmt: skip
+    assert len(said) < 12
+    assert all(mask[3:].mean() < 0.01 for mask in result.left_out.values())
