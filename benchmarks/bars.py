@@ -145,6 +145,7 @@ def kept_lines(keep: Path | None) -> list[dict[str, Any]]:
 def keep_line(keep: Path | None, one: dict[str, Any]) -> None:
     """Add a run to the file."""
     if keep is not None:
+        keep.parent.mkdir(parents=True, exist_ok=True)
         with keep.open("a") as file:
             file.write(json.dumps(one) + "\n")
 

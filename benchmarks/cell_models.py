@@ -124,6 +124,8 @@ def rows_of_models(found: list[dict[str, Any]]) -> list[Row]:
         table.append(Row(f"the command's mean error over that of: {name}", words))
     for kind in (*cells.KINDS, "all"):
         of_kind = [one["errors"] for one in found if kind in (one["kind"], "all")]
+        if not of_kind:
+            continue
         ours = np.array([of["command"] for of in of_kind])
         best = np.array([min(v for n, v in of.items() if n not in ("command", "from poses")) for of in of_kind])
         ratio = ours.mean() / best.mean()
@@ -131,6 +133,8 @@ def rows_of_models(found: list[dict[str, Any]]) -> list[Row]:
         bar, met = (f"<= {MOST}", ratio <= MOST) if kind == "all" else ("", None)
         table.append(Row(f"{kind}: mean error over the oracle's", words, bar, met))
     right = [one["errors"] for one in found if "from poses" in one["errors"]]
+    if not right:
+        return table
     worse = sum(of["command"] > MOST_OF_POSES * of["from poses"] for of in right)
     ratio = np.mean([of["command"] for of in right]) / np.mean([of["from poses"] for of in right])
     words = f"{worse} of {len(right)}; {ratio:.2f} in mean"
@@ -144,7 +148,7 @@ def rows_of_opencv(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> 
     pairs = [(a, b) for a, b in zip(ours, theirs, strict=True) if a["verdict"] and b["verdict"]]
     for board in ("Checkerboard", "Charuco"):
         of = [(a, b) for a, b in pairs if a["board"].startswith(board)]
-        for unit in ("deg", "mm"):
+        for unit in ("deg", "mm") if of else ():
             errors = np.array([
                 [one["sensors"][n][unit] for one in (a, b)] for a, b in of for n in a["sensors"] if n in b["sensors"]
             ])  # fmt: skip

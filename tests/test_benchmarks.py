@@ -166,3 +166,22 @@ def test_what_is_drawn_is_where_the_truth_says(imported: Callable[[str], ModuleT
     right, up = (scenes.projected(camera, over + step[i], T) - at for i in range(2))
     area = np.abs(right[:, 0] * up[:, 1] - right[:, 1] * up[:, 0])
     assert np.abs(middle - (at * area[:, None]).sum(axis=0) / area.sum()).max() < 0.01
+
+
+def test_a_rendered_cell_is_calibrated_and_compared_with_fixed_models(
+    imported: Callable[[str], ModuleType], tmp_path: Path
+) -> None:
+    cells, models = imported("rendered_cells"), imported("cell_models")
+    cells.WIDTHS = (640,)
+    found = cells.run("hand", 3, 0, tmp_path)
+    assert found["verdict"] == "use"
+    assert found["sensors"]["camera1"]["deg"] < 0.05
+    errors = models.run("hand", 3, 0, tmp_path)  # neither rendered nor searched again
+    assert errors["command"] < 1e-3
+    assert min(errors.values()) <= errors["command"] < 3.0 * min(errors.values())
+    oracle = next(row for row in models.rows_of_models([found | {"errors": errors}]) if row.what.startswith("all"))
+    assert oracle.met == (
+        errors["command"] <= 1.2 * min(v for n, v in errors.items() if n not in ("command", "from poses"))
+    )
+    table = {row.what.strip(): row for row in cells.rows_of("hand", [found], 0.9, 1.0)}
+    assert table["left out of those whose board is read"].met == (found["left_out"] <= 0.01 * found["read"])
