@@ -33,6 +33,7 @@ from gtsam_rwhec.fitting.corner_model import Model
 from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.fit_options import CornerOptions, FreeLens
+from gtsam_rwhec.fitting.held_out import blocks_of
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.stated_intrinsics import is_free, prior_of
 from gtsam_rwhec.geometry.poses import Array
@@ -49,8 +50,9 @@ BENT, WARP_M, FLAT_M = 9, 1e-3, 1e-8
 #: Without a block each camera and each target must keep so many images, or the block is not left out.
 FEWEST = 4
 #: The scatter of blocks' answers counts where chance gives it with less than this probability. Each frame's six numbers
-#: count as this many, since they go together.
-BY_CHANCE, NUMBERS = 0.1, 3
+#: count as this many, since they go together. A block tells of an unknown whose variance grows by this share without it;
+#: so many blocks must.
+BY_CHANCE, NUMBERS, TOLD, FEWEST_BLOCKS = 0.01, 3, 0.01, 3
 #: Lengths and angles of configurations are alike where they are as far apart, m over rad.
 M_PER_RAD = 0.5
 
@@ -309,7 +311,8 @@ class Blocks:
         model, noise = refined.graph.model, refined.noise
         whole = Reduced.of(model, refined.point).without_carriers(noise)
         found, ways = [], []
-        for way, block in enumerate((_by_time(model), _by_configuration(model), _by_region(model))):
+        in_time = blocks_of(model.stacks, len(model.A), min(BLOCKS, len(model.A)))
+        for way, block in enumerate((in_time, _by_configuration(model), _by_region(model))):
             for number in range(block.max() + 1):
                 inside = block == number
                 if inside.any() and _leaves_enough(model, inside):
@@ -344,20 +347,26 @@ class Blocks:
         return at, list(zip(px.tolist(), (px2 * standard_error / px).tolist(), strict=True)), weights / weights.sum()
 
     def spread(self, model: LinearModel) -> dict[tuple[str, str], float]:
-        """By unknown: the scatter of the blocks' answers over what the covariance claims; `ChosenCameras.spread`."""
-        claimed = np.diagonal(model.covariance(self.all_H))
+        """By unknown: the scatter of the blocks' answers over what the covariance claims; `ChosenCameras.spread`.
+
+        Without block j the answer differs by what has the covariance C_j - C: with C_j that of the rest, C that of all.
+        """
         found = dict.fromkeys(self.refined.slots, 1.0)
+        theta, C = model.theta(self.all_H, self.all_h), np.diagonal(model.covariance(self.all_H))
         for way in (0, 1):
             at = np.flatnonzero(self.way == way)
-            if len(at) < 3:
+            if not len(at):
                 continue
-            theta = np.array([model.theta(self.all_H - self.H[i], self.all_h - self.h[i]) for i in at])
-            left = 1.0 - self.count[at] / self.count[at].sum()
-            variance = left @ (theta - theta.mean(axis=0)) ** 2
-            freedom = NUMBERS * (len(at) - 1)
+            rest = [(self.all_H - self.H[i], self.all_h - self.h[i]) for i in at]
+            off = np.array([model.theta(H, h) for H, h in rest]) - theta
+            claimed = np.array([np.diagonal(model.covariance(H)) for H, _ in rest]) - C
+            told = claimed > TOLD * C
+            squares = np.where(told, off**2, 0.0) / np.where(told, claimed, 1.0)
             for slot, rows in self.refined.slots.items():
-                ratio = float((variance[rows] / np.maximum(claimed[rows], 1e-300)).mean())
-                if ratio > chdtri(freedom, BY_CHANCE) / freedom:
+                number = told[:, rows].sum() / max(rows.stop - rows.start, 1)  # of blocks that tell of it
+                freedom = NUMBERS * (number - 1.0)
+                ratio = float(squares[:, rows].sum() / max(told[:, rows].sum(), 1))
+                if number >= FEWEST_BLOCKS and ratio > chdtri(freedom, BY_CHANCE) / freedom:
                     found[slot] = max(found[slot], float(np.sqrt(ratio)))
         return found
 
@@ -370,12 +379,6 @@ def _leaves_enough(model: Model, inside: np.ndarray) -> bool:
         for at in (("x", stack.target), ("y", stack.sensor)):
             left[at] = left.get(at, 0) + number
     return min(left.values()) >= FEWEST
-
-
-def _by_time(model: Model) -> np.ndarray:
-    """The block (I,) of each instant, by its place among the images."""
-    number = len(model.A)
-    return np.arange(number) * min(BLOCKS, number) // number
 
 
 def _by_configuration(model: Model) -> np.ndarray:

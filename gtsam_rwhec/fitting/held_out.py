@@ -77,7 +77,7 @@ def held_out_errors(refined: CornersRefined, *, folds: int = 5, progress: Progre
         replace(stack, known=stack.known & (weights > 0.0))
         for stack, weights in zip(model.stacks, model.weights, strict=True)
     )
-    block = _blocks(stacks, len(model.A), folds)
+    block = blocks_of(stacks, len(model.A), folds)
     found: dict[str, list[tuple[Array, Array, Array, Array]]] = {name: [] for name in model.sensors}
     for fold in range(folds):
         tell(f"predicting images that were left out: block {fold + 1} of {folds}")
@@ -155,7 +155,7 @@ def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, 
     return length, on_target, expected, stack.pixels[known]
 
 
-def _blocks(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarray:
+def blocks_of(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarray:
     """The block (I,) of each instant: by its place among the images of the pairs that it is in, so that each block has
     a part of every pair."""
     place, count = np.zeros(instants), np.zeros(instants)

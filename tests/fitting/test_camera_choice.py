@@ -176,6 +176,15 @@ def test_the_blocks_are_the_whole() -> None:
         assert blocks.c[blocks.way == way].sum() == pytest.approx(whole.rr, rel=1e-9)
 
 
+def test_blocks_of_independent_images_scatter_as_the_covariance_says() -> None:
+    """Also where the images of one camera come after those of the other: each block has a part of both."""
+    factors = []
+    for seed in range(6):
+        _, chosen = wide_and_chosen(four(seed), rw.CornerOptions())
+        factors += [factor for (letter, _), factor in chosen.spread.items() if letter in "xy"]
+    assert np.mean(np.array(factors) > 1.0) <= 0.1
+
+
 def test_no_lens_that_is_sold_has_other_focal_lengths() -> None:
     prior = prior_of(CAMERA, "nominal")
     covariance = np.linalg.inv(prior.precision)
