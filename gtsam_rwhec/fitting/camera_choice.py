@@ -50,8 +50,8 @@ BENT, WARP_M, FLAT_M = 9, 1e-3, 1e-8
 #: Without a block each camera and each target must keep so many images, or the block is not left out.
 FEWEST = 4
 #: The scatter of blocks' answers counts where chance gives it with less than this probability. Each frame's six numbers
-#: count as this many, since they go together. A block tells of an unknown whose variance grows by this share without it;
-#: so many blocks must.
+#: count as this many, since they go together. A block tells of an unknown where its variance grows by this share
+#: without it; so many blocks must.
 BY_CHANCE, NUMBERS, TOLD, FEWEST_BLOCKS = 0.01, 3, 0.01, 3
 #: Lengths and angles of configurations are alike where they are as far apart, m over rad.
 M_PER_RAD = 0.5
