@@ -76,8 +76,7 @@ class BatchResiduals:
 
     def _predicted(self, X: Array, Y: Array, offset_s: float) -> Array:
         A = self.A if self.twists is None or offset_s == 0.0 else self.A @ se3.expmap(offset_s * self.twists)
-        predicted: Array = np.linalg.inv(Y) @ A @ X
-        return predicted
+        return np.linalg.inv(Y) @ A @ X
 
     def _compared(self, predicted: Array, scale: float) -> Array:
         scaled = predicted.copy()

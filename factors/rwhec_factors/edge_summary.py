@@ -221,7 +221,6 @@ def _summary_factor(ends: list[int], summary: EdgeSummary, scale_key: int | None
             if scale_key is not None:  # x's first seven entries are scale times something
                 metres = np.r_[poses[0].translation() - origins[0], poses[1].translation() - origins[1], 1.0]
                 jacobians[len(blocks)] = np.asfortranarray((L[:, :7] @ metres)[:, None])
-        residual: Array = L @ x
-        return residual
+        return L @ x
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(L)), keys, error)

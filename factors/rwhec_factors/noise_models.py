@@ -52,8 +52,7 @@ def without_loss(noise: Noise) -> Any:
     """The Gaussian model inside a robust model; a Gaussian model itself."""
     while isinstance(noise, gtsam.noiseModel.Robust):
         noise = noise.noise()
-    gaussian: Any = noise  # GTSAM has no third kind
-    return gaussian
+    return noise  # GTSAM has no third kind
 
 
 def information_of(gaussian: Any) -> Array:

@@ -110,8 +110,7 @@ class TagGrid:
     def corners(self) -> Array:
         """(4 columns rows, 3), metres."""
         middles = grid(self.columns, self.rows, self.tag_m + self.gap_m)
-        corners: Array = (middles[:, None] + square(self.tag_m)).reshape(-1, 3)
-        return corners
+        return (middles[:, None] + square(self.tag_m)).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -282,8 +281,7 @@ class AprilGrid:
         """(4 columns rows, 3), metres; rows of tags from the bottom."""
         middles = grid(self.columns, self.rows, self.tag_m * (1.0 + self.spacing))
         from_below = middles.reshape(self.rows, self.columns, 3)[::-1].reshape(-1, 1, 3)
-        corners: Array = (from_below + square(self.tag_m)).reshape(-1, 3)
-        return corners
+        return (from_below + square(self.tag_m)).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

@@ -177,8 +177,7 @@ def _values(gray: Gray, plane: BoardPlane, rows: int, columns: int) -> Array:
     squares = (
         samples.reshape(rows + 3, PER_SIDE, columns + 3, PER_SIDE).swapaxes(1, 2).reshape(rows + 3, columns + 3, -1)
     )
-    found: Array = np.median(squares, axis=-1)
-    return found
+    return np.median(squares, axis=-1)
 
 
 def _contrasts(values: Array, light: np.ndarray, axis: int) -> Array:

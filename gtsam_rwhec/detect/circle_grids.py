@@ -320,8 +320,7 @@ def _light(values: Array, basis: Array, where: np.ndarray, steady: float) -> Arr
     """The planes (n, 3) that fit gray values (n, p) best in some of the pixels; basis (n, p, 3) has 1, du, dv."""
     weighed = (basis * where[..., None]).swapaxes(1, 2)
     normal = weighed @ basis + np.diag([1e-9, steady, steady])
-    planes: Array = np.linalg.solve(normal, weighed @ values[..., None])[..., 0]
-    return planes
+    return np.linalg.solve(normal, weighed @ values[..., None])[..., 0]
 
 
 def _gaps(steps: Array, radii: Array) -> Array:

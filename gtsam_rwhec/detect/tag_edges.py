@@ -27,15 +27,13 @@ GROSS = 3.5
 def median(values: Array, count: np.ndarray) -> Array:
     """Medians (...) of values (..., n); the last n - count values by size are infinite and do not count."""
     middle = np.maximum((count - 1) // 2, 0)[..., None]
-    found: Array = np.take_along_axis(np.sort(values, axis=-1), middle, axis=-1)[..., 0]
-    return found
+    return np.take_along_axis(np.sort(values, axis=-1), middle, axis=-1)[..., 0]
 
 
 def area(corners: Array) -> Array:
     """Areas (N,) of quadrangles (N, 4, 2), pixels^2: half the cross product of the diagonals."""
     first, second = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    found: Array = 0.5 * np.abs(_cross(first, second))
-    return found
+    return 0.5 * np.abs(_cross(first, second))
 
 
 def sampled(stack: Gray, image_of: np.ndarray, points: Array) -> Array:
@@ -106,8 +104,7 @@ def mapped(H: Array, x: Array, y: float) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    product: Array = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 #: Gray values beyond the border and beyond the paper have this prior standard deviation, in units of the edge's step.

@@ -71,8 +71,7 @@ def error_of(estimate: gtsam.Pose3, T_a_b: PoseLike) -> Array:
         When T_a_b is not a valid pose.
     """
     truth = gtsam.Pose3(one_transform(T_a_b, "the pose to compare with"))
-    xi: Array = gtsam.Pose3.Logmap(estimate.inverse().compose(truth))
-    return xi
+    return gtsam.Pose3.Logmap(estimate.inverse().compose(truth))
 
 
 def standard_deviations(covariance: ArrayLike) -> tuple[Array, Array]:
@@ -100,5 +99,4 @@ def _turned(by: Array, covariance: ArrayLike) -> Array:
             "the covariance is infinite along a free direction and cannot be written in another frame's axes; "
             "turn the marginal information instead (Refined.information)"
         )
-    turned: Array = by @ array @ by.T
-    return turned
+    return by @ array @ by.T

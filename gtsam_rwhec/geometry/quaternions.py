@@ -61,8 +61,7 @@ def of_rows(rows: Array) -> Array:
 
 def of_rotations(R: Array) -> Array:
     """Unit quaternions (N, 4), of either sign, of rotations (N, 3, 3)."""
-    q: Array = of_rows(R.transpose(2, 1, 0).reshape(9, -1)).T
-    return q
+    return of_rows(R.transpose(2, 1, 0).reshape(9, -1)).T
 
 
 def to_rotations(q: Array) -> Array:
@@ -82,8 +81,7 @@ def to_rotations(q: Array) -> Array:
 
 def of_vectors(v: Array) -> Array:
     """Vectors (..., 3) as quaternions (..., 4) without a scalar part."""
-    q: Array = np.concatenate([v, np.zeros((*v.shape[:-1], 1))], axis=-1)
-    return q
+    return np.concatenate([v, np.zeros((*v.shape[:-1], 1))], axis=-1)
 
 
 def dual_parts(q: Array, t: Array) -> Array:

@@ -160,8 +160,7 @@ def edges(A: Array, X: Array, Y: Array, B: Array) -> tuple[Array, Array, Array, 
 def _quaternions(R: Array) -> Array:
     """Quaternions (V, 4) with a positive scalar part, which is last, of rotations (V, 3, 3)."""
     q = of_rotations(R)
-    positive: Array = q * np.where(q[:, 3:] < 0.0, -1.0, 1.0)
-    return positive
+    return q * np.where(q[:, 3:] < 0.0, -1.0, 1.0)
 
 
 def graph_model(corners: Corners, graph: Graph, deviations: tuple[float, float]) -> Linearised:

@@ -40,8 +40,7 @@ class Linearised:
     def step(self, damping: float) -> Array:
         """The step to the least value of the quadratic model, with damping times H's diagonal added to H."""
         H = self.H + damping * np.diag(np.diagonal(self.H))
-        step: Array = -np.linalg.lstsq(H, self.g, rcond=1e-15)[0]  # a chart's H may be singular
-        return step
+        return -np.linalg.lstsq(H, self.g, rcond=1e-15)[0]  # a chart's H may be singular
 
 
 @dataclass(frozen=True)

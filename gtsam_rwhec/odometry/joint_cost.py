@@ -234,8 +234,7 @@ def _best(form: JointForm, starts: list[Array]) -> tuple[Descent, Array, JointCe
 
 def _gradient(q: Array) -> Array:
     """The entries of Q'x without the last one, (K, 9)."""
-    rows: Array = q[:-1].reshape(-1, 9)
-    return rows
+    return q[:-1].reshape(-1, 9)
 
 
 def _proven(form: JointForm, end: Descent) -> tuple[Array, JointCertificate]:

@@ -328,8 +328,7 @@ def _correlations(answer: Answer, k: int) -> Array:
         return np.zeros(2)
     before, after = r[:-1][follows], r[1:][follows]
     squares = _products(before, before) * _products(after, after)
-    shares: Array = _products(before, after) / np.sqrt(np.maximum(squares, 1e-300))
-    return shares
+    return _products(before, after) / np.sqrt(np.maximum(squares, 1e-300))
 
 
 #: An answer fits equally well if its cost is at most this much above the best one's: two standard deviations.
@@ -379,5 +378,4 @@ def _free_shift(answer: Answer, task: Task, k: int) -> Array | None:
     U, s, _ = np.linalg.svd(answer.fit.state.T[k, :3, :3] @ rows)
     if not len(s) or s[0] < 0.05:
         return None
-    axis: Array = U[:, 0]
-    return axis
+    return U[:, 0]

@@ -169,14 +169,12 @@ class OdometryCalibration:
         if sensor == self.reference:
             return np.zeros((6, 6))
         first = 6 * self.order.index(sensor)
-        block: Array = self.covariance[first : first + 6, first : first + 6]
-        return block
+        return self.covariance[first : first + 6, first : first + 6]
 
     def T(self, first: str, second: str) -> Array:
         """The pose (4, 4) of sensor ``second`` in the frame of sensor ``first``. Such poses close loops exactly."""
         inverse = np.linalg.inv(self.T_reference_sensor[first])
-        pose: Array = inverse @ self.T_reference_sensor[second]
-        return pose
+        return inverse @ self.T_reference_sensor[second]
 
     @cached_property
     def judgement(self) -> Judgement:

@@ -154,8 +154,7 @@ class Rows:
     @property
     def information(self) -> Array:
         """(p, p)."""
-        product: Array = self.J.T @ self.J
-        return product
+        return self.J.T @ self.J
 
 
 @dataclass(frozen=True)
@@ -291,8 +290,7 @@ def _unit(direction: tuple[float, float, float] | Array) -> Array:
 def _across(axis: Array) -> Array:
     """Two unit vectors (3, 2), perpendicular to an axis and to each other."""
     _, _, Vt = np.linalg.svd(axis[None])
-    basis: Array = Vt[1:].T
-    return basis
+    return Vt[1:].T
 
 
 #: An axis is taken as up if it is within this angle of the reference's +z axis or -y axis.
@@ -350,5 +348,4 @@ def upside_down(normal: Array, T: Array) -> np.ndarray:
     limit = np.cos(NEAR_RAD)
     by_z = np.where(np.abs(along[:, 2]) > limit, -np.sign(along[:, 2]), 0.0)
     by_y = np.where(np.abs(along[:, 1]) > limit, np.sign(along[:, 1]), 0.0)
-    said: np.ndarray = np.where(by_z != 0.0, by_z, by_y)
-    return said
+    return np.where(by_z != 0.0, by_z, by_y)

@@ -75,8 +75,7 @@ def found_variances(
         current = current * np.exp(groups.T @ step)
         if np.abs(step).max() < CONVERGED:
             break
-    result: Array = current * unit
-    return result
+    return current * unit
 
 
 def uncertain_by(windows: WindowMotions, linear: Linear, variances: Array, stated: np.ndarray, scale: Array) -> Array:
@@ -89,8 +88,7 @@ def uncertain_by(windows: WindowMotions, linear: Linear, variances: Array, state
     _, information = _score(windows, linear, weights(windows, *variances.T), parts, unit, 1.0)
     select = _by_logarithm(groups, variances / unit)
     inverse = np.linalg.inv(select @ information @ select.T + np.eye(len(select)) / PRIOR**2)
-    deviations: Array = groups.T @ np.sqrt(np.diagonal(inverse)).reshape(-1, 2)
-    return deviations
+    return groups.T @ np.sqrt(np.diagonal(inverse)).reshape(-1, 2)
 
 
 def _contrasts(linear: Linear, W: Array) -> tuple[Array, Array, Array, Array]:

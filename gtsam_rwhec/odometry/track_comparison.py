@@ -131,8 +131,7 @@ def _velocities(track: OdometryTrack, *, inverted: bool = False) -> Array:
     stamps, T = stamps[::every], T[::every]
     if inverted:
         T = se3.inverse(T)
-    velocity: Array = se3.logmap(se3.inverse(T[:-1]) @ T[1:]) / (1e-9 * np.diff(stamps))[:, None]
-    return velocity
+    return se3.logmap(se3.inverse(T[:-1]) @ T[1:]) / (1e-9 * np.diff(stamps))[:, None]
 
 
 def _ahead(velocity: Array) -> float:

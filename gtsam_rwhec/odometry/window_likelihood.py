@@ -53,8 +53,7 @@ class Layout:
     @cached_property
     def poses(self) -> np.ndarray:
         """The indices (m - 1, 6) of the poses' tangents."""
-        numbers: np.ndarray = self.at[1:, :6]
-        return numbers
+        return self.at[1:, :6]
 
     def spread(self, step: Array) -> Array:
         """A step (size,) arranged by sensor and column, (m, 8)."""
@@ -124,8 +123,7 @@ class Eliminated:
 
     def motions(self, step: Array) -> Array:
         """The best step (n, 6) of the motions for a step of the unknowns."""
-        d: Array = np.linalg.solve(self.D, (self.of_motion - self.G @ step)[:, :, None])[:, :, 0]
-        return d
+        return np.linalg.solve(self.D, (self.of_motion - self.G @ step)[:, :, None])[:, :, 0]
 
 
 def weights(windows: WindowMotions, rotation: Array, translation: Array) -> Array:
@@ -151,8 +149,7 @@ def predicted(state: State) -> Array:
 
 def _true_motions(state: State) -> Array:
     """The motions (m, n, 4, 4) in true lengths."""
-    motions: Array = se3.inverse(state.T)[:, None] @ state.motion @ state.T[:, None]
-    return motions
+    return se3.inverse(state.T)[:, None] @ state.motion @ state.T[:, None]
 
 
 def _back(true: Array) -> Array:
@@ -222,8 +219,7 @@ def information_of_noise(linear: Linear, W: Array, layout: Layout, state: State,
         dG = _by_window(np.swapaxes(linear.B, 2, 3) @ WdJ, layout)
         N += _own(np.einsum("mnia,mnib->mab", dJ, WdJ, optimize=True), layout)
         N -= np.einsum("nap,naq->pq", dG, np.linalg.solve(D, dG), optimize=True)
-    symmetric: Array = 0.5 * (N + N.T)
-    return symmetric
+    return 0.5 * (N + N.T)
 
 
 def _by_window(blocks: Array, layout: Layout) -> Array:

@@ -30,8 +30,7 @@ class SampledTrack:
     @cached_property
     def times(self) -> Array:
         """(N,) seconds on the reference's clock."""
-        stamps: Array = (np.asarray(self.track.stamps_ns) - self.origin_ns) * 1e-9 + self.offset_s
-        return stamps
+        return (np.asarray(self.track.stamps_ns) - self.origin_ns) * 1e-9 + self.offset_s
 
     @cached_property
     def _sums(self) -> tuple[Array, Array, Array]:
@@ -60,8 +59,7 @@ class SampledTrack:
                 if a != b:
                     weight *= (at - times[first + b]) / (times[first + a] - times[first + b])
             tangent += weight[:, None] * se3.logmap(from_here @ T[first + a])
-        poses: Array = T[i] @ se3.expmap(tangent)
-        return poses
+        return T[i] @ se3.expmap(tangent)
 
     def covers(self, start: Array, end: Array, max_gap_s: float) -> np.ndarray:
         """Which windows (M,) are inside the track and contain no bad step and no gap."""
@@ -104,16 +102,13 @@ def _between(times: Array, sums: Array, start: Array, end: Array) -> Array:
     def at(when: Array) -> Array:
         i = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(times) - 2)
         share = ((when - times[i]) / (times[i + 1] - times[i]))[:, None]
-        value: Array = flat[i] + share * (flat[i + 1] - flat[i])
-        return value
+        return flat[i] + share * (flat[i + 1] - flat[i])
 
-    difference: Array = (at(end) - at(start)).reshape(len(start), *sums.shape[1:])
-    return difference
+    return (at(end) - at(start)).reshape(len(start), *sums.shape[1:])
 
 
 def _outer(p: Array, q: Array) -> Array:
-    product: Array = p[:, :, None] * q[:, None, :]
-    return product
+    return p[:, :, None] * q[:, None, :]
 
 
 @dataclass(frozen=True)
@@ -158,8 +153,7 @@ class WindowMotions:
     def rotation_vectors(self) -> Array:
         """(m, n, 3) rotation vectors of the motions."""
         m, n = self.M.shape[:2]
-        vectors: Array = se3.so3_logmap(self.M[:, :, :3, :3].reshape(m * n, 3, 3)).reshape(m, n, 3)
-        return vectors
+        return se3.so3_logmap(self.M[:, :, :3, :3].reshape(m * n, 3, 3)).reshape(m, n, 3)
 
     def covariance_parts(self) -> tuple[Array, Array]:
         """Covariances (m, n, 6, 6) of M's right perturbation for a unit of rotation noise, and of translation noise.

@@ -60,15 +60,13 @@ class Freedom:
         """An orthonormal basis (p, p - l) of the directions that are determined."""
         if not self.left.shape[1]:
             return np.eye(len(self.left))
-        rest: Array = np.linalg.svd(self.left, full_matrices=True)[0][:, self.left.shape[1] :]
-        return rest
+        return np.linalg.svd(self.left, full_matrices=True)[0][:, self.left.shape[1] :]
 
     def inverse(self) -> Array:
         """The inverse (p, p) of the information, zero along the directions that are left free."""
         Z = self.complement()
         inner = Z.T @ self.information @ Z
-        inverse: Array = Z @ np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner))) @ Z.T
-        return inverse
+        return Z @ np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner))) @ Z.T
 
     def covariance(self) -> Array:
         """(p, p), zero along the directions that are left free."""
@@ -129,8 +127,7 @@ def seven_each(directions: Array, layout: Layout) -> Array:
     """Directions (p, l) in identifiability's order, (7 (m - 1) + 1, l): each sensor's pose and scale; a zero."""
     padded = np.vstack([directions, np.zeros((1, directions.shape[1]))])
     rows = padded[layout.at[1:, : SCALE + 1].ravel()]
-    result: Array = np.vstack([rows, np.zeros((1, directions.shape[1]))])
-    return result
+    return np.vstack([rows, np.zeros((1, directions.shape[1]))])
 
 
 #: The most Gauss-Newton steps. Well-excited drives take four.
@@ -375,8 +372,7 @@ def freedom_at(used: Used, state: State, task: Task) -> Freedom:
 def _main_axis(motion: Array) -> Array:
     """The axis (3,) about which the vehicle turned most."""
     w = se3.so3_logmap(motion[:, :3, :3])
-    axis: Array = np.linalg.eigh(w.T @ w)[1][:, -1]
-    return axis
+    return np.linalg.eigh(w.T @ w)[1][:, -1]
 
 
 def too_few(count: int) -> UnderdeterminedError:

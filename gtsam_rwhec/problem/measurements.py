@@ -79,8 +79,7 @@ class Measurements:
         if self.covariances is not None:
             return self.covariances
         variances = np.repeat(np.column_stack([0.5 / self.kappa, self.sigma**2]), 3, axis=1)
-        covariance: Array = variances[:, :, None] * np.eye(6)
-        return covariance
+        return variances[:, :, None] * np.eye(6)
 
     def selected(self, mask: np.ndarray) -> Measurements:
         """The measurements where ``mask`` (N,) is true."""

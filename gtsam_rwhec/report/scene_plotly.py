@@ -285,8 +285,7 @@ def first_view(scene: Scene) -> Array:
     _, axes = np.linalg.eigh(spread[:2, :2])
     flat = axes[:, 0] * (1.0 if axes[0, 0] >= 0.0 else -1.0)  # the eye is on the side of x
     turned = np.cos(0.45) * flat + np.sin(0.45) * np.array([-flat[1], flat[0]])
-    direction: Array = np.array([*(np.cos(ELEVATION) * turned), np.sin(ELEVATION)])
-    return direction
+    return np.array([*(np.cos(ELEVATION) * turned), np.sin(ELEVATION)])
 
 
 def camera(scene: Scene, towards_eye: Array, up: Sequence[float] = (0.0, 0.0, 1.0)) -> dict[str, Any]:

@@ -313,8 +313,7 @@ def correlation(covariance: Array) -> Array:
     """The correlation matrix of a covariance; rows without variance correlate with nothing."""
     deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     inverse = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0.0)
-    result: Array = np.clip(covariance * inverse[:, None] * inverse, -1.0, 1.0)
-    return result
+    return np.clip(covariance * inverse[:, None] * inverse, -1.0, 1.0)
 
 
 def _groups(unknowns: list[Unknown], sizes: list[int]) -> tuple[list[str], list[int]]:
@@ -330,5 +329,4 @@ def _largest_of_blocks(matrix: Array, sizes: list[int]) -> Array:
     """The largest size of the entries in each block."""
     first = np.cumsum([0, *sizes[:-1]])
     of_rows = np.maximum.reduceat(np.abs(matrix), first, axis=0)
-    result: Array = np.maximum.reduceat(of_rows, first, axis=1)
-    return result
+    return np.maximum.reduceat(of_rows, first, axis=1)

@@ -189,8 +189,7 @@ def _complement(free: Array, least: float | None = None) -> Array:
     """A basis (m, r) of all directions that are orthogonal to ``free``, whose lengths up to ``least`` are none."""
     U, s, _ = np.linalg.svd(free, full_matrices=True)
     least = ROUNDING * s.max(initial=0.0) if least is None else least
-    rest: Array = U[:, int((s > least).sum()) :]
-    return rest
+    return U[:, int((s > least).sum()) :]
 
 
 def _whitening(covariance: Array) -> Array:
@@ -213,8 +212,7 @@ def _span(columns: Array) -> Array:
     if not columns.shape[1]:
         return columns
     U, s, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
-    span: Array = U[:, s > ROUNDING * s.max()]
-    return span
+    return U[:, s > ROUNDING * s.max()]
 
 
 def _own(difference: Array, covariance: Array, free: Array) -> tuple[float, int]:

@@ -174,5 +174,4 @@ def numbers_of(refined: RefinedPoses, unknown: Unknown) -> Array:
 def _unit(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> Array:
     """The unit of each row, from the first of both that has the unknown."""
     joint = old.joint if unknown in old.joint.slots else new.joint
-    found: Array = joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)
-    return found
+    return joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)

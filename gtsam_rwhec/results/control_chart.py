@@ -60,8 +60,7 @@ class Shifts:
     def change(self, which: int, rows: np.ndarray) -> Array:
         """The estimated change (r,) of these rows, if only they changed."""
         seen = self.seen[which, rows]
-        found: Array = np.where(seen, solved(self.S[which][np.ix_(rows, rows)], self.u[which, rows], seen), 0.0)
-        return found
+        return np.where(seen, solved(self.S[which][np.ix_(rows, rows)], self.u[which, rows], seen), 0.0)
 
     def chances(self, ratios: Array, dimensions: np.ndarray, spread: Spread) -> Array:
         """How often a ratio of so many dimensions is as large without a change; 1 where nothing is tested."""

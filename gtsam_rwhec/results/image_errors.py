@@ -151,8 +151,7 @@ def _at_optimum(J: Array, errors: Array, counts: np.ndarray) -> Array:
     """Errors (n, 2) without what A's errors explain of those that count; derivatives (n, 2, 6) in deviations."""
     flat = J[counts].reshape(-1, 6)
     xi = np.linalg.solve(flat.T @ flat + np.eye(6), flat.T @ errors[counts].ravel())
-    left: Array = errors - J @ xi
-    return left
+    return errors - J @ xi
 
 
 #: At most this many corners are kept for one camera, and for all cameras together.

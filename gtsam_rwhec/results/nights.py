@@ -103,8 +103,7 @@ def solved(S: Array, u: Array, seen: np.ndarray) -> Array:
     """S^-1 u over the rows that are seen, 0 in the others; stacks of them too."""
     S = np.where(seen[..., :, None] & seen[..., None, :], S, 0.0)
     S = S + np.where(seen, 0.0, 1.0)[..., :, None] * np.eye(S.shape[-1])
-    found: Array = np.linalg.solve(S, np.where(seen, u, 0.0)[..., None])[..., 0]
-    return found
+    return np.linalg.solve(S, np.where(seen, u, 0.0)[..., None])[..., 0]
 
 
 def _root(information: Array, first: Array) -> Array:

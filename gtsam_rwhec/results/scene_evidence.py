@@ -413,8 +413,7 @@ def _warp(shape: BoardShape | None) -> Array:
 def _bent(points: Array, reach: float, warp: Array) -> Array:
     """Points of a flat board (n, 3) on the warped one, by the formula of `corner_residuals.shaped`."""
     x, y = (points[:, :2] / reach).T
-    bent: Array = points + np.outer(np.stack([x * x, y * y, x * y], axis=1) @ warp, [0.0, 0.0, 1.0])
-    return bent
+    return points + np.outer(np.stack([x * x, y * y, x * y], axis=1) @ warp, [0.0, 0.0, 1.0])
 
 
 def _kind(target: Target) -> str:

@@ -232,8 +232,7 @@ def _points_in_view(camera: Camera) -> Array:
     u, v = np.meshgrid(np.linspace(0.0, camera.width - 1.0, COLUMNS), np.linspace(0.0, camera.height - 1.0, ROWS))
     x = camera.undistort(np.stack([u, v], axis=-1).reshape(-1, 2))
     rays = np.column_stack([x, np.ones(len(x))])[np.isfinite(x).all(axis=1)]
-    points: Array = (np.geomspace(NEAR_M, FAR_M, DEPTHS)[:, None, None] * rays).reshape(-1, 3)
-    return points
+    return (np.geomspace(NEAR_M, FAR_M, DEPTHS)[:, None, None] * rays).reshape(-1, 3)
 
 
 def _origin(frames: RigFrames, name: str) -> str:

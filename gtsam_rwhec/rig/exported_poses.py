@@ -197,8 +197,7 @@ def _joint(frame: CalibratedFrame, parent: str) -> str:
 
 def quaternion_xyzw(T: Array) -> Array:
     """The unit quaternion (4,) of a transform's rotation, as x, y, z, w, where w is not below 0."""
-    quaternion: Array = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
-    return quaternion
+    return Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
 
 
 def fixed_axis_angles(T: Array) -> tuple[float, float, float]:

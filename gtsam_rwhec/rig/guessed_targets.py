@@ -320,8 +320,7 @@ def _places(kind: Kind, columns: int, rows: int) -> Array:
     if kind == "charuco":  # markers are in the white squares, and the upper left one is black
         white = (x + y) % 2 == 1
         x, y = x[white], y[white]
-    places: Array = np.stack([x, y if kind == "aprilgrid" else -y], axis=1).astype(float)
-    return places
+    return np.stack([x, y if kind == "aprilgrid" else -y], axis=1).astype(float)
 
 
 def _fit(places: Array, tags: Sequence[SeenTag]) -> tuple[float, float]:

@@ -171,8 +171,7 @@ class BlockFactor:
             result[group.frames] = np.einsum("kii->ki", lower)
         last = np.diagonal(self.rest)
         result[self.order.rest] = last[: len(last) - q].reshape(-1, m)
-        whole: Array = np.append(result.ravel(), last[len(last) - q :])
-        return whole
+        return np.append(result.ravel(), last[len(last) - q :])
 
     def solve_vector(self, v: Array) -> Array:
         """Solve L L' x = v (n m + q,)."""

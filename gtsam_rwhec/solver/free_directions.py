@@ -159,8 +159,7 @@ def sparse_basis(basis: Array, length_m: float) -> Array:
     columns /= np.linalg.norm(columns, axis=0)
     columns[np.abs(columns) < 1e-12] = 0.0  # rounding
     columns *= np.sign(np.take_along_axis(columns, np.abs(columns).argmax(axis=0)[None], axis=0))
-    sparse: Array = columns * unit[:, None]
-    return sparse
+    return columns * unit[:, None]
 
 
 def free_directions_of(

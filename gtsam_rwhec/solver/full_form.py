@@ -45,8 +45,7 @@ class Slots:
     def variables(self, numbers: Array, at: slice) -> Array:
         """The variables (k, 25, D) of the pairs' numbers (k, 28, D)."""
         place = self.place[at].astype(int)[:, :, None]
-        result: Array = np.take_along_axis(numbers, place, axis=1) * self.factor[at][:, :, None]
-        return result
+        return np.take_along_axis(numbers, place, axis=1) * self.factor[at][:, :, None]
 
     def summed(self, values: Array, at: slice) -> Array:
         """Values of the pairs' variables (k, 25), summed by numbers (k, 28)."""

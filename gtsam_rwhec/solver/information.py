@@ -149,8 +149,7 @@ def order_of(part: Part) -> Elimination:
 
 def _coupled(part: Part) -> np.ndarray:
     """(E,): whether a pair has two free frames."""
-    coupled: np.ndarray = (part.ends < len(part.free)).all(axis=1) & ~part.moments.motion
-    return coupled
+    return (part.ends < len(part.free)).all(axis=1) & ~part.moments.motion
 
 
 def information(

@@ -42,8 +42,7 @@ def own_curvature(whole: PartForm, multipliers: Array) -> Array:
     Lambda = multiplier_blocks(multipliers)[0][:, :9, :9]
     values, vectors = np.linalg.eigh(0.5 * (M + M.transpose(0, 2, 1)))
     root = vectors / np.sqrt(np.maximum(values, 1e-9 * np.abs(values).max(axis=1, initial=1e-290)[:, None]))[:, None, :]
-    smallest: Array = 1.0 - np.linalg.eigvalsh(root.transpose(0, 2, 1) @ Lambda @ root)[:, -1]
-    return smallest
+    return 1.0 - np.linalg.eigvalsh(root.transpose(0, 2, 1) @ Lambda @ root)[:, -1]
 
 
 #: Fractions of Q's diagonal that are added to Q and to Z, because translations and scales may be free.
@@ -117,8 +116,7 @@ def improve_locally(whole: PartForm, evaluation: Evaluation, kkt: Array, most: i
 
 def rotation_rows(frames: np.ndarray) -> np.ndarray:
     """The places of the frames' rotations among the form's variables (9 k,)."""
-    result: np.ndarray = (13 * frames[:, None] + np.arange(4, 13)).ravel()
-    return result
+    return (13 * frames[:, None] + np.arange(4, 13)).ravel()
 
 
 def local_form(Q: Curvature, Z: Curvature, evaluation: Evaluation, kkt: Array, frames: np.ndarray) -> LocalForm | None:
@@ -218,8 +216,7 @@ def _frames_of(vectors: Array) -> np.ndarray:
     n = len(vectors) // 13
     squares = (vectors[:-1].reshape(n, 13, -1)[:, 4:] ** 2).sum(axis=1)
     least = np.minimum(SHARE * squares.sum(axis=0), squares.max(axis=0, initial=0.0))  # the first frame in any case
-    result: np.ndarray = np.flatnonzero((squares >= least).any(axis=1))
-    return result
+    return np.flatnonzero((squares >= least).any(axis=1))
 
 
 def helpful_frames(

@@ -83,8 +83,7 @@ def variance_factors(part: Part, told: PartInformation, J_t: Array, J_R: Array) 
 
     def factors(J: Array, spare: float, floor: Array) -> Array:
         of_part = 2.0 * float(J.sum()) / max(spare, 1.0)
-        larger: Array = np.maximum(np.maximum(J / (1.5 * counts), of_part), floor)
-        return larger
+        return np.maximum(np.maximum(J / (1.5 * counts), of_part), floor)
 
     return PartVarianceFactors(
         factors(J_R, spare_rotation, floor_R),
@@ -183,8 +182,7 @@ def fitted_squares(part: Part) -> Array:
     A direction may tilt at each free end, about two axes.
     """
     free = part.ends < len(part.free)
-    fitted: Array = 2.0 * np.where(part.moments.motion, free[:, 0], free.sum(axis=1))
-    return fitted
+    return 2.0 * np.where(part.moments.motion, free[:, 0], free.sum(axis=1))
 
 
 def common_axes(part: Part) -> tuple[Array, Array, Array]:

@@ -141,5 +141,4 @@ def half_widths(part: Part, point: Point, region: Region) -> Array:
     else:  # -R't and -R_0't_0
         width[:, :3] = region.radius_m + 2.0 * reach
     width[:, 3] = factor * np.abs(point.numbers[:, 3])
-    result: Array = np.append(width.ravel(), factor * scale) * (1.0 + 1e-9)
-    return result
+    return np.append(width.ravel(), factor * scale) * (1.0 + 1e-9)

@@ -182,8 +182,7 @@ def _schur(family: Array, X: Array, W: Array) -> Array:
 
 
 def _symmetric(M: Array) -> Array:
-    result: Array = 0.5 * (M + M.T)
-    return result
+    return 0.5 * (M + M.T)
 
 
 def _step_length(S: Array, dS: Array, fraction: float) -> float:

@@ -293,5 +293,4 @@ def _reach(x: Array) -> Array:
 def _power_above(values: Array) -> Array:
     """For each value the smallest power of two that is not below it; 1 for zero."""
     mantissa, exponent = np.frexp(values)
-    powers: Array = np.where(values > 0.0, np.ldexp(1.0, exponent - (mantissa == 0.5)), 1.0)
-    return powers
+    return np.where(values > 0.0, np.ldexp(1.0, exponent - (mantissa == 0.5)), 1.0)

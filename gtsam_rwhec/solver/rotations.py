@@ -70,8 +70,7 @@ def constraint_values(R: Array) -> Array:
     y = np.concatenate([vec(R), np.ones((len(R), 1))], axis=1)
     p, q, factor = _TERMS
     exact = product(y[:, p], y[:, q])
-    result: Array = Doubled(exact.hi * factor, exact.lo * factor).summed(axis=2).value
-    return result
+    return Doubled(exact.hi * factor, exact.lo * factor).summed(axis=2).value
 
 
 #: e_k^, the cross product with each axis (3, 3, 3): the opposite of the Levi-Civita symbol.
@@ -85,8 +84,7 @@ def vec(R: Array) -> Array:
 
 def unvec(r: Array) -> Array:
     """(n, 9) or (9 n,) to (n, 3, 3)."""
-    stack: Array = r.reshape(-1, 3, 3).transpose(0, 2, 1)
-    return stack
+    return r.reshape(-1, 3, 3).transpose(0, 2, 1)
 
 
 def tangent_basis(R: Array) -> Array:

@@ -80,5 +80,4 @@ class StoredForm:
 
 def _rounded(values: Array) -> Array:
     """A bound on the error of rounding to doubles."""
-    result: Array = 2.0**-52 * np.abs(values).astype(float)
-    return result
+    return 2.0**-52 * np.abs(values).astype(float)

@@ -42,8 +42,7 @@ class Weak:
     @property
     def free(self) -> np.ndarray:
         """(k,): whether a direction is free."""
-        free: np.ndarray = self.values <= self.thresholds
-        return free
+        return self.values <= self.thresholds
 
     @property
     def ratio(self) -> float:
@@ -53,8 +52,7 @@ class Weak:
 
 def unit_of(noise: Array, used: np.ndarray) -> Array:
     """The factor that brings a parameter to units of its noise; 0 for an unused parameter."""
-    result: Array = np.where(used, 1.0 / np.sqrt(np.where(used, noise, 1.0)), 0.0)
-    return result
+    return np.where(used, 1.0 / np.sqrt(np.where(used, noise, 1.0)), 0.0)
 
 
 def weakest(information: BlockMatrix, noise: Array, used: np.ndarray, ends: Array, spare: float, *, few: bool) -> Weak:
