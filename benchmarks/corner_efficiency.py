@@ -71,8 +71,7 @@ KINDS = {
 
 def off(truth: np.ndarray, T: np.ndarray) -> np.ndarray:
     """The perturbation [omega, v] of an estimated pose about the true one."""
-    error: np.ndarray = se3.logmap((se3.inverse(truth) @ T)[None])[0]
-    return error
+    return se3.logmap((se3.inverse(truth) @ T)[None])[0]
 
 
 def one(name: str, seed: int) -> dict[str, tuple[float, ...]]:
@@ -139,8 +138,7 @@ def bound_at_the_truth(given: simulated_cells.Cell, corners: rw.CornersRefined, 
         shapes={name: np.zeros(3) for name in model.targets},
     )
     information = Reduced.of(replace(model, weights=every), truth).information(noise)
-    inverse: np.ndarray = np.linalg.inv(information)
-    return inverse
+    return np.linalg.inv(information)
 
 
 def squared(

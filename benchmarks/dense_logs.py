@@ -73,8 +73,7 @@ def by_view(B: FloatArray, generator: np.random.Generator) -> FloatArray:
     view = np.column_stack([t[:, :2] / t[:, 2:] / 0.3, (t[:, 2] - 0.6) / 0.2, B[:, :2, 2] / 0.4])
     waves = np.cos(view @ generator.normal(0.0, FREQUENCY, (5, WAVES)) + generator.uniform(0.0, 2.0 * np.pi, WAVES))
     amplitudes = generator.standard_normal((WAVES, 6)) * np.repeat(BY_VIEW, 3) * np.sqrt(2.0 / WAVES)
-    result: FloatArray = waves @ amplitudes
-    return result
+    return waves @ amplitudes
 
 
 def _path(frames: int, generator: np.random.Generator) -> FloatArray:
@@ -84,5 +83,4 @@ def _path(frames: int, generator: np.random.Generator) -> FloatArray:
     cycles = generator.uniform(0.02, 0.2, (3, 6))
     phases = generator.uniform(0.0, 2.0 * np.pi, (3, 6))
     waves = np.sin(2.0 * np.pi * cycles * times[:, None, None] + phases)
-    path: FloatArray = BENT_RAD + sizes * waves.sum(axis=1) / np.sqrt(1.5)
-    return path
+    return BENT_RAD + sizes * waves.sum(axis=1) / np.sqrt(1.5)

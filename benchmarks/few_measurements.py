@@ -118,8 +118,7 @@ def problem_of(given: Setting, count: int, generator: np.random.Generator) -> rw
     def noisy(T: Array, turn: float, shift: float, on_the_right: bool) -> Array:
         sizes = generator.standard_normal((2, len(T), 3))
         noise = pose(rotations_of_vectors(turn * sizes[0]), shift * sizes[1])
-        product: Array = T @ noise if on_the_right else noise @ T
-        return product
+        return T @ noise if on_the_right else noise @ T
 
     def measured(A: Array, X: Array, Y: Array) -> tuple[Array, Array]:
         B = inverse(Y) @ A @ X

@@ -109,8 +109,7 @@ def cramer_rao(driven: Drive, given: odometry.Given, *, clocks: bool) -> Array:
     )
     information = eliminated(linearised(windows, state), W, layout).H + rows.rows(state, layout).information
     kept = np.r_[layout.poses.ravel(), layout.at[layout.open[:, SCALE], SCALE]]
-    bound: Array = np.linalg.inv(information)[np.ix_(kept, kept)]
-    return bound
+    return np.linalg.inv(information)[np.ix_(kept, kept)]
 
 
 def _scaled(T: Array, scale: float) -> Array:

@@ -39,8 +39,7 @@ def make_cell() -> Iterator[ModuleType]:
 
 
 def truth(log: str) -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads((CELL / LOGS[log][1]).read_text(encoding="utf-8"))
-    return loaded
+    return json.loads((CELL / LOGS[log][1]).read_text(encoding="utf-8"))
 
 
 def images(log: str, camera: str) -> list[ImageRecord]:

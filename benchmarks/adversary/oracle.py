@@ -61,8 +61,7 @@ def form_of(problem: rw.Problem, certificate: Any) -> str:
     is_inverse = problem.scale == "per_target" or (
         problem.scale == "shared" and any(p.sigma is not None for priors in problem.priors.values() for p in priors)
     )
-    form: str = getattr(certificate.objective, "form", "inverse" if is_inverse else "direct")
-    return form
+    return getattr(certificate.objective, "form", "inverse" if is_inverse else "direct")
 
 
 def centres(problem: rw.Problem, rows: Rows, certificates: list[tuple[tuple[str, ...], Any]]) -> np.ndarray:
@@ -87,8 +86,7 @@ def _parts_of(problem: rw.Problem) -> list[Any]:
         module = importlib.import_module("gtsam_rwhec.solver.parts")
     except ModuleNotFoundError:
         module = importlib.import_module("gtsam_rwhec.certify.parts")
-    parts: list[Any] = module.parts_of(problem)
-    return parts
+    return module.parts_of(problem)
 
 
 def judged(

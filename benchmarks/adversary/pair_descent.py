@@ -42,8 +42,7 @@ class Region:
         """Whether answers t (K, F, 3), log_scales (K, s) are inside."""
         distance = np.sqrt(((t - self.t) ** 2).sum(axis=2)).max(axis=1, initial=0.0)
         factor = np.abs(log_scales - self.log_scales).max(axis=1, initial=0.0)
-        inside: Array = (distance <= INSIDE * self.radius_m) & (factor <= INSIDE * self.log_factor)
-        return inside
+        return (distance <= INSIDE * self.radius_m) & (factor <= INSIDE * self.log_factor)
 
 
 @dataclass(frozen=True)
@@ -238,8 +237,7 @@ class PairDescent:
         change = after / before - 1.0
         limit = np.where(change > 0.0, factor - 1.0, 1.0 - 1.0 / factor) / np.maximum(np.abs(change), 1e-300)
         share = np.minimum(share, 0.99 * limit.min(axis=1, initial=np.inf))
-        result: Array = np.clip(share, 0.0, 1.0)
-        return result
+        return np.clip(share, 0.0, 1.0)
 
     def jacobian(self, z: Pairs) -> Array:
         """(K, m, n) over the rotations' tangents and the linear unknowns, weighted."""

@@ -97,10 +97,9 @@ def test_people_with_other_abilities_can_use_it(
 
 
 def camera(page: Any) -> dict[str, float]:
-    eye: dict[str, float] = page.evaluate(
+    return page.evaluate(
         "(({ x, y, z }) => ({ x, y, z }))(document.querySelector('.turn')._fullLayout.scene._scene.getCamera().eye)"
     )
-    return eye
 
 
 @pytest.mark.parametrize("width", WIDTHS)

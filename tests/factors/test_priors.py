@@ -225,8 +225,7 @@ MOUNTING = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.2, 1.0), np.array([0.1, -0.05, 
 
 
 def information(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> np.ndarray:
-    hessian: np.ndarray = graph.linearize(values).hessian()[0]
-    return hessian
+    return graph.linearize(values).hessian()[0]
 
 
 def test_a_known_height_determines_what_a_four_axis_robot_leaves_free() -> None:

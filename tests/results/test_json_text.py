@@ -122,8 +122,7 @@ def readings(good: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     assert done.returncode == 0, done.stderr[-1000:]
     for path in folder.iterdir():
         path.unlink()
-    read: dict[str, tuple[int, float, str]] = json.loads(done.stdout)
-    return read
+    return json.loads(done.stdout)
 
 
 @pytest.mark.parametrize("kind", LARGE_FILES)

@@ -97,8 +97,7 @@ def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         monkeypatch.setitem(sys.modules, name, module)
     names: dict[str, Any] = {}
     exec(compile(text, "static_tf.launch.py", "exec"), names)
-    nodes: list[Any] = names["generate_launch_description"]()
-    return nodes
+    return names["generate_launch_description"]()
 
 
 @on_random_poses

@@ -24,8 +24,7 @@ def stage_log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     detected, clean = folder / "detected.mcap", folder / "calibration.mcap"
     detect_log(made.write(folder / "raw.mcap", made.recording(4.0)), made.rig(), detected)
     clean_log(detected, clean)
-    path: Path = folder / request.param
-    return path
+    return folder / request.param
 
 
 def test_workers_are_refused_where_detection_is_skipped(stage_log: Path, tmp_path: Path) -> None:

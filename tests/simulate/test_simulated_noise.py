@@ -26,15 +26,13 @@ SMALLEST_P_VALUE = 1e-3
 def angles_of(rotations: Array) -> Array:
     skew = rotations - rotations.transpose(0, 2, 1)
     sines = np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]]), axis=0) / 2.0
-    angles: Array = np.arctan2(sines, (np.trace(rotations, axis1=1, axis2=2) - 1.0) / 2.0)
-    return angles
+    return np.arctan2(sines, (np.trace(rotations, axis1=1, axis2=2) - 1.0) / 2.0)
 
 
 def axes_of(rotations: Array) -> Array:
     skew = rotations - rotations.transpose(0, 2, 1)
     axes = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-    unit: Array = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    return unit
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
 def langevin_distribution(kappa: float, angles: Array) -> Array:
@@ -43,8 +41,7 @@ def langevin_distribution(kappa: float, angles: Array) -> Array:
     grid = np.linspace(0.0, top, 200_001)
     density = np.exp(2.0 * kappa * (np.cos(grid) - 1.0)) * (1.0 - np.cos(grid))
     cumulative = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2.0)])
-    probabilities: Array = np.interp(angles, grid, cumulative / cumulative[-1])
-    return probabilities
+    return np.interp(angles, grid, cumulative / cumulative[-1])
 
 
 @pytest.mark.parametrize("kappa", [0.0, 1e-3, 0.4, 0.5, 0.6, 3.0, 12.0, 125.0, 1e4])

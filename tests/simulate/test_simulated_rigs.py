@@ -26,8 +26,7 @@ def residuals(simulation: Simulation, pair: Pair) -> Array:
     measured = simulation.problem.measurements(target, sensor)
     expected = np.linalg.inv(simulation.Y[sensor]) @ measured.A @ X
     expected[:, :3, 3] *= scale
-    difference: Array = measured.B - expected
-    return difference
+    return measured.B - expected
 
 
 def number_of_parts(edges: list[Edge], targets: int, sensors: int) -> int:

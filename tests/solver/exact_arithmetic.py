@@ -38,8 +38,7 @@ def rotation(q: np.ndarray) -> np.ndarray:
         ],
         dtype=object,
     )
-    scaled: np.ndarray = R / (w * w + x * x + y * y + z * z)
-    return scaled
+    return R / (w * w + x * x + y * y + z * z)
 
 
 def rational_quaternion(R: Array) -> np.ndarray:
@@ -60,8 +59,7 @@ def homogeneous(R: list[np.ndarray]) -> np.ndarray:
 def cost(Q: np.ndarray, quaternions: list[np.ndarray]) -> Fraction:
     """x' Q x at exact rotations."""
     x = homogeneous([rotation(q) for q in quaternions])
-    value: Fraction = x @ (Q @ x)
-    return value
+    return x @ (Q @ x)
 
 
 def random_quaternions(count: int, generator: np.random.Generator) -> list[np.ndarray]:
@@ -106,8 +104,7 @@ def _hessian(Q: Array, R: Array, gradient: Array) -> Array:
         at = slice(3 * i, 3 * i + 3)
         basis[9 * i : 9 * i + 9, at] = each
         curvature[at, at] = 0.5 * (M[i] + M[i].T) - np.trace(M[i]) * np.eye(3)
-    result: Array = basis.T @ Q @ basis + curvature
-    return result
+    return basis.T @ Q @ basis + curvature
 
 
 def _turned(q: np.ndarray, w: Array) -> np.ndarray:

@@ -33,8 +33,7 @@ SPECIAL = [(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1), (1, 1, 0, 0), (1, 1, 1, 1),
 def jacobian(R: np.ndarray) -> np.ndarray:
     """(21, 9): derivatives of the constraints with h = 1, exactly."""
     x = homogeneous([R])
-    result: np.ndarray = np.array([2 * (A @ x)[:9] for A in EXACT], dtype=object)
-    return result
+    return np.array([2 * (A @ x)[:9] for A in EXACT], dtype=object)
 
 
 def wedge(w: Array) -> Array:
