@@ -61,6 +61,14 @@ def adjoint(T: Array) -> Array:
     return result
 
 
+def so3_nearest(M: Array) -> Array:
+    """The nearest rotations (..., 3, 3) to matrices (..., 3, 3), in the Frobenius norm (Kabsch)."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    nearest: Array = U @ Vt
+    return nearest
+
+
 def so3_logmap(R: Array) -> Array:
     """Rotation vectors (N, 3) of rotations (N, 3, 3), with angles in [0, pi], accurate near 0 and near pi."""
     half = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)

@@ -20,7 +20,6 @@ from gtsam_rwhec.cameras.plane_ambiguity import (
     agrees_with_none,
     extrinsic_rotations,
     first_rotation,
-    nearest_rotation,
     rotations_off,
 )
 from gtsam_rwhec.geometry.poses import Array
@@ -149,7 +148,7 @@ def turn_between(first: Turns, second: Turns, ways: int) -> tuple[int, float]:
     costs = []
     for turn in turns_about_z(ways):
         turned = np.where(of_second[:, None], b @ turn, b)  # R_z' b
-        R_X = nearest_rotation(a.T @ turned)
+        R_X = se3.so3_nearest(a.T @ turned)
         squared = ((a - turned @ R_X.T) ** 2).sum(axis=1)
         # Neighbours share images: their sum counts as one pair for each image.
         each = np.minimum(0.25 * squared / SIGMA_TURN_RAD**2, MOST_OF_A_LINK)

@@ -114,7 +114,7 @@ def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsE
     if near is not None and found is not None and found.contradicts:  # then what is stated is no prior for what fits
         again = _fitted(camera, near.T, p, u, known, free=WIDER)
         found = found if again is None else _compared(camera, stated, again, known, reach)
-    lens = _with_distortion(camera)
+    lens = replace(camera, model="radtan", D=np.zeros(4)) if camera.model == "pinhole" else camera  # zero, to be fitted
     start = _far_start(lens, views)
     far = None if start is None else _fitted(lens, start[1], p, u, known, free=WIDER, lens=start[0])
     elsewhere = None if far is None else _compared(lens, stated, far, known, reach)
@@ -137,11 +137,6 @@ def different(poses: Sequence[Array]) -> list[int]:
                 continue
         kept.append(int(i))
     return [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_VIEWS).astype(int))] if kept else []
-
-
-def _with_distortion(camera: Camera) -> Camera:
-    """The camera with coefficients to be fitted: for a pinhole, radial-tangential coefficients that start at zero."""
-    return replace(camera, model="radtan", D=np.zeros(4)) if camera.model == "pinhole" else camera
 
 
 def _far_start(camera: Camera, views: Sequence[View]) -> tuple[Camera, Array] | None:

@@ -267,8 +267,8 @@ def extrinsic_rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: 
     """Solve R_A R_X = R_Y R_B for R_X and R_Y, by weighted least squares from a first R_Y."""
     w = weight[:, None, None]
     for _ in range(TURNS):
-        R_X = nearest_rotation((w * (R_A.swapaxes(1, 2) @ R_Y @ R_B)).sum(axis=0))
-        R_Y = nearest_rotation((w * (R_A @ R_X @ R_B.swapaxes(1, 2))).sum(axis=0))
+        R_X = se3.so3_nearest((w * (R_A.swapaxes(1, 2) @ R_Y @ R_B)).sum(axis=0))
+        R_Y = se3.so3_nearest((w * (R_A @ R_X @ R_B.swapaxes(1, 2))).sum(axis=0))
     root = np.sqrt(weight)
     for _ in range(STEPS):
         off = rotations_off(R_A, R_B[:, None], R_X, R_Y)[:, 0]
@@ -292,7 +292,7 @@ def first_rotation(R_A: Array, R_B: Array) -> Array:
             a, b = (se3.so3_logmap(R[:-lag] @ R[lag:].swapaxes(1, 2)) for R in (R_A, R_B))
             alike = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1)) < ALIKE_RAD
             M += a[alike].T @ b[alike]
-    return nearest_rotation(M)
+    return se3.so3_nearest(M)
 
 
 def _translations(track: _Track, R_Y: Array, which: np.ndarray) -> float:
@@ -309,10 +309,3 @@ def _translations(track: _Track, R_Y: Array, which: np.ndarray) -> float:
         cost = np.minimum(0.5 * squared, track.most)
         weight = 1.0 / (sigma * np.maximum(1.0, np.sqrt(squared) / 2.0))
     return float(cost.sum())
-
-
-def nearest_rotation(M: Array) -> Array:
-    """The rotation nearest to a matrix (3, 3)."""
-    U, _, Vt = np.linalg.svd(M)
-    R: Array = U @ np.diag([1.0, 1.0, float(np.linalg.det(U @ Vt))]) @ Vt
-    return R

@@ -183,7 +183,7 @@ class RotationProblem:
             change[0] = np.clip(change[0], -LONGEST_STEP_S, LONGEST_STEP_S)
             turn = np.minimum(1.0, 0.3 / max(float(np.abs(change[1:]).max()), 1e-12)) * change[1:].reshape(-1, 3)
             offset_s += float(change[0])
-            turns = _exp(turn)
+            turns = se3.expmap(np.hstack([turn, np.zeros_like(turn)]))[:, :3, :3]
             R_Y, R_X = R_Y @ turns[0], R_X @ turns[1:]
             if step > 7 and settled and abs(change[0]) < 1e-7:
                 break
@@ -198,8 +198,7 @@ class RotationProblem:
             own = each[self.track == k]
             weight = np.ones(len(own))
             for _ in range(START_STEPS):
-                U, _, Vt = np.linalg.svd(np.einsum("n,nij->ij", weight, own))
-                R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+                R = se3.so3_nearest(np.einsum("n,nij->ij", weight, own))
                 off = np.linalg.norm(own - R, axis=(1, 2))
                 weight = 1.0 / np.maximum(off, 0.01)
             result.append(R)
@@ -300,10 +299,6 @@ def _scatter(scores: Array, share: Array, count: int) -> float:
     return float(np.sqrt(variance) * stdtrit(filled - 1, 0.975) / 1.96)
 
 
-def _exp(omega: Array) -> Array:
-    return se3.expmap(np.hstack([omega, np.zeros_like(omega)]))[:, :3, :3]
-
-
 #: The two detections of an interval are this many seconds apart. The time is long enough for the turn to exceed a
 #: detection's noise, and short enough for the motion not to repeat itself.
 INTERVAL_S = 0.4
@@ -360,9 +355,7 @@ class Turns:
 
 def aligned(a: Array, b: Array, weight: Array) -> Array:
     """The rotation R with the smallest sum of weight |a - R b|^2, for (N, 3) vectors (Kabsch 1976)."""
-    U, _, Vt = np.linalg.svd((a * weight[:, None]).T @ b)
-    R: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return R
+    return se3.so3_nearest((a * weight[:, None]).T @ b)
 
 
 def _of_track(stamps_ns: np.ndarray, B: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:

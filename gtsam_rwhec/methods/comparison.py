@@ -20,6 +20,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec.errors import FrameError, OptionError, RwhecError
 from gtsam_rwhec.files.progress import Progress, check_progress
@@ -99,11 +100,7 @@ def solved_pair(problem: Problem, method: str) -> tuple[Array, Array]:
     H = np.linalg.inv(raw.B[1:]) @ raw.B[:-1]
     X = solve_hand_eye(C, H, method).X.matrix()
     Ys = raw.A @ X @ np.linalg.inv(raw.B)
-    U, _, Vt = np.linalg.svd(Ys[:, :3, :3].sum(axis=0))
-    Y = np.eye(4)
-    Y[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt  # the rotation nearest to their mean
-    Y[:3, 3] = Ys[:, :3, 3].mean(axis=0)
-    return X, Y
+    return X, se3.pose(se3.so3_nearest(Ys[:, :3, :3].sum(axis=0)), Ys[:, :3, 3].mean(axis=0))
 
 
 #: Solvers of one pair by A X = X B, by their names in comparisons.

@@ -15,6 +15,7 @@ from typing import Literal
 import clarabel
 import numpy as np
 import scipy.sparse
+from rwhec_factors.se3 import so3_nearest
 from scipy.linalg import block_diag
 
 from gtsam_rwhec.errors import FrameError, OptionError, ScaleError
@@ -36,7 +37,7 @@ from gtsam_rwhec.solver.relaxation import (
     triangle,
     unstacked,
 )
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, project, unvec
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, unvec
 from gtsam_rwhec.solver.small_dual import scatter
 
 #: The name of this cost in ``Estimate.proof``.
@@ -248,7 +249,7 @@ def _rounded(M: Array, frames: int) -> list[Array]:
             second[a, b] = second[b, a] = moment
         by_quaternion[k] = to_rotations(np.linalg.eigh(second)[1][:, -1])
     products = M[0, 1:].reshape(frames, 10)
-    by_matrix = project(unvec(products @ products_to_rotation().T))
+    by_matrix = so3_nearest(unvec(products @ products_to_rotation().T))
     return [by_quaternion, by_matrix]
 
 

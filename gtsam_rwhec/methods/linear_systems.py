@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
@@ -21,7 +22,6 @@ from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.full_form import edge_forms
 from gtsam_rwhec.solver.parts import connected_components
-from gtsam_rwhec.solver.rotations import project
 
 #: Up to this smallest eigenvalue over the largest, normal equations are singular: exact data leave a direction free.
 FREE = 1e-10
@@ -148,7 +148,7 @@ def linear_rotations(stack: Stack) -> Array:
 def rotations_up_to_sign(V: Array) -> Array:
     """The nearest rotations (det = 1) to matrices (n, 3, 3) that are known up to a factor of either sign."""
     signs = np.where(np.linalg.det(V) < 0.0, -1.0, 1.0)
-    return project(signs[:, None, None] * V)
+    return so3_nearest(signs[:, None, None] * V)
 
 
 def linear_outcome(stack: Stack, R: Array, notes: Iterable[str] = ()) -> Outcome[Poses]:

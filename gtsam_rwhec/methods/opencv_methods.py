@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
@@ -22,7 +23,6 @@ from gtsam_rwhec.methods.dq_saddle import minimum
 from gtsam_rwhec.methods.dual_quaternion_cost import MotionMoments, gram, to_transform
 from gtsam_rwhec.methods.linear_systems import solve_scaled
 from gtsam_rwhec.methods.motions import UNCERTAIN
-from gtsam_rwhec.solver.rotations import project
 
 #: Rotation of the axes below this share of the largest possible one is rounding error.
 PARALLEL = 1e-13
@@ -190,7 +190,7 @@ def park(stations: Stations) -> tuple[Array, Array]:
     M = np.zeros((3, 3))
     for block in pair_blocks(stations):
         M += _moment(block.a[:3], _log_factor(block.a) * _log_factor(block.b) * block.weight, block.b[:3])
-    R = project(M[None])[0]  # M here is the sum of log(R_A) log(R_B)', and R the rotation nearest to it
+    R = so3_nearest(M[None])[0]  # M here is the sum of log(R_A) log(R_B)', and R the rotation nearest to it
     return R, translation_of(stations, R)
 
 
@@ -240,7 +240,7 @@ def andreff(stations: Stations) -> tuple[Array, Array]:
     D = np.einsum("nba,ncd->acbd", stations.R_G, stations.R_C).reshape(9, 9)  # summed over the stations
     form[:9, :9] += count**2 * np.eye(9) - D @ D.T
     x = solve_scaled(form[:12, :12], -form[:12, 12], LENGTH_UNKNOWN.format("Andreff's"), SINGULAR)
-    return project(x[:9].reshape(1, 3, 3))[0], x[9:]
+    return so3_nearest(x[:9].reshape(1, 3, 3))[0], x[9:]
 
 
 def daniilidis(stations: Stations) -> tuple[Array, Array]:
@@ -385,7 +385,7 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     right = np.concatenate([m.t_A_t_B.ravel(), -np.einsum("aba->b", m.R_A_t_A), m.t_A])
     normal = np.triu(normal) + np.triu(normal, 1).T
     z = solve_scaled(normal, right, LENGTH_UNKNOWN.format("Li's"), SINGULAR)
-    R_X, R_Z = project(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
+    R_X, R_Z = so3_nearest(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
     return R_X, z[9:12], R_Z, z[12:]
 
 

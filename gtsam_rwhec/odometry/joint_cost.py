@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.geometry.poses import Array
@@ -322,8 +323,6 @@ def star_starts(w: Array, s: Array, used: np.ndarray) -> list[Array]:
             a, b = w[0, both], w[k, both]
             c, d = (x / max(np.sqrt((x**2).mean()), 1e-300) for x in (s[0, both], s[k, both]))
             size = max(float(np.sqrt((a**2).mean())), 1e-300)
-            M = (a / size).T @ (b / size) + of_ways * c.T @ d
-            U, _, Vt = np.linalg.svd(M)
-            rotations.append(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+            rotations.append(so3_nearest((a / size).T @ (b / size) + of_ways * c.T @ d))
         starts.append(np.array(rotations))
     return starts

@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
-from gtsam_rwhec.solver.rotations import project
 
 #: A hypothesis is fitted at most this often to the measurements that agree with it. Most need two or three fits.
 MOST_FITS = 10
@@ -146,7 +146,7 @@ def _least_squares(rows: Array, right: Array) -> Array:
 
 def _rotation(M: Array) -> Array:
     """The rotations nearest to matrices (H, 3, 3) of unknown sign; the sign is chosen so that det M > 0."""
-    return project(M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None])
+    return so3_nearest(M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None])
 
 
 def distances(A: Array, B: Array, X: Array, Y: Array, scale: Array) -> tuple[Array, Array]:

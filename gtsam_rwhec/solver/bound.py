@@ -376,7 +376,9 @@ class _Lagrangian:
             for root, of_own, own in zip(roots, of_nulls, (nulls, nulls.without_errors()), strict=True)
         ]
         lower, value = self.value - np.array([self.value_error, 0.0]) - np.array(loss) * (1.0 + 1e-9)
-        lower = max(lower - self._slack_by_multipliers(), self._less_rounding_of_rotations(lower))
+        # |L - J| has this bound at rotations in floating point.
+        slack = ROTATION_IN_DOUBLES * float(np.abs(self.multipliers).sum()) * (1.0 + 1e-9)
+        lower = max(lower - slack, self._less_rounding_of_rotations(lower))
         return float(np.nextafter(lower, -np.inf)), float(value)
 
     def _step_along(self, nulls: NullVectors, enough: float) -> Array | None:
@@ -398,10 +400,6 @@ class _Lagrangian:
             return None
         step: Array = -nulls.V[:, moving] @ (reach * (vectors[:, surely] @ (slope[surely] / values[surely])))
         return step
-
-    def _slack_by_multipliers(self) -> float:
-        """An upper bound on |L - J| at rotations in floating point."""
-        return ROTATION_IN_DOUBLES * float(np.abs(self.multipliers).sum()) * (1.0 + 1e-9)
 
     def _less_rounding_of_rotations(self, lower: float) -> float:
         """The bound for rotations in floating point, from that for exact ones: the root of J is a norm of residuals."""

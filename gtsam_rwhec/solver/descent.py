@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import ONE, R_A
@@ -16,7 +17,7 @@ from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
 from gtsam_rwhec.solver.graph_form import GraphForm
 from gtsam_rwhec.solver.parts import Part, connected_components
 from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.rotations import project, retract, tangent_basis, unvec, vec
+from gtsam_rwhec.solver.rotations import retract, tangent_basis, unvec, vec
 
 #: The reduced form in which answers are searched: Q' as a matrix, or as products over the graph.
 SearchForm = ReducedForm | GraphForm
@@ -109,7 +110,7 @@ def spectral_start(part: Part, rotation: BlockMatrix) -> list[Array]:
         return [np.tile(np.eye(3), (n, 1, 1))]
     if is_anchored:
         r = _smallest(factor, weight, np.ones(matrix.size))
-        return [project(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
+        return [so3_nearest(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
     # Components that only the shared scale joins each have an eigenvector and a sign.
     r = np.zeros(9 * n)
     place = {name: i for i, name in enumerate(part.free)}
@@ -119,7 +120,7 @@ def spectral_start(part: Part, rotation: BlockMatrix) -> list[Array]:
         begin[members] = np.random.default_rng(0).standard_normal((len(members), 9))
         v = _smallest(factor, weight, np.append(begin.ravel(), 0.0))[:-1]
         r += v * _handedness(v)
-    return [project(unvec(r))]
+    return [so3_nearest(unvec(r))]
 
 
 def unconstrained_start(form: SearchForm) -> list[Array]:
@@ -137,7 +138,7 @@ def unconstrained_start(form: SearchForm) -> list[Array]:
         v = solved(v)
         v /= np.linalg.norm(v)
     candidates.append(v * _handedness(v))
-    return [project(unvec(r)) for r in candidates]
+    return [so3_nearest(unvec(r)) for r in candidates]
 
 
 def mirrored(part: Part, R: Array) -> Array:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
@@ -24,7 +25,7 @@ from gtsam_rwhec.solver.answers import Evaluation
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, multiplier_blocks, project, unvec, vec
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, multiplier_blocks, unvec, vec
 from gtsam_rwhec.solver.small_dual import maximise, null_multipliers, scatter
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
@@ -269,5 +270,5 @@ def relax_locally(
     starts = []
     for R in round_to_rotations(relaxation):
         followed = form.follow @ np.append(vec(R).ravel(), 1.0)
-        starts.append(project(unvec(followed[:-1].reshape(-1, 13)[:, 4:])))
+        starts.append(so3_nearest(unvec(followed[:-1].reshape(-1, 13)[:, 4:])))
     return LocalRelaxation(multipliers, relaxation.dual, starts)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.answers import Answer, Evaluation, Form, Point, answer_at, answer_of, as_point
@@ -17,7 +18,7 @@ from gtsam_rwhec.solver.graph_form import GraphForm
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.rotations import kkt_multipliers, project, retract, tangent_basis, unvec, vec
+from gtsam_rwhec.solver.rotations import kkt_multipliers, retract, tangent_basis, unvec, vec
 from gtsam_rwhec.solver.stored_form import StoredForm
 
 #: No step is taken if the gradient can lower the cost by less than about this fraction of it.
@@ -145,7 +146,7 @@ class PartForm:
         """The answer after a step (13 n + 1,) in the form's variables, with its rotations projected, and polished."""
         point = evaluation.point
         numbers = point.numbers + step[:-1].reshape(point.numbers.shape)
-        R = project(unvec(numbers[:, 4:]))
+        R = so3_nearest(unvec(numbers[:, 4:]))
         return self._polished(answer_at(self.part, R, numbers[:, :4], point.alpha + float(step[-1])))
 
     def _polished(self, answer: Answer) -> tuple[Answer, Evaluation]:

@@ -13,12 +13,13 @@ import clarabel
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.certificate import Start
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, project, unvec
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, unvec
 from gtsam_rwhec.solver.small_dual import gram, local_indices, scatter, traces
 
 
@@ -270,7 +271,7 @@ def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:
 def round_to_rotations(relaxation: Relaxation) -> list[Array]:
     """Rotations (n, 3, 3) from X: from its h column, which is x where X has rank one, and its leading eigenvector."""
     X = relaxation.X
-    starts = [project(unvec(X[:-1, -1] / X[-1, -1]))]
+    starts = [so3_nearest(unvec(X[:-1, -1] / X[-1, -1]))]
     leading = np.linalg.eigh(X)[1][:, -1]
-    starts.append(project(unvec(leading[:-1] * np.sign(leading[-1]))))
+    starts.append(so3_nearest(unvec(leading[:-1] * np.sign(leading[-1]))))
     return starts

@@ -110,15 +110,6 @@ def retract(R: Array, w: Array) -> Array:
     return result
 
 
-def project(M: Array) -> Array:
-    """The nearest rotation to each (3, 3) block, in the Frobenius norm (Kabsch)."""
-    U, _, Vt = np.linalg.svd(M)
-    sign = np.sign(np.linalg.det(U @ Vt))
-    U[:, :, 2] *= sign[:, None]
-    result: Array = U @ Vt
-    return result
-
-
 def random_rotations(count: int, generator: np.random.Generator) -> Array:
     """(count, 3, 3) rotations, uniform on SO(3)."""
     q = generator.standard_normal((count, 4))

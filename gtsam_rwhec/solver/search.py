@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
@@ -20,7 +21,7 @@ from gtsam_rwhec.solver.local_dual import LocalDual, improve_locally, relax_loca
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.relaxation import Relaxation, round_to_rotations, solve_relaxation
-from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec
+from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, unvec
 from gtsam_rwhec.solver.small_dual import improve, stationary_multipliers
 from gtsam_rwhec.solver.solve_options import Method, SolveOptions
 
@@ -361,7 +362,7 @@ class Attempt:
         if self.bound.direction is not None:
             direction = self.bound.direction * np.sqrt(3.0 * self.form.rotations)
             for step in (0.5, -0.5, 2.0, -2.0):
-                starts.append(project(self.best.R + step * unvec(direction)))
+                starts.append(so3_nearest(self.best.R + step * unvec(direction)))
         with self.stages.of("better starts"):
             starts += unconstrained_start(self.form)
             if not self.search.is_large:
