@@ -47,7 +47,7 @@ def read_pose_table(path: str, text: str, *, stated: PoseStatement) -> list[Pose
     if header is not None and len(header) >= 7 and all(len(fields) == len(header) for _, fields in lines):
         _refuse_names(path, header)
     counts = {len(fields) for _, fields in lines}
-    if counts == {4} and not _name_first(lines, 4):
+    if counts == {4} and not any(_number(fields[0]) is None for _, fields in lines):
         return _stacked(path, lines)
     return [_row(path, line, stated) for line in lines]
 
@@ -78,7 +78,7 @@ def _lines(path: str, text: str) -> tuple[list[str] | None, list[Line]]:
         if not bare or (is_comment and (lines or header)):
             continue
         fields = _fields(bare.lstrip("#% ") if is_comment else bare)
-        if not lines and header is None and _is_header(fields):
+        if not lines and header is None and sum(_number(field) is None for field in fields) > max(1, len(fields) // 2):
             if not is_comment or _columns(fields):
                 header = fields
         elif not is_comment:
@@ -93,10 +93,6 @@ def _fields(line: str) -> list[str]:
     while fields and not fields[-1]:
         fields.pop()
     return fields
-
-
-def _is_header(fields: Sequence[str]) -> bool:
-    return sum(_number(field) is None for field in fields) > max(1, len(fields) // 2)
 
 
 def _columns(header: Sequence[str]) -> dict[str, int]:
@@ -248,10 +244,6 @@ def _row(path: str, line: Line, stated: PoseStatement) -> PoseRow:
         at = stated.columns.split().index
         kind, numbers = "quaternion", tuple(numbers[at(name)] for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
     return PoseRow(fields[0].strip("\"'") if has_name else "", place, kind, numbers)
-
-
-def _name_first(lines: list[Line], count: int) -> bool:
-    return any(len(fields) == count and _number(fields[0]) is None for _, fields in lines)
 
 
 def _numbers(path: str, line: int, fields: Sequence[str]) -> tuple[float, ...]:

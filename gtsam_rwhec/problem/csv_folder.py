@@ -215,7 +215,7 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
         if parsed is None:
             unknown.append(path.name)
             continue
-        if not _is_unicode(path.name):
+        if any("\ud800" <= sign <= "\udfff" for sign in path.name):  # Python's surrogates for bytes that are no text
             raise FileFormatError(f"{path}: the file's name is not text in UTF-8; rename the file.")
         target, sensor, side = parsed
         sides = found.setdefault(Pair(target, sensor), {})
@@ -238,11 +238,6 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
         )
     in_order = sorted(found, key=lambda pair: (natural_key(pair.target), natural_key(pair.sensor)))
     return {pair: _both(found[pair], folder) for pair in in_order}
-
-
-def _is_unicode(name: str) -> bool:
-    """Whether a file's name is valid text; Python replaces other bytes by surrogates."""
-    return not any("\ud800" <= sign <= "\udfff" for sign in name)
 
 
 def _both(sides: dict[str, Path], folder: Path) -> tuple[Path, Path]:

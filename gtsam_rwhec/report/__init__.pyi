@@ -5,7 +5,6 @@ from .calibration_report import print_solution as print_solution
 from .change_report import print_difference as print_difference
 from .change_report import print_verification as print_verification
 from .change_report import write_changes as write_changes
-from .choices_section import print_log as print_log
 from .hold_out_report import print_cross_validation as print_cross_validation
 from .corners_section import print_corners as print_corners
 from .demo_report import print_demo as print_demo

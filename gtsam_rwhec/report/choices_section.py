@@ -6,11 +6,9 @@ import re
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from rich.console import Console
 
 from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Section, Table, Words, worded
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.report.terminal_report import print_blocks, report_console
 from gtsam_rwhec.results.log_history import LogFields, TrackCount
 
 TITLE = "What was chosen, and why"
@@ -80,11 +78,6 @@ def _refinement(shown: ShownResult) -> Iterator[Block]:
     specs = {"initial_cost": ".6g", "cost": ".6g", "iterations": ".0f"}
     numbers = {field: shown.number("refined", field, spec=spec) for field, spec in specs.items()}
     yield Paragraph(worded(words, frame=moved[0], **numbers))
-
-
-def print_log(log: LogFields, console: Console | None = None) -> None:
-    """Print what was detected, what cleaning removed, and what the answer uses."""
-    print_blocks(report_console() if console is None else console, log_blocks(log))
 
 
 def log_blocks(log: LogFields) -> Iterator[Block]:

@@ -83,7 +83,11 @@ def write_html(
     """
     path = checked_path(path)
     folder = None if figures is None else checked_path(figures)
-    _check_evidence(evidence)
+    if not isinstance(evidence, Evidence | None):
+        raise OptionError(
+            f"evidence is {brief(evidence)}; give what rw.results.evidence_of(problem, calibration) returned, or "
+            "nothing: the evidence beside a result file is read with it"
+        )
     if isinstance(result, Calibration | Refined | Solution):
         shown = ShownResult.of(result_json(result, log), evidence, images=images)
     else:
@@ -121,14 +125,6 @@ def write_figures(page: Page, folder: str | Path) -> list[Path]:
                 write_atomically(path, figure.file(form))
                 written.append(path)
     return written
-
-
-def _check_evidence(evidence: object) -> None:
-    if not isinstance(evidence, Evidence | None):
-        raise OptionError(
-            f"evidence is {brief(evidence)}; give what rw.results.evidence_of(problem, calibration) returned, or "
-            "nothing: the evidence beside a result file is read with it"
-        )
 
 
 def _is_of(evidence: Evidence, shown: ShownResult) -> bool:

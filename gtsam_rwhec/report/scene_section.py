@@ -8,18 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.figures import (
-    AXIS_COLOURS,
-    AXIS_NAMES,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    SKY,
-    SvgFigure,
-    shortened,
-    svg_figure,
-)
+from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, shortened, svg_figure
 from gtsam_rwhec.report.report_blocks import Block, Drawing, Listing, Paragraph, Section, Table, Words, worded
 from gtsam_rwhec.report.scene_model import (
     MANY,
@@ -75,7 +64,8 @@ def scene_section(shown: ShownResult) -> Section:
 
 def _drawing(name: str, title: str, scene: Scene, lines: tuple[Line, ...], says: str) -> Drawing:
     traces = traces_of(scene, lines)
-    return Drawing(f"scene-{name}", title, says, traces, layout_of(scene, traces), still_of(scene, lines))
+    still = svg_figure(lambda figure: _draw(figure, scene, lines), HEIGHT_IN, WIDTH_IN)
+    return Drawing(f"scene-{name}", title, says, traces, layout_of(scene, traces), still)
 
 
 def _about_rig(evidence: SceneEvidence, scene: Scene, lines: tuple[Line, ...]) -> str:
@@ -210,11 +200,6 @@ def _count(number: int, word: str) -> str:
 WIDTH_IN, HEIGHT_IN = 7.0, 5.6
 
 
-def still_of(scene: Scene, lines: Sequence[Line]) -> SvgFigure:
-    """The picture."""
-    return svg_figure(lambda figure: _draw(figure, scene, lines), HEIGHT_IN, WIDTH_IN)
-
-
 def projection(scene: Scene) -> Array:
     """(2, 3): right and up of the picture in the scene's axes."""
     eye = first_view(scene)
@@ -231,7 +216,8 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     axes.set_axis_off()
     axes.set_aspect("equal")
     P, eye = projection(scene), first_view(scene)
-    parts = [part for board in sorted(scene.boards, key=lambda one: _depth(one, eye)) for part in _parts(board, eye)]
+    boards = sorted(scene.boards, key=lambda one: float(np.concatenate([one.paper, *one.dark]).mean(axis=0) @ eye))
+    parts = [part for board in boards for part in _parts(board, eye)]  # the nearest last
     if parts:
         polygons, colours, widths = zip(*((p @ P.T, colour, width) for p, colour, width in parts), strict=True)
         axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=GREY, linewidths=widths, zorder=1))
@@ -262,11 +248,6 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _legend(figure, scene, lines)
-
-
-def _depth(board: PlacedBoard, eye: Array) -> float:
-    """How near a board is to the eye."""
-    return float(np.concatenate([board.paper, *board.dark]).mean(axis=0) @ eye)
 
 
 def _parts(board: PlacedBoard, eye: Array) -> Iterator[tuple[Array, str, float]]:

@@ -24,7 +24,6 @@ from gtsam_rwhec.report.report_blocks import (
     Section,
     Table,
     Tone,
-    Words,
     plain_text,
 )
 
@@ -121,7 +120,8 @@ class TerminalTable:
         """Print the widest layout that fits."""
         yield Text(printable(self.table.caption), style="italic")
         if options.ascii_only:
-            self = replace(self, table=replace(self.table, rows=tuple(map(_in_ascii, self.table.rows))))
+            rows = tuple(tuple(plain_text(cell).translate(ASCII_SIGNS) for cell in row) for row in self.table.rows)
+            self = replace(self, table=replace(self.table, rows=rows))
         number = len(self.table.headings)
         unlimited = options.update(max_width=10_000)
         for parts in (1, 2, 3):
@@ -147,11 +147,6 @@ class TerminalTable:
             said = (Text(shown(plain_text(cell))) for cell in cells[columns.start - 1 : columns.stop - 1])
             table.add_row(Text(shown(plain_text(name))), *said)
         return table
-
-
-def _in_ascii(row: tuple[Words, ...]) -> tuple[Words, ...]:
-    """A row with its signs in ASCII, where they still differ."""
-    return tuple(plain_text(cell).translate(ASCII_SIGNS) for cell in row)
 
 
 def _is_words(cell: object) -> bool:

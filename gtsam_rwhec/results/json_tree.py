@@ -208,7 +208,7 @@ def parse_json(content: bytes) -> Any:
     except UnicodeDecodeError as error:
         raise ValueError(f"it is not text in UTF-8 (byte {error.start})") from error
     try:
-        return json.loads(text, object_pairs_hook=_object, parse_int=_integer, parse_constant=_constant)
+        return json.loads(text, object_pairs_hook=_object, parse_int=_integer)
     except json.JSONDecodeError as error:
         raise ValueError(f"$: Invalid JSON: {error.msg} (line {error.lineno} column {error.colno})") from error
     except RecursionError:
@@ -233,7 +233,3 @@ def _integer(digits: str) -> int:
     if len(digits) > MOST_DIGITS:
         raise ValueError(f"an integer of {len(digits)} digits; at most {MOST_DIGITS} are read")
     return int(digits)
-
-
-def _constant(word: str) -> float:
-    return float(word)  # `json_tree.from_json` refuses it with its place

@@ -7,7 +7,6 @@ the estimate and its covariance. Directions that a short log leaves free are fre
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,7 +68,8 @@ def near(
     for _ in range(MAX_CHOICES):
         tell("judging outliers")
         again = agreeing(problem, inliers, task, found, how)
-        if all(np.array_equal(mask, inliers[pair]) for pair, mask in again.items()) or not _has_all(again):
+        is_settled = all(np.array_equal(mask, inliers[pair]) for pair, mask in again.items())
+        if is_settled or not all(mask.any() for mask in again.values()):  # frames of an empty pair could not be tested
             break
         inliers = again
         task, found = _settled(old, selected(problem, inliers), how, noise, tell)
@@ -104,11 +104,6 @@ def near(
         inliers=inliers,
         free=tuple(map(str, task.free_directions)),
     )
-
-
-def _has_all(inliers: Mapping[Pair, np.ndarray]) -> bool:
-    """Whether each pair keeps measurements. Without any, its frames could not be tested."""
-    return all(mask.any() for mask in inliers.values())
 
 
 def _settled(

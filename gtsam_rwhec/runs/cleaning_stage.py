@@ -101,7 +101,9 @@ def cleaned(log: Log, rig: Rig | None = None, progress: Progress | None = None) 
             continue
         if sigma_s is not None:
             sigmas_s[sensor] = sigma_s
-        _check_overlap(tracks, path, sensor, offsets_s[sensor])
+        if tracks:  # refuses a sensor if all its stamps are outside the carriers' path; a single target may be outside
+            stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
+            synchronise(path, stamps, time_offset_s=offsets_s[sensor], where=sensor)
         pairs += [clean_track(track, path, rig, offsets_s[sensor]) for track in tracks]
     if rig.is_of_odometries:
         assert rig.reference is not None
@@ -193,13 +195,6 @@ def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[MeasuredP
         )
     found = offset_of_either_direction(path, usable, rig.carriers.max_gap_s, sensor)
     return found.offset_s, found.sigma_s
-
-
-def _check_overlap(tracks: list[MeasuredPairs], path: Trajectory, sensor: str, offset_s: float) -> None:
-    """Refuse a sensor if all its stamps are outside the carriers' path. A single target may be outside."""
-    if tracks:
-        stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
-        synchronise(path, stamps, time_offset_s=offset_s, where=sensor)
 
 
 #: Seconds. Poses further apart than this are not interpolated: an arm at 1 m/s moves 20 cm in this time.

@@ -143,8 +143,8 @@ def hypotheses_of(board: Target) -> dict[Key, Array]:
     n = len(corners)
     tags = corners.reshape(-1, 4, 3) if n % 4 == 0 else np.zeros((0, 4, 3))
     if isinstance(board, AprilGrid | TagGrid):
-        pitch = board.tag_m + _gap_m(board)
-        steps = np.repeat(tags.mean(axis=1), 4, axis=0) / pitch
+        gap_m = board.gap_m if isinstance(board, TagGrid) else board.spacing * board.tag_m
+        steps = np.repeat(tags.mean(axis=1), 4, axis=0) / (board.tag_m + gap_m)
         return {("gap", 0): steps[..., None]} if len(tags) > 1 else {}
     made: dict[Key, Array] = {}
     if isinstance(board, Bundle) and len(tags) > 1:
@@ -161,10 +161,6 @@ def hypotheses_of(board: Target) -> dict[Key, Array]:
                 made[what, k] = np.zeros((n, 3, G.shape[2]))
                 made[what, k][4 * k : 4 * k + 4] = G
     return made
-
-
-def _gap_m(board: AprilGrid | TagGrid) -> float:
-    return board.gap_m if isinstance(board, TagGrid) else board.spacing * board.tag_m
 
 
 def _of_board(board: Target, sensor: str, camera: Camera, views: Sequence[BoardView], rig: Rig) -> Iterator[Finding]:

@@ -146,8 +146,12 @@ def calibrate_log(
                 )
             check_is_not_read(log, Path(out) / CALIBRATION_LOG)
             sources = tuple(file.name for file in files)
+        elif len(files) > 1:
+            raise LogError(
+                f"{', '.join(map(str, files[:10]))}: a stage wrote at least one of these files; give that file alone, "
+                "or only raw logs"
+            )
         else:
-            _check_is_alone(log)
             sources = read_metadata(log).detection.sources
         check_image_options(log, rig if is_raw else None, images=images, workers=workers)
         with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
@@ -218,15 +222,6 @@ def _stages(
 def _is_cleaned(log: Log, rig: Rig | None) -> bool:
     """Whether a log was cleaned as the rig file says."""
     return CLEANING_METADATA in log.metadata() and (rig is None or not changes(read_embedded_rig(log), rig).cleaning)
-
-
-def _check_is_alone(log: Log) -> None:
-    """Refuse a log of a stage that is one of several files."""
-    if len(log.files) > 1:
-        raise LogError(
-            f"{', '.join(str(file.path) for file in log.files[:10])}: a stage wrote at least one of these files; give "
-            "that file alone, or only raw logs"
-        )
 
 
 def solve_into(
