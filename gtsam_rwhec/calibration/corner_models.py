@@ -10,7 +10,7 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Choice
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, with_widest
+from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, spread_of, with_widest
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
@@ -23,8 +23,9 @@ MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
 #: Number of cross-validation folds; below `FEW_IMAGES` images more folds, so that enough images remain to calibrate
 #: from.
 FOLDS, FEW_IMAGES, FOLDS_OF_FEW = 4, 50, 8
-#: A counts as exact if this lowers the held-out error to less than this share of the error with noise of A.
-BETTER_SHARE = 0.95
+#: A counts as exact if this lowers the held-out error by this share and more, and by more than chance does: an image's
+#: corners are off together by what its A is off, which has so many numbers.
+BETTER_SHARE, NUMBERS_OF_AN_IMAGE = 0.05, 6
 #: If errors in held-out images are more than this many times what the covariances predict, the model is incomplete.
 UNEXPLAINED = 1.5
 
@@ -105,13 +106,13 @@ def chosen_model(
         cameras = chosen_cameras(wide, some, options, cameras)
     options = cameras.options
 
-    def scored(of: CornerOptions) -> tuple[CornerOptions, Score, dict[str, HeldOut]]:
+    def scored(of: CornerOptions) -> tuple[CornersRefined, CornerOptions, Score, dict[str, HeldOut]]:
         refined = refine_corners(some, X, Y, of, tell)
         folds = FOLDS_OF_FEW if len(refined.point.A) < FEW_IMAGES else FOLDS
         found = held_out_errors(refined, folds=folds, progress=tell)
         errors = np.array([(one.rms_px, one.rms_mm, one.expected_px) for one in found.values()])
         weights = np.array([one.corners for one in found.values()], dtype=float)
-        return of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found
+        return refined, of, Score(in_words(of), *np.sqrt(weights @ errors**2 / weights.sum()).tolist()), found
 
     try:
         every = [scored(options)]
@@ -119,14 +120,17 @@ def chosen_model(
         return Tried(options, in_words(options), f"no other was tried: {error}", (), {}, cameras, images)
     if options.carrier_noise != "exact":
         every.append(scored(replace(options, carrier_noise="exact")))
-        if every[1][1].mm < BETTER_SHARE * every[0][1].mm:
+        chance = 2.0 / np.sqrt(NUMBERS_OF_AN_IMAGE * images)
+        if every[1][2].mm < (1.0 - max(BETTER_SHARE, chance)) * every[0][2].mm:
             every.reverse()
-    chosen, score, found = every[0]
+    refined, chosen, score, found = every[0]
+    if refined.noise.carrier is None:  # then what A is off makes an image's corners go together, and only blocks tell
+        cameras = replace(cameras, spread=spread_of(refined, some, chosen))
     evidence = f"it predicts images that were left out to {score.px:.3g} px, and {score.mm:.3g} mm on the target"
-    for _, other, _ in every[1:]:
+    for _, _, other, _ in every[1:]:
         size = f"{other.mm:.3g} mm" if np.isfinite(other.mm) else "a target behind its camera"
         evidence += f" ({size} with {other.words})"
-    return Tried(chosen, score.words, evidence, tuple(one for _, one, _ in every), found, cameras, images)
+    return Tried(chosen, score.words, evidence, tuple(one for _, _, one, _ in every), found, cameras, images)
 
 
 def thinned(observations: Observations) -> Observations:

@@ -166,6 +166,13 @@ def chosen_cameras(
     return ChosenCameras(choice.options, tuple(choice.tried), blocks.spread(model), tuple(choice.rivals))
 
 
+def spread_of(
+    refined: CornersRefined, observations: Observations, options: CornerOptions
+) -> dict[tuple[str, str], float]:
+    """By unknown of a refinement under the options: how far blocks of images scatter; `ChosenCameras.spread`."""
+    return Blocks.of(refined).spread(LinearModel.of(refined, observations.cameras, options))
+
+
 @dataclass(eq=False)
 class Choosing:
     """The options as they are chosen, one thing after the other, with the rest as it is."""
