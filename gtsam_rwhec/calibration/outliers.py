@@ -181,7 +181,7 @@ def gross_errors(problem: Problem) -> str:
     if sampled is None or sampled.count < FEWEST_ASKED:
         return ""
     fit = fitted(problem, sampled.as_read())
-    if fit is None:
+    if fit is None:  # a sample without an answer tells nothing; how large the residuals of all are is judged
         return ""
     ends = np.cumsum([len(rows) for rows in sampled.rows.values()])[:-1]
     errors = fit.errors / _stated(sampled)
@@ -285,10 +285,8 @@ def without_outliers(
     elif not problem.has_measurements:
         why = "the raw measurements were not kept"
     if not problem.has_measurements:
-        words = (
-            "the raw measurements were not kept, so outliers, mistakes of reading, late clocks, noise of A and drift"
-        )
-        record.find(Ground.NOT_CHECKED, f"{words} were not looked for")
+        lost = "outliers, mistakes of reading, late clocks, wrong sizes, noise of A and drift"
+        record.find(Ground.NOT_CHECKED, f"the raw measurements were not kept, so {lost} were not looked for")
     if why:
         record.choose(OUTLIERS, "every measurement counts", why)
         return first, {}
