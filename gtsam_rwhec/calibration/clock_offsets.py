@@ -57,6 +57,8 @@ class Clock:
     #: A first estimate of the offset, one step from the certified solution, and its standard deviation
     offset_s: float | None = None
     sigma_s: float | None = None
+    #: Whether a path of the carriers was given to tell the clock by, and it has no velocity at most of the stamps
+    is_unchecked: bool = False
 
     @property
     def is_clearly_off(self) -> bool:
@@ -98,8 +100,8 @@ def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: T
         (pair for pair in problem.pairs if pair.sensor == sensor), key=lambda pair: -problem.moments(*pair).count
     )[:MOST_TARGETS]
 
-    def right(why: str, *found: float) -> Clock:
-        return Clock(sensor, False, why, *found)
+    def right(why: str, offset_s: float | None = None, sigma_s: float | None = None) -> Clock:
+        return Clock(sensor, False, why, offset_s, sigma_s)
 
     if not problem.has_measurements:
         return right("the raw measurements were not kept")
@@ -117,7 +119,10 @@ def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: T
     try:
         paths = local_paths(problem, (sensor,), carrier_path)
     except CountError as error:
-        return right(f"the carriers' path about its stamps is not known ({apart_s:.2g} s apart): {error}")
+        # Between stations without a path this is usual: a late clock is then noise, which is estimated, as it is
+        # without stamps. Whoever gives a path wants the clock told by it.
+        why = f"the carriers' path about its stamps is not known ({apart_s:.2g} s apart): {error}"
+        return Clock(sensor, is_worth_estimating=False, evidence=why, is_unchecked=carrier_path is not None)
     unknown = _unknown_share(paths)
     if unknown > LARGEST_UNKNOWN_SHARE:
         help_ = "" if carrier_path is not None else " (a path that was logged faster would tell: carrier_path)"
@@ -147,7 +152,7 @@ def _unknown_share(paths: dict[Pair, LocalPaths]) -> float:
     squares, error = np.zeros(2), np.zeros(2)
     for path in paths.values():
         squares += (path.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
-        error += len(path.coefficients) * path.velocity_variance.reshape(2, 3).sum(axis=1)
+        error += path.known.sum() * path.velocity_variance.reshape(2, 3).sum(axis=1)
     return float(np.min(error / np.maximum(squares, 1e-18)))
 
 
@@ -268,7 +273,7 @@ def _by_option(run: Run, first: Solution | None) -> Answer:
     found = _with_offsets(run, first)
     asked = offsets_of(run.problem, run.options)
     chosen = f"estimated for {', '.join(found.time_offsets_s)}" if asked and found.time_offsets_s else "not estimated"
-    run.record.choose(TIME_OFFSETS, chosen, run.says_so)
+    run.record.choose(TIME_OFFSETS, chosen, run.says_so + _without_velocity(run, found))
     if found.refined is not None:
         _doubt_stated_clocks(run, found)
     return found
@@ -294,7 +299,8 @@ def _by_the_data(run: Run, first: Solution | None) -> Answer:
     run.record.take(attempt.record)
     names = ", ".join(found.time_offsets_s)
     chosen = f"estimated for {names}" if names else "not estimated"
-    run.record.choose(TIME_OFFSETS, chosen, _evidence(after))
+    run.record.choose(TIME_OFFSETS, chosen, _evidence(after) + _without_velocity(run, found))
+    _say_unchecked(run, after)
     return found
 
 
@@ -328,6 +334,38 @@ def _evidence(clocks: tuple[Clock, ...]) -> str:
     return "; ".join(f"{', '.join(names)}: {evidence}" for evidence, names in sensors.items())
 
 
+#: So many measurements are named by their stamps.
+NAMED = 5
+
+
+def _without_velocity(run: Run, found: Answer) -> str:
+    """How many measurements count without a term of their clock, and which; empty where none does."""
+    sensors = tuple(found.time_offsets_s)
+    kept = agreeing(run.problem, found.inliers)
+    paths = local_paths(kept, sensors, run.options.carrier_path)
+    where = []
+    for pair, path in paths.items():
+        stamps_ns = kept.measurements(*pair).stamps_ns
+        if stamps_ns is not None:
+            where += [f"{pair} at {stamp} ns" for stamp in stamps_ns[~path.known].tolist()]
+    if not where:
+        return ""
+    more = f" and {len(where) - NAMED} more" if len(where) > NAMED else ""
+    total = sum(len(path.known) for path in paths.values())
+    return (
+        f"; beside gaps in the carriers' path no velocity is known, so {len(where)} of {total} measurements count as "
+        f"they are paired, without an offset ({', '.join(where[:NAMED])}{more})"
+    )
+
+
+def _say_unchecked(run: Run, clocks: tuple[Clock, ...]) -> None:
+    """Record a finding for each clock that a path of the carriers was given for, and that could not be checked."""
+    for clock in clocks:
+        if clock.is_unchecked:
+            words = f"the clock of {clock.sensor} could not be checked: {clock.evidence}"
+            run.record.find(Ground.NOT_CHECKED, words)
+
+
 def _doubt_stated_clocks(run: Run, found: Answer) -> None:
     """Record a finding for each clock that was taken as right, although the measurements that agree contradict it.
 
@@ -346,6 +384,7 @@ def _doubt_stated_clocks(run: Run, found: Answer) -> None:
         if clock.is_clearly_off and clock.offset_s is not None:
             ground = Ground.LATE_CLOCK if abs(clock.offset_s) > LATE_S else Ground.COVARIANCE_DOUBTED
             run.record.find(ground, f"the clock of {clock.sensor} was taken as right, but {clock.evidence}")
+    _say_unchecked(run, tuple(clocks[name] for name in stated if name in clocks))
 
 
 def _worth_estimating(clocks: tuple[Clock, ...]) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,10 +165,13 @@ def misread_as_recorded(run: Run) -> Reading:
         warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
         try:
             found = _of_recording(problem, run)
-            if found and recording.is_inverse:
-                found = min(found, _of_recording(inverted(problem), run) or found, key=_is_left)
-        except ScaleError:
+        except ScaleError as error:
+            words = "whether the poses were misread was not looked for among what cleaning removed"
+            run.record.find(Ground.NOT_CHECKED, f"{words}: {error}")
             return Reading()
+        if found and recording.is_inverse:
+            with suppress(ScaleError):  # the poses as they are read tell it too
+                found = min(found, _of_recording(inverted(problem), run) or found, key=_is_left)
     exchanged = exchange_of(problem).misreading if not found else None
     found = found if exchanged is None else (exchanged,)
     return Reading() if all(one.mistake.may_be_sizes_or_clocks for one in found) else Reading(found)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, agreeing, offsets_of
-from gtsam_rwhec.calibration.outliers import spare_equations
+from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, spare_equations
 from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
@@ -38,6 +38,8 @@ class NoiseFound:
     simple: str = ""  #: Why B's alone was estimated; empty with a model
     #: Whether the model of all noise could not be computed, or the noise that was stated for A not used
     has_failed: bool = False
+    #: Whether that model was asked for, and could not run: what it would have found is not known
+    is_unchecked: bool = False
 
     def __str__(self) -> str:
         if self.model is not None:
@@ -88,14 +90,15 @@ def estimated(
     # the whole model holds standard deviations of A, and no covariances
     stated = options.carrier_noise
     is_asked = options.noise != "given" and options.noise_groups == "all"
-    why, failed = "a model of all noise was not asked for", False
+    # Who asks for other noise has chosen; the residuals are still compared with noise that is given.
+    why, failed, unchecked = "a model of all noise was not asked for", False, False
     if not problem.has_measurements:
         why = "the raw measurements were not kept"
     elif is_asked and (stated is None or stated.covariances is None):
         try:
             return _by_the_whole_model(problem, solution, how, options, inliers, progress)
         except CountError as error:
-            why = str(error)
+            why, unchecked = str(error), True
         except (np.linalg.LinAlgError, RuntimeError) as error:  # noises many orders apart, in LAPACK or in GTSAM
             why, failed = f"that of A and B together could not be computed ({error})", True
     try:
@@ -110,7 +113,7 @@ def estimated(
         else:
             raise
     counts = {pair: (int(mask.sum()), len(mask)) for pair, mask in inliers.items()}
-    noise = _noise_of(refined, options, None, why, has_failed=failed)
+    noise = replace(_noise_of(refined, options, None, why), has_failed=failed, is_unchecked=unchecked)
     return replace(refined, inliers=inliers, inlier_counts=counts), noise, inliers
 
 
@@ -149,9 +152,7 @@ def _by_the_whole_model(
     return refined, _noise_of(refined, options, noise_found), inliers
 
 
-def _noise_of(
-    refined: Refined, options: CalibrateOptions, model: NoiseInData | None, why: str = "", *, has_failed: bool = False
-) -> NoiseFound:
+def _noise_of(refined: Refined, options: CalibrateOptions, model: NoiseInData | None, why: str = "") -> NoiseFound:
     return NoiseFound(
         source="estimated from the residuals" if refined.noise_source == "estimated" else "as given",
         rotation_rad={pair: noise.rotation_rad for pair, noise in refined.noise.items()},
@@ -159,7 +160,6 @@ def _noise_of(
         carriers="as given" if options.carrier_noise is not None else "none, A counts as exact",
         model=model,
         simple=why,
-        has_failed=has_failed,
     )
 
 
@@ -207,6 +207,10 @@ def refined_under_its_noise(
             record.find(Ground.NOISE_OVERSTATED, words)
         _say_drift(run, noise.model)
         _say_systematic(run, noise.model)
+    # Of measurements that are too few to estimate any noise, the verdict says so.
+    if noise.is_unchecked and (refined.noise_source == "given" or spare >= SPARE_EQUATIONS):
+        words = "noise of A, drift and errors that vary with the configuration were not looked for"
+        record.find(Ground.NOT_CHECKED, f"{words}: {noise.simple}")
     return refined, noise, refined.solution, inliers
 
 
@@ -236,6 +240,8 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
         if run.options.drift == "none":
             record.choose(what, "none", run.says_so)
         elif model.drift_not_sought:
+            # No finding: few instants hardly drift. (Honest ones often have neighbours that are alike by chance, so a
+            # test of that would accuse them.)
             record.choose(what, "no model of it was tried", model.drift_not_sought)
         else:
             order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"

@@ -21,6 +21,7 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.robust_solution import NoiseScale, robust_solution
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import LONGEST_GAP_S
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -180,7 +181,7 @@ def gross_errors(problem: Problem) -> str:
     if sampled is None or sampled.count < FEWEST_ASKED:
         return ""
     fit = fitted(problem, sampled.as_read())
-    if fit is None:
+    if fit is None:  # a sample without an answer tells nothing; how large the residuals of all are is judged
         return ""
     ends = np.cumsum([len(rows) for rows in sampled.rows.values()])[:-1]
     errors = fit.errors / _stated(sampled)
@@ -252,6 +253,8 @@ SPARE_EQUATIONS = 24
 MOST_AGREE = 0.5
 #: From this share of outliers on, the verdict reports them.
 MANY = 0.3
+#: From this share on, of a stream with at least so many stamps: where so much is wrong, what is kept is in doubt too.
+MANY_OF_A_STREAM, LEAST_OF_A_STREAM = 0.15, 40
 #: With fewer measurements than `FEW`, a share of outliers above `MANY_OF_FEW` may mean that the stated noise is too
 #: small. It is, if the noise that the residuals show leaves no outlier.
 FEW, MANY_OF_FEW = 20, 0.25
@@ -281,12 +284,16 @@ def without_outliers(
             record.find(Ground.OUTLIERS_KEPT, gross)
     elif not problem.has_measurements:
         why = "the raw measurements were not kept"
+    if not problem.has_measurements:
+        lost = "outliers, mistakes of reading, late clocks, wrong sizes, noise of A and drift"
+        record.find(Ground.NOT_CHECKED, f"the raw measurements were not kept, so {lost} were not looked for")
     if why:
         record.choose(OUTLIERS, "every measurement counts", why)
         return first, {}
     if options.robust == "auto" and lacking > 0:
         why = f"{problem.number_of_measurements} measurements are too few to tell a wrong one from the others"
         record.choose(OUTLIERS, "not looked for", f"{why}; {lacking} more would do")
+        # No finding: what is wrong shows against a stated noise; where none is stated, the verdict asks for care.
         return first, {}
     offsets = clearly_off or offsets_of(problem, options)
     try:
@@ -391,7 +398,7 @@ def outliers_of(run: Run, inliers: Inliers, *, is_answered: bool) -> Outliers:
             run.record.find(Ground.NO_ANSWER, words)
     number = sum(len(mask) for mask in inliers.values())
     left_out = sum(int((~mask).sum()) for mask in inliers.values())
-    if left_out > MANY * number and not contradicted:
+    if left_out > (MANY_OF_A_STREAM if is_stream(run.problem) else MANY) * number and not contradicted:
         words = f"{left_out} of {number} measurements contradict the answer and were left out"
         run.record.find(Ground.MANY_OUTLIERS, words)
     if is_answered:
@@ -400,6 +407,16 @@ def outliers_of(run: Run, inliers: Inliers, *, is_answered: bool) -> Outliers:
             if name not in known:
                 run.record.find(Ground.FEW_MEASUREMENTS, few_words(name, number))
     return outliers
+
+
+def is_stream(problem: Problem) -> bool:
+    """Whether measurements follow one another on a clock, as a moving camera's do, and not from station to station."""
+    raw = [problem.measurements(*pair) for pair in problem.pairs] if problem.has_measurements else []
+    known = [one.stamps_ns for one in raw if one.stamps_ns is not None]
+    if not known or len(known) < len(raw):
+        return False
+    stamps_ns = np.unique(np.concatenate(known))
+    return len(stamps_ns) >= LEAST_OF_A_STREAM and float(np.median(np.diff(stamps_ns))) <= 1e9 * LONGEST_GAP_S
 
 
 def spare_equations(problem: Problem) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing, offsets_of, with_sizes_of
 from gtsam_rwhec.calibration.from_corners import CornersFound, with_estimated_intrinsics
 from gtsam_rwhec.calibration.outliers import refined_with_outliers
-from gtsam_rwhec.calibration.sizes import TargetSize, sizes_in
+from gtsam_rwhec.calibration.sizes import TargetSize, refined_by, sizes_in
 from gtsam_rwhec.errors import (
     CountError,
     NoiseError,
@@ -106,7 +106,7 @@ def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # the answer takes the stated sizes
             return tuple(sizes_in(refine(free, solve(free, options=run.options.solve), how)))
-    except RwhecError:
+    except RwhecError:  # harmless: the stated sizes are compared with the answer then
         return ()
 
 
@@ -134,14 +134,14 @@ def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled 
                     beside = () if run.recording is not None else asked
                     agree = refined_with_outliers(replace(run, problem=problem), solution, beside, noise)
                     solution, inliers = agree.solution, agree.inliers
-                refined = refine(agreeing(problem, inliers), solution, how, progress=run.tell)
+                refined = refined_by(agreeing(problem, inliers), solution, how, run.tell)
                 moved = refined.time_offsets_s
                 if path is None or max(map(abs, moved.values()), default=0.0) < SAME_S:
                     break
                 problem = paired_again(problem, path, moved)
                 total |= {name: total.get(name, 0.0) + more for name, more in moved.items()}
     except (CountError, NoiseError, OutlierError, ScaleError, UnderdeterminedError):
-        return None
+        return None  # the answer estimates the offsets itself, and stated sizes are compared with it
     return _Settled(problem, total, refined, inliers)
 
 

@@ -73,6 +73,8 @@ class TargetSize:
     target: str  #: The target; or a sensor, for the lengths of its own motions
     scale: float  #: Lengths in B over true lengths: the stated over the true size
     sigma: float | None  #: Standard deviation of the scale; None where the motion does not determine it
+    #: Whether no test of it could run: it looked wrong and hangs on single blocks of rows, or no answer has it
+    is_untested: bool = False
 
     @property
     def is_doubted(self) -> bool:
@@ -140,8 +142,8 @@ def sizes(
     Returns
     -------
     tuple of TargetSize
-        One for each target. Empty where the scale is not said to be known, the measurements were not kept, or no sizes
-        can be found: then the motion says nothing about them.
+        One for each target; ``is_untested`` where the measurements are too few. Empty where the scale is not said to be
+        known, the measurements were not kept, or no positive sizes fit: then the motion says nothing about them.
     """
     check_progress(progress)
     if not isinstance(problem, Problem):
@@ -163,13 +165,29 @@ def sizes(
             assert isinstance(start.scale, dict)
             if not all(1.0 / LARGEST < scale < LARGEST for scale in start.scale.values()):
                 return ()  # the lengths of B tell nothing, or they are those of another unit: that is a misreading
-            refined = refine(free, start, options or RefineOptions(noise="estimate"))
-        except (ScaleError, CountError, NoiseError, UnderdeterminedError):
-            return ()
+            refined = refined_by(free, start, options or RefineOptions(noise="estimate"))
+        except ScaleError:
+            return ()  # as where the motion leaves sizes free: by chance they are then positive or not
+        except (CountError, NoiseError, UnderdeterminedError):
+            return tuple(
+                TargetSize(name, 1.0, None, is_untested=True) for name in {pair.target: 0 for pair in free.pairs}
+            )
         found = sizes_in(refined)
         if any(size.is_doubted or size.is_uncertain for size in found):
             found = _under_all_noise(free, start, options, like, progress or silent) or _with_jackknife(free, found)
     return tuple(found)
+
+
+def refined_by(
+    problem: Problem, start: Solution | None, options: RefineOptions, progress: Progress | None = None
+) -> Refined:
+    """The refinement by these options; without the noise that was stated for A where the residuals hold no such."""
+    try:
+        return refine(problem, start, options, progress=progress)
+    except NoiseError:
+        if options.carrier_noise is None:
+            raise
+        return refine(problem, start, replace(options, carrier_noise=None), progress=progress)
 
 
 def _under_all_noise(
@@ -186,7 +204,7 @@ def _under_all_noise(
         kinds = NoiseOptions(drift=walk or "none", side=like.hand, systematic=like.arms_assumed)
     try:
         refined, noise = refine_under_noise(free, start, options, kinds, progress=progress)
-    except (CountError, np.linalg.LinAlgError, RuntimeError):
+    except (CountError, np.linalg.LinAlgError, RuntimeError):  # harmless: the jackknife tests them
         return []
     # where drift is untried, errors of neighbours in time are alike, and the deviations do not know it
     return [] if noise.is_drift_untried else sizes_in(refined)
@@ -212,7 +230,9 @@ def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:
         try:
             scale = solve(selected(free, {pair: of != block for pair, of in numbers.items()})).scale
         except (ScaleError, CountError, UnderdeterminedError):
-            return [replace(size, sigma=None) for size in found]  # the sizes hang on single blocks
+            return [  # the sizes hang on single blocks
+                replace(size, sigma=None, is_untested=size.is_doubted or size.is_uncertain) for size in found
+            ]
         assert isinstance(scale, dict)
         for name in scales.keys() & scale.keys():
             scales[name].append(scale[name])
@@ -221,7 +241,9 @@ def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:
     }
     known = [size.sigma is not None and size.target in sigmas for size in found]
     return [
-        replace(size, sigma=max(size.sigma or 0.0, sigmas[size.target]) if is_known else None)
+        replace(size, sigma=max(size.sigma or 0.0, sigmas[size.target]))
+        if is_known
+        else replace(size, sigma=None, is_untested=size.is_doubted or size.is_uncertain)
         for size, is_known in zip(found, known, strict=True)
     ]
 

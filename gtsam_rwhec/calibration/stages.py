@@ -183,7 +183,7 @@ def calibrate(
     run.tell("computing the poses of targets again, with intrinsics that the images tell")
     try:
         again = _calibrated(by_told_intrinsics(run, recording.far_off))
-    except RwhecError:  # no pose by these: what the stated ones gave is judged
+    except RwhecError:  # no pose by these: what the stated ones gave is judged, and not to be used (far off)
         return found
     return again if again.refined is not None and again.refined.intrinsics else found
 
@@ -200,7 +200,7 @@ def _check_what_needs_measurements(problem: Problem, options: CalibrateOptions) 
 def _calibrated(run: Run) -> Calibration:
     """All stages, one after the other, and their verdict."""
     found_sizes: tuple[TargetSize, ...] = ()
-    by_corners = None
+    by_corners, are_checked = None, False
     with run.record.noted():
         reading = misread_as_recorded(run)
         late = () if run.recording is None else run.recording.late
@@ -220,8 +220,11 @@ def _calibrated(run: Run) -> Calibration:
         if found.refined is not None:
             doubt_stated_poses(run, found.refined, found.inliers)
             doubt_one_pose(run, found.refined, found.inliers)
-            found_sizes = found_sizes or doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
+            if not found_sizes:
+                found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
+                are_checked = run.problem.scale == "known"
             found = answered_by_corners(run, found, thin, by_corners)
+            _doubt_untested_corners(run, found)
     problem, record = run.problem, run.record
     lengths = ""
     if found.solution is not None and not reading.misreadings:
@@ -239,7 +242,8 @@ def _calibrated(run: Run) -> Calibration:
     if refined is not None:  # with offsets from the given stamps, including those that A was already corrected by
         offsets = {name: run.moved_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
         refined = replace(refined, time_offsets_s=offsets)
-        say_estimated_sizes(run, found_sizes, refined)
+        if not are_checked:
+            say_estimated_sizes(run, found_sizes, refined)
     if solution is None:
         record.find(Ground.NO_SCALE, why)
     is_determined = refined is not None and not refined.free_directions
@@ -278,6 +282,14 @@ def _calibrated(run: Run) -> Calibration:
         options=run.options,
         problem=problem,
     )
+
+
+def _doubt_untested_corners(run: Run, found: Answer) -> None:
+    """Record a finding where no image could be left out of a refinement from corners, to see how it is predicted."""
+    numbers = None if found.refined is None else found.refined.reprojection
+    if numbers is not None and all(one.held_out_px is None for one in numbers.sensors.values()):
+        words = "systematic errors of the arm or of the targets were not looked for in images that are left out"
+        run.record.find(Ground.NOT_CHECKED, f"{words}: there are too few images to leave some out")
 
 
 def _solved(run: Run) -> tuple[Solution | None, str]:

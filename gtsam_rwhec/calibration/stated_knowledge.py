@@ -122,6 +122,7 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     options = replace(run.options, time_offsets=tuple(refined.time_offsets_s))
     has_outliers = any(not mask.all() for mask in inliers.values())
     found: list[StatedPose] = []
+    untold = ""
     without = _without(run.problem, {})
     for is_last in (False, True):
         try:
@@ -136,6 +137,8 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
                 free[name] = priors
             else:
                 found += [one for prior in priors if (one := _compared(name, prior, alone)) is not None]
+        if is_last and alone is None:
+            untold = ", ".join(stated)
         if is_last or not free:
             break
         stated = free
@@ -143,6 +146,12 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     for one in found:
         off = Ground.COVARIANCE_DOUBTED if one.is_small else Ground.POSE_DOUBTED
         run.record.find(off if one.is_surely_off else Ground.POSE_UNCERTAIN, str(one))
+    if untold:
+        words = f"the stated poses of {untold} could not be compared with the measurements, which give none alone"
+        run.record.find(Ground.NOT_CHECKED, words)
+    if untold and not found:
+        run.record.choose("stated poses", "as stated", "the measurements alone give no answer to compare them with")
+        return
     chosen, do = ("as stated, and doubted", "") if found else ("as stated", "do not ")
     run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")
 
@@ -174,9 +183,12 @@ def _moved(run: Run, at: Mapping[Pair, AtStations], measured: Mapping[Pair, Meas
 def doubt_stated_sizes(
     run: Run, refined: Refined, inliers: Inliers, like: NoiseInData | None
 ) -> tuple[TargetSize, ...]:
-    """Estimate the sizes that were stated as known; record findings for those that the motion contradicts."""
+    """Estimate the sizes that were stated as known; record findings for those that the motion contradicts.
+
+    Where sizes were to be corrected, none could be estimated before: then they are checked here.
+    """
     problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
-    if problem.scale != "known" or options.sizes in ("correct", "estimate"):
+    if problem.scale != "known" or options.sizes == "estimate":
         return ()
     if options.sizes == "known":
         record.choose(what, "as stated", run.says_so)
@@ -186,6 +198,10 @@ def doubt_stated_sizes(
     kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
     found = sizes(agreeing(problem, kept), how, like=like, progress=run.tell)
     doubted = [size for size in found if size.is_doubted]
+    untested = ", ".join(size.target for size in found if size.is_untested)
+    if untested:
+        words = f"the stated size of {untested} could not be compared with the motion: it hangs on few measurements"
+        record.find(Ground.NOT_CHECKED, words)
     together = common_factor(found)
     uncertain = [size for size in found if size.is_uncertain]
     if together:

@@ -107,6 +107,8 @@ class Ground(StrEnum):
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
     SYSTEMATIC = "systematic"
+    #: A check that could have found trouble could not run, so nothing is known of that trouble.
+    NOT_CHECKED = "not_checked"
     #: Every measurement counts, as an option says, and some of them look wrong.
     OUTLIERS_KEPT = "outliers_kept"
     #: So many measurements were left out that A and B may not belong together.
@@ -136,7 +138,9 @@ def _rank(ground: Ground) -> int:
 _MISREAD = frozenset({Ground.MISREAD, Ground.IMPLAUSIBLE})
 #: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
 _MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
-_NOT_DETERMINED = frozenset({Ground.NOT_UNIQUE, Ground.NO_COVARIANCE})
+_NOT_DETERMINED = frozenset({Ground.NOT_UNIQUE, Ground.NO_COVARIANCE, Ground.NOT_CHECKED})
+#: What cannot be checked of an answer that is none, or is not to be used, is no question.
+_UNASKED = frozenset({Ground.NO_COVARIANCE, Ground.NOT_CHECKED})
 _OF_SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED, Ground.SIZE_UNCERTAIN})
 #: What each ground makes too, which is then no fact of its own beside it.
 _MADE_BY = {
@@ -151,7 +155,8 @@ _MADE_BY = {
     # Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
     Ground.INTRINSICS_DOUBTED: _MADE_BY_A_MISTAKE | _NOT_DETERMINED | _OF_SIZES,
     # How well poses are known that are not determined is no question.
-    Ground.NOT_UNIQUE: frozenset({Ground.NO_COVARIANCE}),
+    Ground.NOT_UNIQUE: _UNASKED,
+    **dict.fromkeys((Ground.NO_SCALE, Ground.NO_COVARIANCE), frozenset({Ground.NOT_CHECKED})),
 }
 _CALIBRATE_INTRINSICS = (
     "calibrate the intrinsics of the named sensor with its distortion (cv2.calibrateCamera, Kalibr, ROS's "
@@ -233,6 +238,10 @@ _ADVICE = {
     ),
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
+    Ground.NOT_CHECKED: (
+        "measure so that the named check can run (more measurements, kept with the problem, and poses of the carriers "
+        "without gaps), or check the poses in another way before you rely on them"
+    ),
     Ground.MANY_OUTLIERS: (
         "look at what was left out, and check that each B belongs to its A (order, stamps, names of files)"
     ),

@@ -313,7 +313,7 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeD
                 continue
             weight = 1.0 / np.einsum("nii->i", item.covariance).reshape(2, 3).mean(axis=1) * item.count
             squares += weight * (item.paths.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
-            variance = item.count * item.paths.velocity_variance.reshape(2, 3).sum(axis=1)
+            variance = item.paths.known.sum() * item.paths.velocity_variance.reshape(2, 3).sum(axis=1)
             if item.carrier is not None:
                 stated = np.einsum("nii->i", item.carrier).reshape(2, 3).sum(axis=1) / item.count
                 variance = np.maximum(variance, item.paths.leverage.sum() * stated)

@@ -101,7 +101,7 @@ def local_paths(
     Raises
     ------
     CountError
-        If measurements have no stamps, or their poses do not determine a motion.
+        If measurements have no stamps, or their poses determine no motion at most of them.
     OptionError
         If a sensor has motions of its own.
     """

@@ -268,20 +268,24 @@ POSES_AT_ONCE = 200_000
 LONGEST_GAP_S = 1.0
 #: Entries (rad and m) of two poses of one stamp and one carrier may differ by this much.
 SAME_POSE = 1e-6
+#: Where a larger share of the stamps has no velocity, no offset is estimated: these measurements would not follow it.
+MOST_WITHOUT_VELOCITY = 0.5
 
 
 @dataclass(frozen=True)
 class LocalPaths:
     """The motion about each of N stamps.
 
-    Where poses are too few to scatter, ``velocity_variance`` comes from how well their neighbours predict them: between
-    stations nothing is known of the path.
+    About a stamp beside a gap no velocity is known. It is zero there: the measurement counts without a term of its
+    clock. Where poses are too few to scatter, ``velocity_variance`` comes from how well their neighbours predict them:
+    between stations nothing is known of the path.
     """
 
     coefficients: Array  #: (N, 3, 6): c_1 (rad/s, m/s), c_2, c_3
     leverage: Array  #: (N,): variance of c_1 over the variance of a pose's noise, 1/s^2
     scatter: Array  #: (6,): variance of the poses about the cubics, rad^2 and m^2
     velocity_variance: Array  #: (6,): mean square error of c_1
+    known: np.ndarray  #: (N,): whether the motion is known
 
     def motion(self, offset_s: float) -> Array:
         """Expmap(c_1 d + c_2 d^2 + c_3 d^3), (N, 4, 4); d is limited to the window of the fit."""
@@ -297,14 +301,16 @@ class LocalPaths:
 
     def selected(self, mask: np.ndarray) -> LocalPaths:
         """The motion about the stamps that a mask or an index array selects."""
-        return LocalPaths(self.coefficients[mask], self.leverage[mask], self.scatter, self.velocity_variance)
+        return LocalPaths(
+            self.coefficients[mask], self.leverage[mask], self.scatter, self.velocity_variance, self.known[mask]
+        )
 
     @staticmethod
     def of(A: Array, stamps_ns: np.ndarray, where: str) -> LocalPaths:
         """The motion about the stamps of measured poses A (N, 4, 4) in any order, fitted to the poses themselves.
 
-        A CountError says that there are fewer than two stamps, two poses at one stamp, or a pose without a neighbour
-        within a second.
+        A CountError says that there are fewer than two stamps, two poses at one stamp, or that most poses have no
+        neighbour within a second.
         """
         stamps, first, place = np.unique(stamps_ns, return_index=True, return_inverse=True)
         poses = A[first]
@@ -317,13 +323,14 @@ class LocalPaths:
         if len(stamps) < 2:
             raise CountError(f"{where}: a time offset needs at least two stamps; there is {len(stamps)}")
         low, high = _neighbours((stamps - stamps[0]) * 1e-9)
-        if (high - low < 2).any():
+        known = high - low >= 2
+        if np.mean(~known) > MOST_WITHOUT_VELOCITY:
             raise CountError(
-                f"{where}: the measurement at {stamps[np.argmin(high - low)]} ns has no other measurement within "
-                f"{LONGEST_GAP_S:g} s, so the carrier's velocity there is unknown. Leave it out, or estimate no time "
-                "offset for its sensor"
+                f"{where}: the measurement at {stamps[np.argmin(high - low)]} ns and {int((~known).sum()) - 1} others "
+                f"of {len(stamps)} have no other measurement within {LONGEST_GAP_S:g} s, so the carrier's velocity "
+                "there is unknown. Leave them out, or estimate no time offset for their sensor"
             )
-        found = _cubics_at_stamps(poses, stamps, Trajectory(stamps, poses, where), low, high, place)
+        found = _cubics_at_stamps(poses, stamps, Trajectory(stamps, poses, where), low, high, known, place)
         unknown = _unpredicted(poses, (stamps - stamps[0]) * 1e-9, found.leverage[first])
         return replace(found, velocity_variance=np.maximum(found.velocity_variance, unknown))
 
@@ -331,7 +338,7 @@ class LocalPaths:
     def along(path: Trajectory, stamps_ns: np.ndarray) -> LocalPaths:
         """The motion about the stamps, fitted to a path that was logged faster than the measurements were made.
 
-        A CountError says that the path has fewer than four poses within half a second of a stamp.
+        A CountError says that the path has fewer than four poses within half a second of most stamps.
         """
         stamps, place = np.unique(stamps_ns, return_inverse=True)
         poses, _ = path.at(stamps)
@@ -340,32 +347,44 @@ class LocalPaths:
         window_ns = round(WINDOW_S * 1e9)
         low = np.maximum(first, np.searchsorted(path.stamps_ns, stamps - window_ns))
         high = np.minimum(first + NEAREST, np.searchsorted(path.stamps_ns, stamps + window_ns, side="right"))
-        if (high - low < 4).any():
+        known = high - low >= 4
+        if np.mean(~known) > MOST_WITHOUT_VELOCITY:
             i = int(np.argmin(high - low))
             raise CountError(
                 f"{path.where}: only {max(high[i] - low[i], 0)} poses are within {WINDOW_S:g} s of the measurement at "
-                f"{stamps[i]} ns; a time offset needs at least four, for the carrier's velocity. Log the poses faster"
+                f"{stamps[i]} ns, and few of {int((~known).sum()) - 1} others of {len(stamps)}; a time offset needs at "
+                "least four, for the carrier's velocity. Log the poses faster"
             )
-        return _cubics_at_stamps(poses, stamps, path, low, high, place)
+        return _cubics_at_stamps(poses, stamps, path, low, high, known, place)
 
 
 def _cubics_at_stamps(
-    poses: Array, stamps_ns: np.ndarray, path: Trajectory, low: np.ndarray, high: np.ndarray, place: np.ndarray
+    poses: Array,
+    stamps_ns: np.ndarray,
+    path: Trajectory,
+    low: np.ndarray,
+    high: np.ndarray,
+    known: np.ndarray,
+    place: np.ndarray,
 ) -> LocalPaths:
-    """The cubics about ``poses`` at ``stamps_ns``, each fitted to ``path[low:high]``; ``place`` repeats them."""
+    """The cubics about ``poses`` at ``stamps_ns``, each fitted to ``path[low:high]``; ``place`` repeats them.
+
+    Those that are not ``known`` are zero, and say nothing of the scatter.
+    """
     # With enough poses the fit has a constant term, because the pose at the stamp is noisy too.
     fit = _cubics(
         path,
         poses,
         stamps_ns,
         low,
-        high,
+        np.where(known, high, low),
         WINDOW_S,
         lambda count: (np.arange(4) >= np.where(count > 2, 0, 1)) & (np.arange(4) < count),
     )
     scatter = fit.squares / max(fit.degrees_of_freedom, 1.0)
     leverage = fit.leverage[place]
-    return LocalPaths(fit.coefficients[place, 1:], leverage, scatter, leverage.mean() * scatter)
+    mean = fit.leverage[place][known[place]].mean()
+    return LocalPaths(fit.coefficients[place, 1:], leverage, scatter, mean * scatter, known[place])
 
 
 def _unpredicted(poses: Array, seconds: Array, leverage: Array) -> Array:

@@ -56,7 +56,8 @@ def judge(
             for one in log.contradicted
         ]
         used_of, all_of = np.array([*log.agreement.values(), (0, 0)]).sum(axis=0).tolist()
-        if not log.contradicted and all_of - used_of > MANY * all_of:
+        is_said = any(one.ground is Ground.MANY_OUTLIERS for one in findings)  # of a stream, from fewer on
+        if not is_said and not log.contradicted and all_of - used_of > MANY * all_of:
             words = f"{all_of - used_of} of {all_of} measurements contradict the answer and were left out"
             found.append(Finding(Ground.MANY_OUTLIERS, words))
         used = {count.sensor for count in log.outliers if count.used}

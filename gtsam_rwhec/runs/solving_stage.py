@@ -60,7 +60,7 @@ from gtsam_rwhec.solver.solution import Solution, solve
 #: Findings of ``calibrate`` that this stage words anew, with the lines of the rig file and the images.
 SAID_BY_THE_LOG = frozenset({
     Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS, Ground.SIZE_DOUBTED, Ground.SIZE_UNCERTAIN, Ground.SIZE_ESTIMATED,
-    Ground.NO_SIZE_FITS, Ground.MANY_OUTLIERS,
+    Ground.NO_SIZE_FITS,
 })  # fmt: skip
 #: The option of ``calibrate`` for each value of ``sizes`` in the rig file.
 SIZES: dict[str, SizesChoice] = {"known": "check", "check": "correct", "estimate": "estimate"}
@@ -209,8 +209,8 @@ def solve_log(log: Log | str | Path, rig: Rig | None = None, *, progress: Progre
 
 def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
     rig, offsets_s = log.rig, log.cleaning.time_offsets_s
-    pairs = with_comparable_noise(log.pairs, rig, log.motion, offsets_s, progress or silent)
-    problem, against = log.problem_of(pairs), []
+    pairs, against = with_comparable_noise(log.pairs, rig, log.motion, offsets_s, progress or silent)
+    problem = log.problem_of(pairs)
     try:
         problem = log.corners.in_problem(problem, pairs, log.cameras)
     except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt
@@ -251,17 +251,18 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
 
 def with_comparable_noise(
     pairs: Pairs, rig: Rig, motion: CarrierMotion, offsets_s: Mapping[str, float], tell: Progress
-) -> Pairs:
-    """The pairs, with covariances of the targets' poses that fit their residuals with the targets alone.
+) -> tuple[Pairs, list[Finding]]:
+    """The pairs, with covariances of the targets' poses that fit their residuals with the targets alone; findings.
 
     One variance factor is estimated for targets and motions together, so the ratios of their covariances must be right.
 
     The pairs are unchanged if the rig file states the noise, if there is no odometry or no target, or if a calibration
-    with the targets alone fails.
+    with the targets alone fails: that is a finding, since all measurements together may have an answer, under weights
+    that are guessed.
     """
     targets = {pair: one for pair, one in pairs.items() if not pair.is_motion and one.used.any()}
     if rig.noise != "estimate" or not targets or not any(pair.is_motion for pair in pairs):
-        return pairs
+        return pairs, []
     tell("finding the noise of the targets' poses")
     problem = problem_of(targets, rig, offsets_s)
     options = RefineOptions(
@@ -271,9 +272,12 @@ def with_comparable_noise(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)
             noise = refine(problem, solve(problem), options, progress=tell).noise
-    except RwhecError:
-        return pairs  # all measurements together may have an answer, under weights that are guessed
-    return pairs | {pair: _with_noise(one, noise[pair]) for pair, one in targets.items() if pair in noise}
+    except RwhecError as error:
+        words = (
+            "the noise of the targets' poses beside that of the motions is guessed, since the targets alone have no "
+        )
+        return pairs, [Finding(Ground.NOT_CHECKED, f"{words}answer: {error}")]
+    return pairs | {pair: _with_noise(one, noise[pair]) for pair, one in targets.items() if pair in noise}, []
 
 
 def _with_noise(measured: MeasuredPairs, noise: PairNoise) -> MeasuredPairs:

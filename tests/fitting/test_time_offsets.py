@@ -191,7 +191,7 @@ def test_time_offsets_with_motions_are_refused() -> None:
         (
             {"stamps_ns": np.arange(20) * 5 * 10**9},
             rw.errors.CountError,
-            "measurement at 0 ns has no other measurement within 1 s",
+            "measurement at 0 ns and 19 others of 20 have no other measurement within 1 s",
         ),
     ],
 )

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.verdict import Ground, Verdict
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Verdict
 from gtsam_rwhec.results.log_history import LogFields, SizeFields
 from gtsam_rwhec.results.result_file import Result, read_result
 from gtsam_rwhec.results.result_judgement import judge
@@ -93,3 +93,15 @@ def test_the_worst_ground_decides_and_all_are_said(result: Result) -> None:
     assert judgement.verdict is Verdict.DO_NOT_USE
     assert judgement.grounds == (Ground.NOT_CERTIFIED, Ground.CONTRADICTED, Ground.SIZE_DOUBTED)
     assert "tag_7" in judgement.reason
+
+
+def test_outliers_of_a_stream_are_said_once(result: Result) -> None:
+    """``calibrate`` speaks of a stream from 15 % on, and the file's counts speak from 30 % on."""
+    assert result.log is not None
+    counts = [count.model_copy(update={"used": 6, "left_out": 4}) for count in result.log.outliers]
+    log = changed(result.log, outliers=tuple(counts))
+    said = [Finding(Ground.MANY_OUTLIERS, "4 of 10 contradict the answer")]
+    for findings in ([], said):
+        judgement = judge(result.solution, result.refined, log, findings)
+        assert judgement.grounds == (Ground.MANY_OUTLIERS,)
+        assert judgement.reason.count("contradict the answer") == 1

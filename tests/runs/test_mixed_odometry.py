@@ -97,6 +97,17 @@ def test_cameras_and_odometries_are_one_problem(tmp_path: Path) -> None:
     assert pairs[Pair("vo", "vo")].count == count
 
 
+def test_targets_that_alone_have_no_answer_are_said(tmp_path: Path) -> None:
+    """Their weights beside the motions' are then guessed."""
+    seen = [one for one in messages() if one.topic == "/cam_0/tags"]
+    one_tag = [replace(one, content={**one.content, "detections": one.content["detections"][:1]}) for one in seen[:2]]
+    few = [*(one for one in messages() if one.topic != "/cam_0/tags"), *one_tag]
+    solved = made.solved(tmp_path, few, RIG)
+    words = [one.words for one in solved.calibration.findings if one.ground is rw.Ground.NOT_CHECKED]
+    assert any(one.startswith("the noise of the targets' poses beside that of the motions is guessed") for one in words)
+    assert solved.judgement.verdict is not rw.Verdict.USE
+
+
 #: Here an odometry jumps by 5 m.
 MIDDLE_NS = made.BEGIN_NS + 5_000_000_000
 
