@@ -19,13 +19,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 #: What the sources may weigh. Lower a number when they become lighter; raise it only with a reason in the commit.
 BUDGET = {
-    # the simplest camera, bent boards and biases of detectors: 700 lines
-    "lines": 83_100,
-    "code": 51_600,
-    "files": 366,
+    # the simplest camera, bent boards, biases of detectors, errors that images share: 950 lines; checks that
+    # could not run: 160
+    "lines": 83_350,
+    "code": 51_750,
+    "files": 368,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 63_850,
+    "lines of tests and benchmarks": 64_450,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

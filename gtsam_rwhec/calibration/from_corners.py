@@ -140,7 +140,8 @@ def corners_found(
         )
         return CornersFound.none(f"the corners give none: {error}", Finding(Ground.CORNERS_DOUBTED, words))
     except RwhecError as error:
-        return CornersFound.none(f"the corners give none: {error}")
+        words = f"intrinsics, and errors that images share, were not looked for in the corners: {error}"
+        return CornersFound.none(f"the corners give none: {error}", Finding(Ground.NOT_CHECKED, words))
     if is_doubtful(corners):
         px, words = corners.noise.corner_px, " ".join(corners.findings)
         # The poses are of the same corners; noise of A alone is no finding, since the poses' noise model contains it.

@@ -115,6 +115,17 @@ def test_k1_and_k2_go_against_each_other() -> None:
     assert alone.opposed == ()
 
 
+def test_noise_of_the_carriers_is_not_taken_for_that_of_corners_by_chance() -> None:
+    """Corners that go together with A's noise would count one by one: deviations ten times too small."""
+    for seed in range(5):
+        given = cell(seed, images=20, cameras=1, carrier=(4e-4, 1e-4), corner_px=0.02)
+        tried = chosen_model(given.observations, given.X, given.Y, rw.CornerOptions(), silent)
+        assert tried.options.carrier_noise == "estimate"
+        exact = rw.CornerOptions(carrier_noise="exact")
+        widened = chosen_model(given.observations, given.X, given.Y, exact, silent).wider["y", "cam_0"]
+        assert widened > 2.0
+
+
 @pytest.mark.parametrize("seed", [1, 2, 5])
 def test_what_the_simplest_lens_lacks_is_in_the_covariance(seed: int) -> None:
     """p1 and p2 that images hardly tell are left out, and how far they would move the camera is counted."""
