@@ -54,7 +54,9 @@ def fixed_models(cell: cells.Cell, log: Path) -> dict[str, float]:
     refined, problem = solved.refined, solved.problem
     observations = observations_of(problem)
     warp = refined.reprojection is not None and any(len(b.names) for b in refined.reprojection.boards.values())
-    base = rw.CornerOptions(warp_m=1e-3 if warp else 0.0, stated={n: solved.rig.stated_of(n) for n in problem.sensors})
+    stated = solved.calibration.options.corners
+    assert stated is not None
+    base = replace(stated, warp_m=1e-3 if warp else 0.0)
     tried: dict[str, rw.CornerOptions] = {}
     if cell.drawn["stated"] != "missing":
         tried["as stated"] = replace(base, stated="exact")
