@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import CountError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, spread_of, with_widest
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
@@ -116,7 +116,7 @@ def chosen_model(
 
     try:
         every = [scored(options)]
-    except CountError as error:
+    except (CountError, UnderdeterminedError) as error:
         return Tried(options, in_words(options), f"no other was tried: {error}", (), {}, cameras, images)
     if options.carrier_noise != "exact":
         every.append(scored(replace(options, carrier_noise="exact")))
@@ -129,6 +129,7 @@ def chosen_model(
     evidence = f"it predicts images that were left out to {score.px:.3g} px, and {score.mm:.3g} mm on the target"
     for _, _, other, _ in every[1:]:
         size = f"{other.mm:.3g} mm" if np.isfinite(other.mm) else "a target behind its camera"
+        size += ", nearer by no more than chance," if other.mm < score.mm else ""
         evidence += f" ({size} with {other.words})"
     return Tried(chosen, score.words, evidence, tuple(one for _, _, one, _ in every), found, cameras, images)
 

@@ -35,7 +35,7 @@ from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.fit_options import CornerOptions, FreeLens
 from gtsam_rwhec.fitting.held_out import blocks_of
 from gtsam_rwhec.fitting.observations import Observations
-from gtsam_rwhec.fitting.stated_intrinsics import is_free, prior_of
+from gtsam_rwhec.fitting.stated_intrinsics import PINHOLE, is_free, prior_of
 from gtsam_rwhec.geometry.poses import Array
 
 #: Blocks of time and of configurations, and columns and rows of the image's regions.
@@ -162,6 +162,14 @@ def chosen_cameras(
         choice.boards()
     if len(blocks) > 1 and options.lens == "all":
         choice.cameras()
+    if len(blocks) <= 1:  # no image can be left out: nothing is free that nothing asks for
+        choice.options = replace(choice.options, warp_m=options.warp_m)
+        if options.lens == "all":
+            assert isinstance(widest.lens, Mapping)
+            least: dict[str, FreeLens] = {
+                name: "k1" if options.stated_of(name) == "unknown" else "focal" for name in widest.lens
+            }
+            choice.options = replace(choice.options, lens=least)
     model = LinearModel.of(refined, observations.cameras, choice.options)
     return ChosenCameras(choice.options, tuple(choice.tried), blocks.spread(model), tuple(choice.rivals))
 
@@ -197,14 +205,23 @@ class Choosing:
         for names in alike({name: self.stated[name] for name in alone}, self.options):
             levels = _levels(self.blocks.refined, names)
             every = [(lens, is_shared) for lens in levels for is_shared in (True, False)]
-            rivals = [(WORDS[lens], self._with(names, lens, is_shared)) for lens, is_shared in every]
+            rivals = [(self._words(names, lens), self._with(names, lens, is_shared)) for lens, is_shared in every]
             chosen = self._simplest(f"camera model of {', '.join(names)}", rivals)
             if chosen.shared != self.options.shared:
                 self.options = chosen
                 alone = [name for name in alone if name not in names]
         for name in alone:
-            rivals = [(WORDS[lens], self._with((name,), lens, False)) for lens in _levels(self.blocks.refined, (name,))]
+            levels = _levels(self.blocks.refined, (name,))
+            rivals = [(self._words((name,), lens), self._with((name,), lens, False)) for lens in levels]
             self.options = self._simplest(f"camera model of {name}", rivals)
+
+    def _words(self, names: Sequence[str], lens: FreeLens) -> str:
+        """What is free of a camera, by the names that its lens model has."""
+        camera = self.blocks.refined.intrinsics[names[0]].camera
+        if lens in ("focal", "focals", "all") or camera.model in ("pinhole", "radtan"):
+            return WORDS[lens]
+        free = [name for name, is_it in zip(camera.parameter_names, is_free(camera, lens), strict=True) if is_it]
+        return f"with {', '.join(free[PINHOLE:])}"
 
     def _with(self, names: tuple[str, ...], lens: FreeLens, is_shared: bool) -> CornerOptions:
         assert isinstance(self.options.lens, Mapping)

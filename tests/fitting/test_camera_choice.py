@@ -115,6 +115,23 @@ def test_k1_and_k2_go_against_each_other() -> None:
     assert alone.opposed == ()
 
 
+def test_from_images_that_are_too_few_to_leave_some_out_nothing_more_is_free() -> None:
+    given = cell(3, images=4, cameras=1, camera=PINHOLE, stated_off=OFF)
+    _, chosen = wide_and_chosen(given, rw.CornerOptions())
+    assert chosen.options.lens_of("cam_0") == "focal"
+    assert chosen.options.warp_m_of("board") == 0.0
+    _, unknown = wide_and_chosen(given, rw.CornerOptions(stated="unknown"))
+    assert unknown.options.lens_of("cam_0") == "k1"
+
+
+def test_models_of_a_fisheye_have_the_names_of_its_coefficients() -> None:
+    fisheye = Camera.of(1920, 1080, "equidistant", PINHOLE.K, [0.02, -0.01, 0.0, 0.0], "a camera")
+    _, chosen = wide_and_chosen(cell(3, images=40, cameras=1, camera=fisheye), rw.CornerOptions())
+    words = {one.words for one in chosen.tried if one.what == "camera model of cam_0"}
+    assert "with k1, k2" in words
+    assert not any("p1" in each or "rational" in each for each in words)
+
+
 def test_noise_of_the_carriers_is_not_taken_for_that_of_corners_by_chance() -> None:
     """Corners that go together with A's noise would count one by one: deviations ten times too small."""
     for seed in range(5):
