@@ -7,15 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.verdict import Choice
-from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.calibration.verdict import Choice, Finding, Ground
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.errors import CountError, RwhecError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.fitting.camera_choice import ChosenCameras, chosen_cameras, spread_of, with_widest
+from gtsam_rwhec.fitting.corner_findings import lens_that_was_left_out
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, CornerOptions
 from gtsam_rwhec.fitting.held_out import HeldOut, held_out_errors
 from gtsam_rwhec.fitting.observations import Observations, Views
+from gtsam_rwhec.fitting.reprojection_record import Intrinsics
 from gtsam_rwhec.geometry.poses import Array, PoseLike
 
 #: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case.
@@ -203,3 +206,63 @@ def growth_by_intrinsics(corners: CornersRefined) -> dict[str, float]:
         known = np.diagonal(C)[e] - np.diagonal(by_k)
         found[name] = float(np.sqrt((np.diagonal(C)[e] / np.maximum(known, 1e-300)).max()))
     return found
+
+
+#: Intrinsics taken as exact, but wrong by more than this many standard deviations of a calibration, give wrong poses.
+SURE_SIGMAS = 5.0
+
+
+def findings_of(
+    observations: Observations, corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, Intrinsics]
+) -> Iterator[Finding]:
+    """What the corners say against stated intrinsics, and what no model explains."""
+    for name, one in intrinsics.items():
+        innovation = corners.intrinsics[name].innovation
+        if innovation.is_contradicted:
+            stated, found = _numbers(one.stated_camera), _numbers(one.camera)
+            words = (
+                f"the intrinsics of {name}, as stated ({stated}), do not fit its corners ({innovation.deviations:.2g} "
+                f"deviations off); the estimated ones ({found}) are used"
+            )
+            yield Finding(Ground.INTRINSICS_ESTIMATED, words)
+        lens = lens_that_was_left_out(corners, [name])
+        if lens and one.stated_as == "calibration":
+            words = f"the intrinsics of {name} are stated without distortion, and its corners show one: {lens}"
+            yield Finding(Ground.INTRINSICS_ESTIMATED, words)
+    times = tried.unexplained
+    if times > 1.0:
+        words = (
+            f"images that were left out are predicted to {tried.scores[0].mm:.2g} mm on the target, {times:.2g} times "
+            "as far off as the noise of corners and of A explains: the arm's poses, or the target, have systematic "
+            "errors, and the standard deviations are widened by as much, or as blocks of images disagree"
+        )
+        yield Finding(Ground.SYSTEMATIC, words)
+    yield from _against_exact(observations, corners, tried.options)
+
+
+def _against_exact(observations: Observations, corners: CornersRefined, options: CornerOptions) -> Iterator[Finding]:
+    """Findings where exact intrinsics would move far if they had a calibration's standard deviations."""
+    exact = [name for name in corners.Y if options.stated_of(options.camera_of(name)) == "exact"]
+    if not exact:
+        return
+    stated = {name: options.stated_of(name) for name in corners.Y}
+    stated |= {options.camera_of(name): "calibration" for name in exact}
+    try:
+        free = refine_corners(thinned(observations), corners.X, corners.Y, replace(options, stated=stated))
+    except RwhecError:  # images that do not determine intrinsics do not contradict them
+        return
+    for name in exact:
+        innovation = free.intrinsics[name].innovation
+        if innovation.is_contradicted:
+            is_sure = innovation.deviations > SURE_SIGMAS
+            words = (
+                f"the intrinsics of {name} are stated as exact ({_numbers(observations.cameras[name])}), and its "
+                f"corners contradict them ({innovation.deviations:.2g} deviations of a calibration off): they tell "
+                f"{_numbers(free.intrinsics[name].camera)}"
+            )
+            yield Finding(Ground.INTRINSICS_DOUBTED if is_sure else Ground.INTRINSICS_UNCERTAIN, words)
+
+
+def _numbers(camera: Camera) -> str:
+    K = np.rint(camera.K).astype(int)
+    return f"fx, fy = {K[0, 0]}, {K[1, 1]}; cx, cy = {K[0, 2]}, {K[1, 2]}"

@@ -20,6 +20,7 @@ from gtsam_rwhec.calibration.corner_models import (
     Tried,
     choices_of,
     chosen_model,
+    findings_of,
     growth_by_intrinsics,
     thinned,
 )
@@ -59,8 +60,6 @@ from gtsam_rwhec.solver.solution import solve
 MEASUREMENTS = "refinement"
 #: Prior standard deviation of an estimated size, relative.
 SIZE_SHARE = 0.2
-#: Intrinsics taken as exact, but wrong by more than this many standard deviations of a calibration, give wrong poses.
-SURE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,32 +162,10 @@ def corners_found(
         intrinsics,
         numbers_of(observations, corners, tried.options, tried.held_out, models),
         tuple(_corner_choices(observations, corners, tried, intrinsics, far_off)),
-        (*_corner_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
+        tuple(findings_of(observations, corners, tried, intrinsics)),
         {slot: factor for slot, factor in tried.wider.items() if slot in corners.slots},
         tried=tried,
     )
-
-
-def _against_exact(observations: Observations, corners: CornersRefined, options: CornerOptions) -> Iterator[Finding]:
-    """Findings where exact intrinsics would move far if they had a calibration's standard deviations."""
-    exact = [name for name in corners.Y if options.stated_of(options.camera_of(name)) == "exact"]
-    if not exact:
-        return
-    stated = {name: options.stated_of(name) for name in corners.Y}
-    stated |= {options.camera_of(name): "calibration" for name in exact}
-    try:
-        free = refine_corners(thinned(observations), corners.X, corners.Y, replace(options, stated=stated))
-    except RwhecError:  # images that do not determine intrinsics do not contradict them
-        return
-    for name in exact:
-        innovation = free.intrinsics[name].innovation
-        if innovation.is_contradicted:
-            is_sure = innovation.deviations > SURE_SIGMAS
-            words = (
-                f"the intrinsics of {name} count as exact, as an option says, and its corners contradict them "
-                f"({innovation.deviations:.2g} deviations of a calibration off)"
-            )
-            yield Finding(Ground.INTRINSICS_DOUBTED if is_sure else Ground.INTRINSICS_UNCERTAIN, words)
 
 
 def _corner_choices(
@@ -206,7 +183,7 @@ def _corner_choices(
     growth = growth_by_intrinsics(corners)
     for name, one in intrinsics.items():
         if one.stated_as == "exact":
-            yield Choice(f"intrinsics of {name}", "as stated, which count as exact", "an option says so")
+            yield Choice(f"intrinsics of {name}", "as stated, which count as exact", "it is said so")
             continue
         known = {
             "calibration": "a calibration states them, and may be off by as much as calibrations are",
@@ -229,31 +206,6 @@ def _corner_choices(
         if one.held_by_prior:
             found += f"; {', '.join(one.held_by_prior)} about as stated, since the images do not tell them"
         yield Choice(f"intrinsics of {name}", found, known)
-
-
-def _corner_findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, Intrinsics]) -> Iterator[Finding]:
-    for name, one in intrinsics.items():
-        innovation = corners.intrinsics[name].innovation
-        if innovation.is_contradicted:
-            before, after = (np.rint(camera.K).astype(int) for camera in (one.stated_camera, one.camera))
-            stated, found = (f"fx, fy = {K[0, 0]}, {K[1, 1]}; cx, cy = {K[0, 2]}, {K[1, 2]}" for K in (before, after))
-            words = (
-                f"the intrinsics of {name}, as stated ({stated}), do not fit its corners ({innovation.deviations:.2g} "
-                f"deviations off); the estimated ones ({found}) are used"
-            )
-            yield Finding(Ground.INTRINSICS_ESTIMATED, words)
-        lens = lens_that_was_left_out(corners, [name])
-        if lens and one.stated_as == "calibration":
-            words = f"the intrinsics of {name} are stated without distortion, and its corners show one: {lens}"
-            yield Finding(Ground.INTRINSICS_ESTIMATED, words)
-    times = tried.unexplained
-    if times > 1.0:
-        words = (
-            f"images that were left out are predicted to {tried.scores[0].mm:.2g} mm on the target, {times:.2g} times "
-            "as far off as the noise of corners and of A explains: the arm's poses, or the target, have systematic "
-            "errors, and the standard deviations are widened by as much, or as blocks of images disagree"
-        )
-        yield Finding(Ground.SYSTEMATIC, words)
 
 
 #: Target poses are computed again at most so many times.

@@ -24,6 +24,11 @@ class CommonErrors:
     of_residual: Array
     P: Array
 
+    def first(self, number: int) -> CommonErrors:
+        """Those of the first patterns."""
+        of_unknowns, of_A, of_residual = (each[:, :number] for each in (self.of_unknowns, self.of_A, self.of_residual))
+        return CommonErrors(self.instant, of_unknowns, of_A, of_residual, self.P[:, :number, :number])
+
     def inverse(self, common_px: float, s2: float) -> tuple[Array, float]:
         """K (V, k, k), and the gain of the logarithm of the determinant."""
         inner = np.eye(self.P.shape[1]) + self.P * (common_px**2 / s2)

@@ -95,7 +95,8 @@ class Reduced:
     #: (d, d): The precision of the prior on theta, and `prior_off` (d,) how far the point is from its mean.
     prior: Array
     prior_off: Array
-    common: CommonErrors
+    #: Of every pattern; an image's corners share the first of them.
+    patterns: CommonErrors
 
     @staticmethod
     def of(model: Model, point: Point, slots: Mapping[tuple[str, str], slice] | None = None) -> Reduced:
@@ -139,7 +140,7 @@ class Reduced:
             np.add.at(C, stack.instant, of_view)
             np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
             np.add.at(b, stack.instant, of_A[..., -1])
-            P = patterns(model, stack, point, OF_AN_IMAGE) * root[..., None]
+            P = patterns(model, stack, point) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
             of_theta = np.zeros((*of_P.shape[:2], size))
             of_theta[:, :, where] = of_P[..., :-1]
@@ -190,6 +191,11 @@ class Reduced:
             gradient[3] = self.common.twice_by_log(noise.common_px, s2, theta, inverse, Carriers(a, K, KC))
             gradient[0] -= gradient[3]
         return value, gradient
+
+    @property
+    def common(self) -> CommonErrors:
+        """Of what an image's corners share."""
+        return self.patterns.first(OF_AN_IMAGE)
 
     def without_common(self, noise: Noise) -> tuple[Reduced, float]:
         """The sums without what images' corners share, and the gain of the logarithm of the determinant."""

@@ -19,21 +19,23 @@ Pattern = Callable[[Array, Array, Array, Array], Array]
 PATTERNS: dict[str, Pattern] = {
     "along the image's x": lambda pixels, x, y, away: np.broadcast_to([1.0, 0.0], pixels.shape),
     "along the image's y": lambda pixels, x, y, away: np.broadcast_to([0.0, 1.0], pixels.shape),
-    "along the target's x": lambda pixels, x, y, away: x,
-    "along the target's y": lambda pixels, x, y, away: y,
     "from the target's middle": lambda pixels, x, y, away: _from_middle(pixels),
     "away from the camera": lambda pixels, x, y, away: away,
+    "along the target's x": lambda pixels, x, y, away: x,
+    "along the target's y": lambda pixels, x, y, away: y,
 }
-#: What an image's corners share by chance: in one image the target's axes span what the image's do.
-OF_AN_IMAGE = tuple(name for name in PATTERNS if "along the target" not in name)
+#: So many of them, the first, are what an image's corners share by chance: in one image the target's axes span what the
+#: image's do.
+OF_AN_IMAGE = 4
 
 
-def patterns(model: Model, stack: Stack, point: Point, names: tuple[str, ...] = tuple(PATTERNS)) -> Array:
-    """One pixel of each named pattern (V, 2n, k), of the corners that were seen."""
+def patterns(model: Model, stack: Stack, point: Point, number: int = len(PATTERNS)) -> Array:
+    """One pixel of each of the first patterns (V, 2n, k), of the corners that were seen."""
     directions = _directions(model, stack, point)
-    every = [np.where(stack.known[..., None], PATTERNS[name](stack.pixels, *directions), 0.0) for name in names]
+    first = list(PATTERNS.values())[:number]
+    every = [np.where(stack.known[..., None], pattern(stack.pixels, *directions), 0.0) for pattern in first]
     V, n = stack.known.shape
-    return np.stack(every, axis=-1).reshape(V, 2 * n, len(names))
+    return np.stack(every, axis=-1).reshape(V, 2 * n, number)
 
 
 def _directions(model: Model, stack: Stack, point: Point) -> tuple[Array, Array, Array]:

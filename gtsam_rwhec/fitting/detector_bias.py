@@ -16,33 +16,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_model import Model
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
-from gtsam_rwhec.fitting.corner_patterns import PATTERNS, patterns
+from gtsam_rwhec.fitting.corner_patterns import PATTERNS
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
 from gtsam_rwhec.geometry.poses import Array
 
 
 def covariance_of_bias(refined: CornersRefined) -> Array:
     """The covariance (d, d) of the answer's unknowns from a bias of the detector."""
-    model, point, noise = refined.graph.model, refined.point, refined.noise
-    H = Reduced.of(model, point).information(noise)
+    model, noise = refined.graph.model, refined.noise
+    reduced = Reduced.of(model, refined.point)
+    H, h = reduced.information(noise), gradients_of_bias(model, reduced, noise)
     size = np.sqrt(np.diagonal(H))
-    gradients = gradients_of_bias(model, point, noise)
-    moved = np.linalg.solve(H / size[:, None] / size, gradients.T / size[:, None]) / size[:, None]
-    result: Array = moved @ moved.T
-    return result
+    moved = np.linalg.solve(H / size[:, None] / size, h.T / size[:, None]) / size[:, None]
+    return moved @ moved.T
 
 
-def gradients_of_bias(model: Model, point: Point, noise: Noise) -> Array:
-    """h (patterns, d) of one standard deviation of each pattern, of all targets together."""
-    whole = Reduced.of(model, point).without_carriers(noise).h
-    every = [model.bias_px[stack.target] * patterns(model, stack, point) for stack in model.stacks]
-    found = []
+def gradients_of_bias(model: Model, reduced: Reduced, noise: Noise) -> Array:
+    """h (patterns, d) of one standard deviation of each pattern, of all targets together, in place of the residuals."""
+    every, found = reduced.patterns, []
+    px = np.concatenate([np.full(len(stack.instant), model.bias_px[stack.target]) for stack in model.stacks])
     for k in range(len(PATTERNS)):
-        stacks = tuple(
-            replace(stack, pixels=stack.pixels - pattern[..., k].reshape(stack.pixels.shape))
-            for stack, pattern in zip(model.stacks, every, strict=True)
-        )
-        found.append(Reduced.of(replace(model, stacks=stacks), point).without_carriers(noise).h - whole)
+        b = np.zeros_like(reduced.b)
+        np.add.at(b, every.instant, px[:, None] * every.of_A[:, k])
+        of_bias = replace(every, of_residual=px[:, None] * every.P[..., k])
+        found.append(replace(reduced, g=px @ every.of_unknowns[:, k], b=b, patterns=of_bias).without_carriers(noise).h)
     return np.array(found)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import BeforeValidator, model_validator
 
-from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.cameras.camera import COEFFICIENTS, MODELS, Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import Lens
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.geometry.poses import Array
@@ -93,7 +93,9 @@ class Intrinsics(Section):
     K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = optional(
         "[fx, fy, cx, cy]; the middle of the first pixel is at 0, 0", [550.0, 550.0, 320.0, 240.0], unit="pixels"
     )
-    D: tuple[float, ...] | None = optional("with model: coefficients in OpenCV's order", [-0.1, 0.02, 0.0, 0.0])
+    D: tuple[float, ...] | None = optional(
+        "with model: all of its coefficients in OpenCV's order", [-0.1, 0.02, 0.0, 0.0]
+    )
     estimate: Lens | None = optional(
         "no calibration is there: from the images, with this lens model (any: the one that fits); intrinsics: "
         "estimate is {estimate: any} in short. It takes images of a board at different tilts",
@@ -149,6 +151,10 @@ class Intrinsics(Section):
             raise ValueError(f"{' and '.join(name for name, there in given.items() if not there)} missing")
         if self.model is None and self.D and any(self.D):
             raise ValueError("D without model; say which coefficients these are: model: radtan, equidistant or unified")
+        least = COEFFICIENTS[MODELS.get((self.model or "").strip().lower(), "pinhole")][0]
+        if len(self.D or ()) < least:
+            words = f"model: {self.model}, and D has {len(self.D or ())} numbers; give all in OpenCV's order"
+            raise ValueError(f"{words}, {least} at least (0 where one is zero), or leave both out where nothing bends")
         fx, fy, cx, cy = self.K
         K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
         return Camera.of(width, height, self.model or "pinhole", K, self.D or (), where)

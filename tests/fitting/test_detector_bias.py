@@ -10,6 +10,7 @@ from rwhec_factors import se3
 from simulated_cells import cell
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.fitting.corner_patterns import PATTERNS
 from gtsam_rwhec.fitting.detector_bias import covariance_of_bias, gradients_of_bias
 from gtsam_rwhec.fitting.observations import Views
@@ -19,7 +20,7 @@ BIAS = 0.02
 EXACT = rw.CornerOptions(carrier_noise="exact", outliers=False, bias_px={"board": BIAS})
 
 
-@pytest.mark.parametrize("which", [0, 4])
+@pytest.mark.parametrize("which", [0, 2])
 def test_a_bias_moves_the_answer_as_said(which: int) -> None:
     given = cell(1, images=20, cameras=1)
     refined = rw.refine_corners(given.observations, given.X, given.Y, EXACT)
@@ -28,8 +29,8 @@ def test_a_bias_moves_the_answer_as_said(which: int) -> None:
     none = np.zeros_like(view.pixels)
     biased = Views(view.A, view.pixels + BIAS * pattern(view.pixels, none, none, none))
     other = rw.refine_corners(replace(given.observations, views={pair: biased}), given.X, given.Y, EXACT)
-    model, point = refined.graph.model, refined.point
-    moved = refined.joint @ gradients_of_bias(model, point, refined.noise)[which]
+    reduced = Reduced.of(refined.graph.model, refined.point)
+    moved = refined.joint @ gradients_of_bias(refined.graph.model, reduced, refined.noise)[which]
     xi = se3.logmap((se3.inverse(refined.Y["cam_0"].matrix()) @ other.Y["cam_0"].matrix())[None])[0]
     assert xi == pytest.approx(moved[refined.slots["y", "cam_0"]], rel=0.1, abs=0.05 * np.abs(xi).max())
 

@@ -14,6 +14,7 @@ from gtsam_rwhec.fitting.common_errors import whitened
 from gtsam_rwhec.fitting.corner_model import Point
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
+from gtsam_rwhec.fitting.corners_as_refined import numbers_of
 from gtsam_rwhec.fitting.observations import Views
 
 
@@ -67,7 +68,9 @@ def test_what_the_corners_of_an_image_share_is_found_and_widens_the_covariance()
         P, view = patterns(model, stack, without.point, OF_AN_IMAGE), views[stack.target, stack.sensor]
         shared = P @ rng.normal(0.0, 0.05, (len(P), P.shape[2], 1))
         views[stack.target, stack.sensor] = Views(view.A, view.pixels + shared.reshape(view.pixels.shape))
-    found = rw.refine_corners(replace(given.observations, views=views), given.X, given.Y)
+    shared = replace(given.observations, views=views)
+    found = rw.refine_corners(shared, given.X, given.Y)
+    assert "all corners of an image are off together by 0.0" in str(numbers_of(shared, found, rw.CornerOptions()))
     assert without.noise.common_px < 0.02 < 0.04 < found.noise.common_px < 0.07
     assert found.noise.corner_px == pytest.approx(0.1, rel=0.05)
     size = [np.sqrt(np.diagonal(one.covariance("cam_0"))) for one in (without, found)]

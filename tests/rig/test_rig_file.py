@@ -328,6 +328,8 @@ def test_a_camera_that_is_shared_is_stated_as_the_other_one() -> None:
         ("shared: left", "shared: right", "right states no intrinsics of its own; these sensors do: left"),
         ("shared: left", "shared: left, stated: nominal", "stated: nominal, and left has the intrinsics; say it there"),
         ("shared: left", "shared: left, file: a.yaml", "give one of"),
+        ("stated: exact", "model: radtan", "line 3: sensors.left.intrinsics: model: radtan, and D has 0 numbers; give"),
+        ("stated: exact", "model: equidistant, D: [0.1]", "equidistant, and D has 1 numbers; give all"),
     ],
 )
 def test_shared_cameras_that_are_none(old: str, new: str, words: str) -> None:
