@@ -55,7 +55,7 @@ def log(tmp_path: Path) -> rw.logs.Log:
         ("alone.yaml", 458.6),  # the only one
         ("ost.yaml", 430.2),
         ("{file: cameras.txt, camera: '2'}", 600.0),
-        ("{size: [640, 480], K: [700, 700, 320, 240], model: unified, D: [1.2, -0.1]}", 700.0),
+        ("{size: [640, 480], K: [700, 700, 320, 240], model: unified, D: [1.2, -0.1, 0, 0, 0]}", 700.0),
     ],
 )
 def test_whose_intrinsics(tmp_path: Path, log: rw.logs.Log, source: str, fx: float) -> None:
