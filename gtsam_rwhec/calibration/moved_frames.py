@@ -46,10 +46,17 @@ class TwoPoses:
     #: pair and one group follows the other; else None
     from_row: int | None
     is_sensor: bool = False  #: Whether it is a sensor: then its mount gave way
+    by_turns: bool = False  #: Whether the groups come by turns: no frame moves there and back so often
 
     def __str__(self) -> str:
-        when = "" if self.from_row is None else f" from measurement {self.from_row} on"
         apart = f"{np.degrees(self.angle_rad):.2g} degrees and {1e3 * self.distance_m:.3g} mm apart"
+        if self.by_turns:
+            return (
+                f"{self.frame} has measurements of two sensors, mixed: {self.first} agree on one pose and "
+                f"{self.second} on another, {apart}, by turns: images of two cameras lie in one folder, or two "
+                "sensors write to one topic"
+            )
+        when = "" if self.from_row is None else f" from measurement {self.from_row} on"
         moved = "its mount is loose or it was knocked" if self.is_sensor else "it was moved"
         return (
             f"{self.frame} was at two poses{when}: its measurements fall into groups of {self.first} and "
@@ -285,7 +292,7 @@ OUTLIERS_BETTER = 3.0
 LEAST = np.array([5e-5, 1e-5])
 #: A frame that moved does not move back: at most this share of the outliers (or of the inliers, if they are fewer) may
 #: be on the wrong side of the moment. Outliers that come and go have another cause: another board was taken for this
-#: one.
+#: one, or two sensors are mixed.
 MISPLACED = 0.2
 
 
@@ -321,6 +328,42 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
     if sum(_moment(of)[1] for of in kept) > MISPLACED * fewer:
         return None
     return replace(found, from_row=_moment(kept[0])[0] if len(kept) == 1 else None)
+
+
+#: So many outliers of two mixed sensors agree on the second; their boards' turns may be wrong, so not most of them do.
+FEWEST_MIXED = 3
+#: Each of so many outliers, evenly over the rows, is tried as the one that the others agree with.
+ANCHORS = 50
+
+
+def mixed_sensors(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPoses | None:
+    """The sensor among whose measurements are some of another: outliers, by turns, that agree on one other pose of it.
+
+    None where none is. The outliers do not agree in their targets' axes as well: those would be one view, seen twice.
+    """
+    for sensor in dict.fromkeys(pair.sensor for pair in measured):
+        rows = [(of, _residual_twists(refined, of, one.A, one.B), one.kept) for of, one in measured.items()]
+        rows = [(pair, twists, kept) for pair, twists, kept in rows if pair.sensor == sensor and len(twists[0])]
+        if not rows:
+            continue
+        of_sensor, kept = np.concatenate([both[1] for _, both, _ in rows]), np.concatenate([one for *_, one in rows])
+        of_target = np.concatenate([both[0] for _, both, _ in rows])
+        away, near = of_sensor[~kept], NEAR * np.maximum(np.median(_sizes(of_sensor[kept]), axis=0), LEAST)
+        if len(away) < FEWEST_MIXED:
+            continue
+        anchors = away[:: -(-len(away) // ANCHORS)]
+        agree = max(((_sizes(away - one) <= near).all(axis=1) for one in anchors), key=np.count_nonzero)
+        if agree.sum() < FEWEST_MIXED:
+            continue
+        middle, of_target = np.median(away[agree], axis=0), of_target[~kept][agree]
+        spreads = [
+            np.maximum(np.median(_sizes(of - np.median(of, axis=0)), axis=0), LEAST).prod()
+            for of in (away[agree], of_target)
+        ]
+        angle, distance = size = _sizes(middle[None])[0]
+        if spreads[0] * OUTLIERS_BETTER < spreads[1] and (size > OUTLIERS_APART * near / NEAR).any():
+            return TwoPoses(sensor, int(kept.sum()), int(agree.sum()), float(angle), float(distance), None, True, True)
+    return None
 
 
 def _step_with_outliers(

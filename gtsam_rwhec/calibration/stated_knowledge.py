@@ -20,6 +20,7 @@ from gtsam_rwhec.calibration.moved_frames import (
     Measured,
     TwoPoses,
     measured_of,
+    mixed_sensors,
     moved_with_outliers,
     residuals_at_stations,
     step_of,
@@ -157,14 +158,15 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
 
 
 def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Record a finding for a frame that was at two poses."""
+    """Record a finding for a frame that was at two poses, or a sensor that is two."""
     if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
         return  # a late clock makes such groups
     measured = measured_of(run.problem, inliers)
     at = residuals_at_stations(refined, measured)
     found = two_poses(at) or _moved(run, at, measured) or moved_with_outliers(refined, measured)
+    found = found or mixed_sensors(refined, measured)
     if found is not None:
-        run.record.find(Ground.MOVED, str(found))
+        run.record.find(Ground.MIXED if found.by_turns else Ground.MOVED, str(found))
 
 
 def _moved(run: Run, at: Mapping[Pair, AtStations], measured: Mapping[Pair, Measured]) -> TwoPoses | None:

@@ -67,6 +67,8 @@ class Ground(StrEnum):
     POSE_DOUBTED = "pose_doubted"
     #: A frame was at two poses: a target was moved, or a sensor's mount gave way.
     MOVED = "moved"
+    #: Measurements of two sensors are mixed, and nobody knows which of them was meant.
+    MIXED = "mixed"
     #: Most measurements of a sensor were left out as outliers.
     CONTRADICTED = "contradicted"
     #: A sensor or a target has no measurement in the answer, and so no pose; or a sensor of a rig file has too few.
@@ -150,8 +152,11 @@ _MADE_BY = {
     **dict.fromkeys(
         (Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED), _MADE_BY_A_MISTAKE
     ),
-    # If a frame moved, all its later measurements are outliers.
-    Ground.MOVED: _MADE_BY_A_MISTAKE | {Ground.CONTRADICTED, Ground.TARGET_CONTRADICTED, Ground.MANY_OUTLIERS},
+    # If a frame moved, all its later measurements are outliers; and so are those of another sensor.
+    **dict.fromkeys(
+        (Ground.MOVED, Ground.MIXED),
+        _MADE_BY_A_MISTAKE | {Ground.CONTRADICTED, Ground.TARGET_CONTRADICTED, Ground.MANY_OUTLIERS},
+    ),
     # Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
     Ground.INTRINSICS_DOUBTED: _MADE_BY_A_MISTAKE | _NOT_DETERMINED | _OF_SIZES,
     # How well poses are known that are not determined is no question.
@@ -185,6 +190,10 @@ _ADVICE = {
     Ground.MOVED: (
         "fix what moved (tighten the mount of a sensor, screw a target down) and measure again, or calibrate with the "
         "measurements before it moved, or with those after it, alone"
+    ),
+    Ground.MIXED: (
+        "give each of the two sensors its own folder of images, or its own topic, and its own entry in the rig file; "
+        "then calibrate again"
     ),
     Ground.CONTRADICTED: (
         "check whether the named frame has moved, has another frame's name or was stated at a wrong pose, and whether "

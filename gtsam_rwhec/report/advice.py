@@ -66,7 +66,7 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
         advice += log.detection.likely
     contradicted = {counts.frame for counts in log.contradicted}
     given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in contradicted]
-    if given and (judgement is None or Ground.MOVED not in judgement.grounds):
+    if given and (judgement is None or not {Ground.MOVED, Ground.MIXED}.intersection(judgement.grounds)):
         advice.append(
             f"The time offset of {', '.join(given)} was not estimated. If the clock may be late, write time_offset: "
             "estimate in the rig file. Wrong intrinsics show like this, too."

@@ -7,7 +7,7 @@ import pytest
 from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.moved_frames import Measured, moved_with_outliers
+from gtsam_rwhec.calibration.moved_frames import Measured, mixed_sensors, moved_with_outliers
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
@@ -64,9 +64,45 @@ def test_few_outliers_name_none() -> None:
 def test_outliers_of_one_step_that_come_and_go_are_no_move() -> None:
     """Another board was taken for this one in every fifth image: it was said to have moved "from measurement 2 on"."""
     refined, measured = seen("board", 7)
+    assert moved_with_outliers(refined, {PAIR: by_turns(measured)}) is None
+
+
+def by_turns(measured: dict[Pair, Measured]) -> Measured:
+    """The measurements after the move, spread among those before it."""
     order = np.argsort(np.r_[np.linspace(0.0, 1.0, FIRST), np.linspace(0.05, 0.95, COUNT - FIRST)], kind="stable")
     one = measured[PAIR]
-    assert moved_with_outliers(refined, {PAIR: Measured(one.A[order], one.B[order], one.kept[order])}) is None
+    return Measured(one.A[order], one.B[order], one.kept[order])
+
+
+@pytest.mark.parametrize("seed", range(20, 25))
+def test_two_sensors_by_turns_are_named_and_other_outliers_are_not(seed: int) -> None:
+    refined, measured = seen("camera", seed)
+    mixed = by_turns(measured)
+    some = np.flatnonzero(~mixed.kept)[4:]  # of these, boards' turns are wrong: they agree with nobody
+    mixed.B[some] = mixed.B[some] @ random_poses(len(some), 0.5, np.random.default_rng(seed))
+    found = mixed_sensors(refined, {PAIR: mixed})
+    assert found is not None
+    assert (found.frame, found.first, found.second, found.from_row) == ("camera", FIRST, 4, None)
+    for other in ("board", "nothing"):
+        refined, measured = seen(other, seed)
+        assert mixed_sensors(refined, {PAIR: by_turns(measured)}) is None
+
+
+def test_one_wrong_view_that_was_seen_many_times_is_no_second_sensor() -> None:
+    refined, measured = seen("nothing", 8)
+    one = measured[PAIR]
+    A, B = one.A.copy(), one.B.copy()
+    A[FIRST:], B[FIRST:] = A[FIRST], B[FIRST]
+    assert mixed_sensors(refined, {PAIR: Measured(A, B, one.kept)}) is None
+
+
+def test_calibrate_says_that_two_sensors_are_mixed() -> None:
+    mixed = by_turns(seen("camera", 9)[1])
+    problem = rw.Problem()
+    problem.add(*PAIR, mixed.A, mixed.B)
+    judgement = rw.calibrate(problem).judgement
+    assert judgement.grounds == (rw.Ground.MIXED,)
+    assert "camera has measurements of two sensors" in judgement.reason
 
 
 def test_calibrate_says_that_a_board_moved_late_in_place_of_outliers() -> None:
