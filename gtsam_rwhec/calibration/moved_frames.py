@@ -332,6 +332,8 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
 
 #: So many outliers of two mixed sensors agree on the second; their boards' turns may be wrong, so not most of them do.
 FEWEST_MIXED = 3
+#: They agree within this share of their angle and distance, too: the second camera's lens is another one.
+OTHER_LENS = 0.15
 #: Each of so many outliers, evenly over the rows, is tried as the one that the others agree with.
 ANCHORS = 50
 
@@ -352,7 +354,10 @@ def mixed_sensors(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPos
         if len(away) < FEWEST_MIXED:
             continue
         anchors = away[:: -(-len(away) // ANCHORS)]
-        agree = max(((_sizes(away - one) <= near).all(axis=1) for one in anchors), key=np.count_nonzero)
+        alike = (
+            (_sizes(away - one) <= np.maximum(near, OTHER_LENS * _sizes(one[None]))).all(axis=1) for one in anchors
+        )
+        agree = max(alike, key=np.count_nonzero)
         if agree.sum() < FEWEST_MIXED:
             continue
         middle, of_target = np.median(away[agree], axis=0), of_target[~kept][agree]

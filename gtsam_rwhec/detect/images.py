@@ -204,7 +204,9 @@ def decode_small(image: ImageRecord, width: int) -> Gray:
 def _check_size(where: str, found: Size, wanted: Size | None) -> None:
     if wanted is not None and found != wanted:
         raise ImageError(
-            f"{where}: {found[0]} x {found[1]} pixels, but the intrinsics are for {wanted[0]} x {wanted[1]}"
+            f"{where}: {found[0]} x {found[1]} pixels, but the intrinsics are for {wanted[0]} x {wanted[1]}: "
+            "it is of another camera, or of another setting of this one; give it a folder or topic and a sensor of its "
+            "own"
         )
 
 
