@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Finding, Verdict
-from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key, rounded
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
@@ -223,7 +223,10 @@ def deviation_cells(covariance: Array) -> tuple[str, ...]:
 
 
 def _cell(value: float | None, decimals: int) -> str:
-    return "free" if value is None or not np.isfinite(value) else f"{value:.{decimals}f}"
+    if value is None or not np.isfinite(value):
+        return "free"
+    # A standard deviation is never printed as 0: it has one digit that counts at least.
+    return rounded(value, 1) if 0.0 < value < 10.0**-decimals else f"{value:.{decimals}f}"
 
 
 def _label(name: str, wrong: Collection[str]) -> str:

@@ -201,7 +201,11 @@ def deviation_cells(shown: ShownResult, name: str) -> list[Words]:
         return [FIXED] * 6
     at = ("refined", "frames", name)
     along, about = (f"standard_deviations_{unit}" for unit in ("mm", "deg"))
-    return [*shown.numbers(*at, along, spec=".2f"), *shown.numbers(*at, about, spec=".3f")]
+    return [
+        significant(number, 1) if 0.0 < (number.value or 0.0) < 10.0**-decimals else number
+        for field, decimals in ((along, 2), (about, 3))
+        for number in shown.numbers(*at, field, spec=f".{decimals}f")
+    ]
 
 
 def known_unknowns(shown: ShownResult) -> frozenset[str]:

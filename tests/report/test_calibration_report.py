@@ -16,7 +16,7 @@ from rich.console import Console
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.report import certificate_sentence, print_calibration, print_refined, print_solution
-from gtsam_rwhec.report.calibration_report import scales_and_clocks
+from gtsam_rwhec.report.calibration_report import deviation_cells, scales_and_clocks
 from gtsam_rwhec.report.choices_section import log_blocks
 from gtsam_rwhec.report.report_blocks import Paragraph, Table, plain_text
 from gtsam_rwhec.report.terminal_report import TerminalTable
@@ -28,6 +28,11 @@ from gtsam_rwhec.solver.certificate import Basis, Cause
 from gtsam_rwhec.solver.region import Region
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
+
+
+def test_a_standard_deviation_is_never_printed_as_zero() -> None:
+    deviations = np.array([*np.radians([2.0, 0.0123, 0.0004]), 1e-3, 1.2e-5, 3.4e-6])
+    assert deviation_cells(np.diag(deviations**2)) == ("1.00", "0.01", "0.003", "2.000", "0.012", "0.0004")
 
 
 def printed(answer: Any, width: int = 160, *, terminal: bool = False, **options: Any) -> str:
