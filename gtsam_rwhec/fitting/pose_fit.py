@@ -128,6 +128,25 @@ class GeodesicModel:
             add(graph, self.variables, rest, self.covariances(state, factors), loss)
         return graph
 
+    def reweighted(self, state: State, factors: FactorsByPair, robust: Robust) -> gtsam.NonlinearFactorGraph:
+        """One factor for each pair, in which measurements have the weights that a loss gives them at an estimate."""
+        loss, covariances = graphs.loss_of(robust), self.covariances(state, factors)
+        for pair, lengths in self.lengths(state, factors).items():
+            weights = np.array([max(loss.weight(d), LEAST_WEIGHT) for d in lengths])
+            covariances[pair] = covariances[pair] / weights[:, None, None]
+        graph = gtsam.NonlinearFactorGraph()
+        there = [replace(item, residuals=item.at(state.offsets_s.get(item.pair.sensor, 0.0))) for item in self.data]
+        graphs.add_batches(graph, self.variables, there, covariances)
+        return graph
+
+    def lengths(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
+        """The lengths (N,) of every pair's whitened residuals at an estimate."""
+        at = linearized(self.data, self.variables, state)
+        return {
+            pair: np.linalg.norm(np.einsum("nij,nj->ni", square_root_information(C), at[pair].residual), axis=1)
+            for pair, C in self.covariances(state, factors).items()
+        }
+
     def values(self, state: State) -> gtsam.Values:
         """An estimate as GTSAM's values, with the measured carrier poses where they are variables."""
         values = self.variables.values(state)
@@ -144,12 +163,7 @@ class GeodesicModel:
         if not self.is_m_estimate:
             return 1.0
         loss = graphs.loss_of(self.options.robust)
-        at = linearized(self.data, self.variables, state)
-        whitened = [
-            np.einsum("nij,nj->ni", square_root_information(covariance), at[pair].residual)
-            for pair, covariance in self.covariances(state, factors).items()
-        ]
-        lengths = np.linalg.norm(np.concatenate(whitened), axis=1)
+        lengths = np.concatenate(list(self.lengths(state, factors).values()))
         weight = np.array([loss.weight(d) for d in lengths])
         step = 1e-5
         before = np.maximum(lengths - step, 0.0)
@@ -301,6 +315,12 @@ SETTLED = 1e-4
 OFFSET_SETTLED_S = 1e-6
 
 
+#: An estimate under a loss is settled when a round moves it by less than this part of its standard deviations.
+SAME = 1e-3
+#: No measurement has less weight than this; its covariance would not be finite.
+LEAST_WEIGHT = 1e-12
+
+
 @dataclass(frozen=True)
 class SettledFit:
     """The settled optimum: the graph, the information of the unknowns, and the variance factors."""
@@ -328,7 +348,10 @@ def fit(
     degrees_of_freedom: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
-    if model.first_loss is not None:
+    if isinstance(model, GeodesicModel) and model.is_m_estimate and model.carriers is None:
+        state, factors = _reweighted(problem, model, variables, start, options, factors, estimates, tell)
+        values = model.values(state)
+    elif model.first_loss is not None:
         graph = model.graph(state, factors, model.first_loss)
         graphs.add_knowledge(graph, variables, problem, options.residual)
         optimum = optimise(graph, values, options.max_iterations)
@@ -384,3 +407,41 @@ def fit(
             stacklevel=5,
         )
     return SettledFit(graph, optimum, information, factors, degrees_of_freedom, iterations)
+
+
+def _reweighted(
+    problem: Problem,
+    model: GeodesicModel,
+    variables: Variables,
+    state: State,
+    options: RefineOptions,
+    factors: FactorsByPair,
+    estimates: bool,
+    tell: Progress,
+) -> tuple[State, FactorsByPair]:
+    """The optimum under a loss by least squares with weights that are taken again, and its variance factors.
+
+    A factor for each measurement, which GTSAM's losses need, is called from C++ in Python each time. So these begin
+    where all measurements of a pair in one factor end.
+    """
+    for robust in dict.fromkeys((model.first_loss or model.options.robust, model.options.robust)):
+        for round_number in range(MAX_ROUNDS):
+            tell(f"refining: weights of measurements, round {round_number + 1} of at most {MAX_ROUNDS}")
+            before = state
+            without = model.reweighted(state, factors, robust)
+            graphs.add_priors(without, variables, problem, options.residual)
+            graph = gtsam.NonlinearFactorGraph(without)
+            graphs.add_fixed(graph, variables, problem)
+            optimum = optimise(graph, model.values(state), options.max_iterations)
+            state = variables.state(optimum.values)
+            information, change = information_of(without, optimum.values, variables), 0.0
+            if estimates:
+                unit = np.ones(len(information))
+                joint = JointCovariance.of(variables.unknowns, information, np.zeros((len(unit), 0)), unit)
+                again = model.next_factors(state, joint, factors, options.noise_groups).factors
+                change, factors = largest_change(factors, again), again
+            step = variables.values(before).localCoordinates(optimum.values)
+            moved = np.concatenate([step.at(variables.keys[unknown]) for unknown in variables.unknowns])
+            if change < SETTLED and moved @ information @ moved < SAME**2:
+                break
+    return state, factors

@@ -290,7 +290,7 @@ def optimise(
             step = linear.optimize()
         except RuntimeError:  # GTSAM's IndeterminantLinearSystemException
             break
-        gain = cost - linear.error(step)
+        gain = linear.error(values.zeroVectors()) - linear.error(step)  # under a loss, the cost is not of these factors
         moved = values.retract(step)
         after = graph.error(moved)
         if not after <= cost * (1.0 + 1e-12) + 1e-12:
