@@ -13,6 +13,7 @@ from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.fitting.block_agreement import too_much
 from gtsam_rwhec.fitting.fit_options import Component, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio_words
 from gtsam_rwhec.fitting.noise_refinement import under_noise
@@ -207,6 +208,7 @@ def refined_under_its_noise(
             record.find(Ground.NOISE_OVERSTATED, words)
         _say_drift(run, noise.model)
         _say_systematic(run, noise.model)
+        _say_blocks(run, noise.model)
     # Of measurements that are too few to estimate any noise, the verdict says so.
     if noise.is_unchecked and (refined.noise_source == "given" or spare >= SPARE_EQUATIONS):
         words = "noise of A, drift and errors that vary with the configuration were not looked for"
@@ -255,6 +257,24 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
             f"a model in which neighbours in time share errors explains the residuals far better "
             f"({ratio_words(model.drift_evidence)}){clock}",
         )
+
+
+#: Standard deviations that blocks of the log make larger by more than this factor are those of errors nobody knows.
+LARGELY = 2.0
+
+
+def _say_blocks(run: Run, model: NoiseInData) -> None:
+    """Record whether blocks of the log agree as well as the noise allows; if they do not by far, add a finding."""
+    if not model.scatter:
+        return
+    worst = too_much(model.scatter)
+    if worst is None:
+        run.record.choose("blocks of the log", "agree as well as the noise allows", str(model.scatter[0]))
+        return
+    run.record.choose("blocks of the log", "do not agree; the standard deviations are larger for it", str(worst))
+    if worst.ratio > LARGELY**2:
+        words = f"{worst}: errors are of another kind than any model of the noise that was tried, and last for long"
+        run.record.find(Ground.CORRELATED, words)
 
 
 def _say_systematic(run: Run, model: NoiseInData) -> None:

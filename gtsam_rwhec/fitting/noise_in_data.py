@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from rwhec_factors import se3
 from scipy.special import expit
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.fitting.block_agreement import Scatter, too_much
 from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -88,6 +90,8 @@ class NoiseInData:
     #: Of the constant errors that the covariance has, [omega, v] in rad and m: of the targets' carrier in its own axes,
     #: A Expmap(c), and of the sensors', Expmap(c) A.
     constant_deviations: tuple[tuple[float, ...], ...] = ((0.0,) * 6,) * 2
+    #: How much blocks of the log scatter, for each way to cut it; empty of few instants.
+    scatter: tuple[Scatter, ...] = ()
 
     @property
     def has_systematic(self) -> bool:
@@ -153,6 +157,13 @@ class NoiseInData:
                 f"({ratio_words(self.systematic_evidence)}): {100.0 * self.systematic_probability:.0f} % probable. "
                 "Their constant part, which residuals do not show, is assumed to be twice as large."
             )
+        worst = too_much(self.scatter)
+        if worst is not None:
+            said.append(
+                f"{worst}: the standard deviations are {rounded(math.sqrt(worst.ratio))} times as large for it."
+            )
+        elif self.scatter:
+            said.append(f"{self.scatter[0]}.")
         return tuple(said)
 
     def __str__(self) -> str:
@@ -178,6 +189,8 @@ NEARER = 4.0
 #: An arm's constant error, over what varies with the configuration: in 300 simulated arms 1.4 to 3.1 (rotation) and
 #: 0.9 to 1.9 (translation), by the spread of the configurations.
 CONSTANT = 2.0
+#: No arm's poses are farther apart (m).
+FARTHEST_M = 5.0
 #: Before the data, the odds that an arm has errors that matter beside the noise of detections: one in seven.
 LOG_ODDS = -2.0
 
@@ -217,7 +230,9 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
     return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
 
 
-def noise_in(task: Task, found: Settled, mixture: Mixture, constant: tuple[Array, Array]) -> NoiseInData:
+def noise_in(
+    task: Task, found: Settled, mixture: Mixture, constant: tuple[Array, Array], scatter: tuple[Scatter, ...]
+) -> NoiseInData:
     """What the data say of their noise; `constant` are the variances of `constant_variances`."""
     white = found.white or found
     middle, low, high = mixture.quantiles((0.5, 0.05, 0.95))
@@ -249,17 +264,24 @@ def noise_in(task: Task, found: Settled, mixture: Mixture, constant: tuple[Array
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
         systematic_probability=_probability(task, found),
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
+        scatter=scatter,
     )
 
 
-def mixed(task: Task, found: Settled) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
-    """The covariance, with the components' uncertainty mixed in, and the arm's constant error added; and its parts."""
+def mixed(
+    task: Task, found: Settled, scatter: tuple[Scatter, ...]
+) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
+    """The covariance, with the components' uncertainty mixed in, and the arm's constant error added; and its parts.
+
+    Where blocks of the log scatter more than the noise allows, it is as much larger.
+    """
     is_dense = task.instants.count > INSTANTS
     mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     constant = constant_variances(task, found, state, mixture)
-    finite = basis @ mixture.covariance @ basis.T
+    worst = too_much(scatter)
+    finite = basis @ mixture.covariance @ basis.T * (1.0 if worst is None else worst.ratio)
     for poses, variances in zip((state.X, state.Y), constant, strict=True):
         shift = _shifts(task, poses)
         finite += (shift * variances) @ shift.T
@@ -274,6 +296,16 @@ def is_drift_untried(task: Task, found: Settled) -> bool:
     return task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED)
 
 
+def is_no_arm(task: Task) -> bool:
+    """Whether the carriers' poses are farther apart than an arm reaches: then they come from a tracker.
+
+    A tracker defines where the frames of what it tracks are, so no constant error can hide there, as an arm's does.
+    """
+    A = np.concatenate([item.residuals.A for item in task.data])
+    ways = (A[:, :3, 3], se3.inverse(A)[:, :3, 3])  # of an arm in a far world, one of both is wide
+    return min(float(np.linalg.norm(np.ptp(way, axis=0))) for way in ways) > FARTHEST_M
+
+
 def constant_variances(task: Task, found: Settled, state: State, mixture: Mixture) -> tuple[Array, Array]:
     """Variances (6,) of constant errors of A: c of the hand, A Expmap(c), and of the base, Expmap(c) A.
 
@@ -283,7 +315,7 @@ def constant_variances(task: Task, found: Settled, state: State, mixture: Mixtur
     hardly show the part that varies, it may not be there: the ellipsoid is that of the average over both models.
     """
     active = found.fit.sizes.active
-    if C.SYSTEMATIC_ROTATION not in active:
+    if C.SYSTEMATIC_ROTATION not in active or is_no_arm(task):
         return np.zeros(6), np.zeros(6)
     places = [active.index(c) for c in (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)]
     deviations = CONSTANT * np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)

@@ -9,6 +9,7 @@ from scipy.special import fdtri
 
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
 from gtsam_rwhec.fitting.component_posterior import FEWEST
 from gtsam_rwhec.fitting.drift import drift_columns
 from gtsam_rwhec.fitting.fit_options import C, NoiseOptions, RefineOptions
@@ -55,7 +56,8 @@ class UnderNoise:
         """
         task, found = self.task, self.settled
         task.tell("covariances: with the uncertainty of the noise itself")
-        joint, mixture, constant = mixed(task, found)
+        scatter = scatter_of_blocks(task, found)
+        joint, mixture, constant = mixed(task, found, scatter)
         layout = task.layout
         frames = [
             layout.slots[unknown]
@@ -66,9 +68,11 @@ class UnderNoise:
         # Two kinds of noise at least share what equations there are to spare.
         spare = 6 * task.problem.number_of_measurements - len(layout.unit)
         freedom = min(freedom, max(0.5 * spare, FEWEST))
+        worst = too_much(scatter)
+        freedom = freedom if worst is None else min(freedom, worst.freedom)
         task.tell("covariances: the graph of the answer")
         refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
-        noise = noise_in(task, found, mixture, constant)
+        noise = noise_in(task, found, mixture, constant, scatter)
         return replace(refined, noise_sentences=noise.sentences), noise
 
 

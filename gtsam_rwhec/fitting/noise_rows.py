@@ -226,14 +226,16 @@ class Rows:
 
     def thinned(self, every: int) -> Rows:
         """The rows of every so-many-th instant of each track."""
+        step = self.instants.step
+        track, begins = np.cumsum(step == 0.0) - 1, np.flatnonzero(step == 0.0)
+        return self.of_instants((np.arange(len(step)) - begins[track]) % every == 0)
+
+    def of_instants(self, kept: np.ndarray) -> Rows:
+        """The rows of some instants, a mask (T,); a track begins at the first of it that is kept."""
         instants = self.instants
-        track = np.cumsum(instants.step == 0.0) - 1
-        begins = np.flatnonzero(instants.step == 0.0)
-        place = np.arange(instants.count) - begins[track]
-        kept = place % every == 0
+        track, walked = np.cumsum(instants.step == 0.0)[kept], np.cumsum(instants.step)[kept]
         rows = kept[instants.index]
-        walked = np.cumsum(instants.step)[kept]
-        step = np.where(instants.step[kept] == 0.0, 0.0, np.diff(walked, prepend=0.0))
+        step = np.where(np.diff(track, prepend=-1) != 0, 0.0, np.diff(walked, prepend=0.0))
         _, index = np.unique(instants.index[rows], return_inverse=True)
         fewer = Instants(
             instants.order[rows], np.flatnonzero(np.r_[True, np.diff(index) != 0]), index, instants.chain[rows],

@@ -14,6 +14,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
 from gtsam_rwhec.fitting.component_posterior import FEWEST, SAMPLES, mixture_of
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
@@ -78,7 +79,8 @@ def near(
     mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
-    finite = basis @ mixture.covariance @ basis.T
+    worst = too_much(scatter_of_blocks(task, found))
+    finite = basis @ mixture.covariance @ basis.T * (1.0 if worst is None else worst.ratio)
     if is_drift_untried(task, found):
         wider = widening(task, found)
         finite = finite * wider[:, None] * wider
@@ -100,7 +102,7 @@ def near(
     )
     return NearAnswer(
         found_poses,
-        degrees_of_freedom=min(freedom, max(0.5 * spare, FEWEST)),
+        degrees_of_freedom=min(freedom, max(0.5 * spare, FEWEST), np.inf if worst is None else worst.freedom),
         inliers=inliers,
         free=tuple(map(str, task.free_directions)),
     )
