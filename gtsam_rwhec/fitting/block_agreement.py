@@ -1,8 +1,8 @@
 """The last judge of a noise model: answers from blocks of the log may scatter as it says, and not more.
 
 The log is cut into blocks of time, and, without a random walk, into blocks of the carriers' configuration. A block's
-measurements have, under the model, information I_j about the unknowns and the gradient b_j = I_j (what they say alone). With the whole answer d
-and its covariance C, the block moves the answer by
+measurements have, under the model, information I_j about the unknowns and the gradient b_j = I_j (what they say alone).
+With the whole answer d and its covariance C, the block moves the answer by
 
     e_j = C (b_j - I_j d),    cov(e_i, e_j) = C (I_i [i = j] - I_i C I_j) C
 
