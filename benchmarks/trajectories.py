@@ -41,7 +41,7 @@ MAP, CAMERA, BODY = "map", "camera", "body"
 CAMERA_HZ, CAPTURE_HZ = 15.0, 60.0
 #: White noise of a pose: of motion capture, and of the trajectory; rad and m.
 CAPTURE, WHITE = (float(np.radians(0.05)), 0.0003), (float(np.radians(0.04)), 0.0015)
-#: Extents (m) and turns (rad), root mean square along and about x, y, z, and the slowest and fastest of their waves, Hz.
+#: Root mean squares along (m) and about (rad) x, y, z, and the slowest and the fastest of the waves, Hz.
 MOTION = {
     "flown": ((2.5, 2.5, 0.6), (0.15, 0.15, 1.2), (0.02, 0.25)),
     "driven": ((8.0, 8.0, 0.05), (0.02, 0.02, 1.5), (0.01, 0.15)),
@@ -168,12 +168,14 @@ def stream(sequence: Sequence) -> tuple[str, Array, Array, float, tuple[str, ...
 def odometry(sequence: Sequence) -> tuple[str, Array, Array, float, tuple[str, ...]]:
     """The same, of the road of odometries: motion capture is one of them."""
     tracks = [
-        rw.OdometryTrack(BODY, sequence.path.stamps_ns, np.linalg.inv(sequence.path.T[0]) @ sequence.path.T),
-        rw.OdometryTrack(CAMERA, sequence.stamps_ns, sequence.T_map_camera),
+        rw.odometry.OdometryTrack(BODY, sequence.path.stamps_ns, np.linalg.inv(sequence.path.T[0]) @ sequence.path.T),
+        rw.odometry.OdometryTrack(CAMERA, sequence.stamps_ns, sequence.T_map_camera),
     ]
-    found = rw.calibrate_odometries(tracks, reference=BODY)
-    T, covariance = found.T[CAMERA], found.covariance(CAMERA)
-    return found.verdict.value, T, covariance, found.degrees_of_freedom, tuple(map(str, found.grounds))
+    found = rw.odometry.calibrate_odometries(tracks, reference=BODY)
+    grounds = tuple(ground.value for ground in found.judgement.grounds)
+    covariance = found.covariance_of(CAMERA)
+    T = found.T_reference_sensor[CAMERA] if np.isfinite(covariance).all() else np.full((4, 4), np.nan)
+    return found.judgement.verdict.value, T, covariance, np.inf, grounds
 
 
 ROADS = {"stream": stream, "odometry": odometry}
@@ -224,15 +226,12 @@ def rows_of(runs: list[dict[str, Any]]) -> list[Row]:
             said = " ".join(
                 f"{v} {sum(o['verdict'] == v for o in of)}" for v in ("use", "care", "do_not_use", "refused")
             )
-            middle = {
-                k: float(np.median([one[k] for one in of if k in one] or [np.nan]))
-                for k in ("chi2", "deg", "mm", "sigma_deg", "sigma_mm", "seconds")
-            }  # noqa: E501
             bad = sum(one["verdict"] == "use" and one.get("chance", 1.0) < 1e-4 for one in of)
-            figure = (
-                f"{share}; {said}; wrong with use {bad}; medians: chi2 {middle['chi2']:.2g}, off {middle['deg']:.2g} deg "
-                f"{middle['mm']:.2g} mm, claimed {middle['sigma_deg']:.2g} deg {middle['sigma_mm']:.2g} mm, {middle['seconds']:.1f} s"
+            medians = " ".join(
+                f"{key} {float(np.median([one[key] for one in of if key in one] or [np.nan])):.2g}"
+                for key in ("chi2", "deg", "sigma_deg", "mm", "sigma_mm", "seconds")
             )
+            figure = f"{share}; {said}; wrong with use {bad}; medians: {medians}"
             rows.append(Row(f"{by} {name}", figure, "90 to 99 %", share.meets(0.90, 0.99)))
     return rows
 

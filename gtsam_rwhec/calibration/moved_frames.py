@@ -330,10 +330,10 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
     return replace(found, from_row=_moment(kept[0])[0] if len(kept) == 1 else None)
 
 
-#: So many outliers of two mixed sensors agree on the second; their boards' turns may be wrong, so not most of them do.
+#: So many outliers of two mixed sensors agree on the second, and this share of all: boards' turns may be wrong. Where
+#: the second camera's lens is another one, they agree within a share of their angle and distance only, but most do.
 FEWEST_MIXED = 3
-#: They agree within this share of their angle and distance, too: the second camera's lens is another one.
-OTHER_LENS = 0.15
+MIXED_SHARES = ((0.25, 0.0), (0.5, 0.15))
 #: Each of so many outliers, evenly over the rows, is tried as the one that the others agree with.
 ANCHORS = 50
 
@@ -354,11 +354,12 @@ def mixed_sensors(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPos
         if len(away) < FEWEST_MIXED:
             continue
         anchors = away[:: -(-len(away) // ANCHORS)]
-        alike = (
-            (_sizes(away - one) <= np.maximum(near, OTHER_LENS * _sizes(one[None]))).all(axis=1) for one in anchors
-        )
-        agree = max(alike, key=np.count_nonzero)
-        if agree.sum() < FEWEST_MIXED:
+        for share, loose in MIXED_SHARES:
+            alike = ((_sizes(away - one) <= np.maximum(near, loose * _sizes(one[None]))).all(axis=1) for one in anchors)
+            agree = max(alike, key=np.count_nonzero)
+            if agree.sum() >= max(FEWEST_MIXED, share * len(away)):
+                break
+        else:
             continue
         middle, of_target = np.median(away[agree], axis=0), of_target[~kept][agree]
         spreads = [

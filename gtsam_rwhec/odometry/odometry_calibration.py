@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from rwhec_factors import se3
+from scipy.special import chdtrc
 
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -32,7 +36,7 @@ from gtsam_rwhec.odometry.window_motions import (
 )
 from gtsam_rwhec.odometry.window_solution import FEWEST, Answer, Task, solve_windows, too_few
 from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
-from gtsam_rwhec.runs.odometry_cleaning import gated
+from gtsam_rwhec.runs.odometry_cleaning import Gated, gated
 
 #: If the drive does not determine a time offset, it stays within about this many seconds of the first guess.
 CLOCK_SIGMA_S = 0.05
@@ -95,7 +99,6 @@ def calibrate_odometries(
     tell = progress or silent
     tracks = _ordered(tracks, reference, given)
     given.checked([track.sensor for track in tracks], reference)
-    names = tuple(track.sensor for track in tracks)
     tell("comparing clocks")
     check_common_time(tracks, options.search_s if options.estimate_time_offsets else 0.0)
     gates = [gated(track, options.gates) for track in tracks]
@@ -105,46 +108,115 @@ def calibrate_odometries(
         first_offset(gates[0].track, gate.track, options) if options.estimate_time_offsets else Clock(0.0)
         for gate in gates[1:]
     ]
-    origin = int(tracks[0].stamps_ns[0])
-    offsets = np.array([clock.offset_s for clock in clocks])
-    scaled = np.array([track.has_unknown_scale for track in tracks])
-
+    drive = _Drive(tuple(tracks), tuple(gates), tuple(clocks), reference, given, options, tell)
     tell("choosing windows")
-    answer: Answer | None = None
-    seconds = options.window_s
-    variances: Array = np.zeros((0, 2))
-    for _ in range(CLOCK_ROUNDS):
-        samples = [
-            SampledTrack(gate.track, origin, float(offset), gate.good)
-            for offset, gate in zip(offsets, gates, strict=True)
-        ]
-        seconds = seconds or best_length(samples, options.max_gap_s)
-        edges = edges_near(samples, seconds)
-        windows = WindowMotions.of(samples, edges, options.max_gap_s, clocks=options.estimate_time_offsets)
-        _check_windows(windows, names)
-        if answer is None:
-            variances = _first_variances(windows, tracks)
-            _check_turning(samples, options, variances)
-        normal, sigma = up_direction(given, windows, variances, reference)
-        rows = GivenRows(given, {name: k for k, name in enumerate(names)}, normal, sigma, CLOCK_SIGMA_S)
-        layout = Layout.of(scaled, clocks=options.estimate_time_offsets, has_ground=rows.has_ground)
-        stated = np.array([track.noise is not None for track in tracks])
-        task = Task(names, scaled, stated, layout, rows, options.reject_outliers)
-        answer = solve_windows(windows, variances, task, answer.fit.state if answer else None, tell)
-        variances = answer.variances
-        change = answer.fit.state.offset
-        offsets = offsets + change
-        if float(np.abs(change).max()) < SAME_CLOCK_S:
+    first = drive.calibrated(options.window_s)
+    return first if options.window_s else _agreeing(drive, first)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """What calibrations with windows of different lengths share."""
+
+    tracks: tuple[OdometryTrack, ...]
+    gates: tuple[Gated, ...]
+    clocks: tuple[Clock, ...]
+    reference: str
+    given: Given
+    options: OdometryOptions
+    tell: Progress
+
+    def calibrated(self, seconds: float | None) -> OdometryCalibration:
+        """The calibration with windows of about this length; None: of that with the most information."""
+        tracks, gates, clocks, given, options = self.tracks, self.gates, self.clocks, self.given, self.options
+        names = tuple(track.sensor for track in tracks)
+        origin = int(tracks[0].stamps_ns[0])
+        offsets = np.array([clock.offset_s for clock in clocks])
+        scaled = np.array([track.has_unknown_scale for track in tracks])
+        answer: Answer | None = None
+        variances: Array = np.zeros((0, 2))
+        for _ in range(CLOCK_ROUNDS):
+            samples = [
+                SampledTrack(gate.track, origin, float(offset), gate.good)
+                for offset, gate in zip(offsets, gates, strict=True)
+            ]
+            seconds = seconds or best_length(samples, options.max_gap_s)
+            edges = edges_near(samples, seconds)
+            windows = WindowMotions.of(samples, edges, options.max_gap_s, clocks=options.estimate_time_offsets)
+            _check_windows(windows, names)
+            if answer is None:
+                variances = _first_variances(windows, tracks)
+                _check_turning(samples, options, variances)
+            normal, sigma = up_direction(given, windows, variances, self.reference)
+            rows = GivenRows(given, {name: k for k, name in enumerate(names)}, normal, sigma, CLOCK_SIGMA_S)
+            layout = Layout.of(scaled, clocks=options.estimate_time_offsets, has_ground=rows.has_ground)
+            stated = np.array([track.noise is not None for track in tracks])
+            task = Task(names, scaled, stated, layout, rows, options.reject_outliers)
+            answer = solve_windows(windows, variances, task, answer.fit.state if answer else None, self.tell)
+            variances = answer.variances
+            change = answer.fit.state.offset
+            offsets = offsets + change
+            if float(np.abs(change).max()) < SAME_CLOCK_S:
+                break
+        assert answer is not None
+        _check_agreement(answer, names)
+        begins = origin + np.round(windows.start * 1e9).astype(np.int64)
+        removed = {
+            name: gate.removed + _outlying(begins, left_out)
+            for name, gate, left_out in zip(names, gates, answer.left_out, strict=True)
+        }
+        self.tell("gathering")
+        return calibration_of(answer, task, tracks, self.reference, offsets, clocks, removed, origin)
+
+
+#: The answer is compared with those of windows of these lengths, s: an error that is no random walk (white noise of a
+#: pose, a clock, a map that bends) weighs otherwise in short and in long windows.
+OTHER_WINDOWS_S = (0.5, 2.0)
+#: Windows count as longer from this factor on.
+LONGER = 1.5
+#: Answers disagree where chance makes such a difference in fewer drives than this.
+BY_CHANCE = 1e-3
+
+
+def _agreeing(drive: _Drive, first: OdometryCalibration) -> OdometryCalibration:
+    """The answer of the shortest windows with which those of all longer ones agree; doubted where some disagree."""
+    answers, why = [first], ""
+    for seconds in OTHER_WINDOWS_S:
+        if seconds > LONGER * answers[-1].windows.seconds:
+            drive.tell(f"comparing with windows of {seconds:g} s")
+            try:
+                answers.append(drive.calibrated(seconds))
+            except (CountError, OutlierError, UnderdeterminedError) as error:  # too few windows of that length
+                why = str(error)
+    if why and len(answers) == 1:
+        words = f"answers from windows of other lengths could not be compared: {why}"
+        return replace(first, findings=(*first.findings, Finding(Ground.NOT_CHECKED, words)))
+    words = ""
+    for k, answer in enumerate(answers):
+        off = next(filter(None, (_disagreement(answer, other) for other in answers[k + 1 :])), "")
+        if not off:
             break
-    assert answer is not None
-    _check_agreement(answer, names)
-    begins = origin + np.round(windows.start * 1e9).astype(np.int64)
-    removed = {
-        name: gate.removed + _outlying(begins, left_out)
-        for name, gate, left_out in zip(names, gates, answer.left_out, strict=True)
-    }
-    tell("gathering")
-    return calibration_of(answer, task, tracks, reference, offsets, clocks, removed, origin)
+        words = words or off
+    if not words:
+        return first
+    words += f". Its errors are no random walk; the poses are from windows of {answer.windows.seconds:.2g} s"
+    return replace(answer, findings=(*answer.findings, Finding(Ground.COVARIANCE_DOUBTED, words)))
+
+
+def _disagreement(one: OdometryCalibration, other: OdometryCalibration) -> str:
+    """The sensor that is elsewhere with windows of another length, in words; empty where none is beyond chance."""
+    for name in one.order:
+        both = one.covariance_of(name) + other.covariance_of(name)
+        if not np.isfinite(both).all():
+            continue
+        error = se3.logmap((np.linalg.inv(one.T_reference_sensor[name]) @ other.T_reference_sensor[name])[None])[0]
+        if chdtrc(6, float(error @ np.linalg.solve(both, error))) < BY_CHANCE:
+            apart = f"{np.degrees(np.linalg.norm(error[:3])):.2g} degrees and {1e3 * np.linalg.norm(error[3:]):.3g} mm"
+            return (
+                f"{name} is {apart} elsewhere with windows of {other.windows.seconds:.2g} s than with those of "
+                f"{one.windows.seconds:.2g} s, which is more than both claim"
+            )
+    return ""
 
 
 def _ordered(tracks: Sequence[OdometryTrack], reference: str, given: Given) -> list[OdometryTrack]:

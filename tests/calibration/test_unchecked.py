@@ -36,11 +36,12 @@ def path(hertz: float, *, without: tuple[float, float] = (0.0, 0.0)) -> Trajecto
 
 
 def stream(seconds: Array, *, A: Array | None = None, wrong: Array | list[int] = (), late_s: float = 0.0) -> rw.Problem:
-    """Measurements of a moving camera, some of which are half a metre off."""
+    """Measurements of a moving camera, some of which are 0.8 m off, each elsewhere."""
     chance = np.random.default_rng(0)
     true = np.array([made.hand(float(t)) for t in seconds + late_s])
     B = noisy(chance, true, 0.002)
-    B[np.array(wrong, dtype=int), :3, 3] += 0.5
+    off = chance.normal(size=(len(wrong), 3))
+    B[np.array(wrong, dtype=int), :3, 3] += 0.8 * off / np.linalg.norm(off, axis=1)[:, None]
     if A is None:
         A = np.array([made.hand(float(t)) for t in seconds])
     return problem_of(A, B, stamps_ns=ns(seconds))
