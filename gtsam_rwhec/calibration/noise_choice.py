@@ -259,10 +259,6 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
         )
 
 
-#: Standard deviations that blocks of the log make larger by more than this factor are those of errors nobody knows.
-LARGELY = 2.0
-
-
 def _say_blocks(run: Run, model: NoiseInData) -> None:
     """Record whether blocks of the log agree as well as the noise allows; if they do not by far, add a finding."""
     if not model.scatter:
@@ -272,7 +268,7 @@ def _say_blocks(run: Run, model: NoiseInData) -> None:
         run.record.choose("blocks of the log", "agree as well as the noise allows", str(model.scatter[0]))
         return
     run.record.choose("blocks of the log", "do not agree; the standard deviations are larger for it", str(worst))
-    if worst.ratio > LARGELY**2:
+    if worst.is_by_far:
         words = f"{worst}: errors are of another kind than any model of the noise that was tried, and last for long"
         run.record.find(Ground.CORRELATED, words)
 

@@ -36,6 +36,8 @@ FEWEST = 10
 HELD = 1e-4
 #: A frame's blocks scatter too much where chance makes so much in fewer logs than this.
 BY_CHANCE = 1e-3
+#: Standard deviations that are too small by more than this factor are those of errors that nobody knows.
+LARGELY = 2.0
 #: Degrees of freedom of the noise beside which the scatter is judged, and those of the widened covariance, at least.
 LEAST_FREEDOM = 3.0
 
@@ -61,6 +63,11 @@ class Scatter:
     def is_too_much(self) -> bool:
         """Whether chance hardly makes so much."""
         return self.chance < BY_CHANCE
+
+    @property
+    def is_by_far(self) -> bool:
+        """Whether the errors are of another kind than the model's, so that no factor makes up for it."""
+        return self.ratio > LARGELY**2
 
     def __str__(self) -> str:
         cut = "halves" if self.blocks == 2 else f"{self.blocks} blocks"
@@ -98,7 +105,10 @@ def scatter_of_blocks(task: Task, found: Settled) -> tuple[Scatter, ...]:
             parts = [block_of(model, sigma, block == j, whole.covariance, spread) for j in range(count)]
             result.append(
                 min(
-                    (_scatter(name, rows, by, parts, whole.step, whole.covariance) for name, rows in frames.items()),
+                    (
+                        scatter_about(name, rows, by, parts, whole.step, whole.covariance)
+                        for name, rows in frames.items()
+                    ),
                     key=lambda one: one.chance,
                 )
             )
@@ -153,9 +163,14 @@ def block_of(
     return information - held, information @ estimate.step
 
 
-def _scatter(
+def scatter_about(
     frame: str, rows: Array, by: str, parts: list[tuple[Array, Array]], answer: Array, covariance: Array
 ) -> Scatter:
+    """The scatter of what blocks say of a frame.
+
+    ``rows`` (6, p) make its twist of the unknowns; ``parts`` are the blocks' information (p, p) and gradient (p,);
+    ``answer`` (p,) and ``covariance`` (p, p) are those of the whole.
+    """
     reach = rows @ covariance
     moves = np.array([reach @ (b - information @ answer) for information, b in parts])
     reached = np.array([reach @ information for information, _ in parts])

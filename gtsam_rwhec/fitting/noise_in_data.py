@@ -92,6 +92,8 @@ class NoiseInData:
     constant_deviations: tuple[tuple[float, ...], ...] = ((0.0,) * 6,) * 2
     #: How much blocks of the log scatter, for each way to cut it; empty of few instants.
     scatter: tuple[Scatter, ...] = ()
+    #: How often the errors of a track jump: it was cut there.
+    jumps: int = 0
 
     @property
     def has_systematic(self) -> bool:
@@ -157,6 +159,8 @@ class NoiseInData:
                 f"({ratio_words(self.systematic_evidence)}): {100.0 * self.systematic_probability:.0f} % probable. "
                 "Their constant part, which residuals do not show, is assumed to be twice as large."
             )
+        if self.jumps:
+            said.append(f"The errors jump {self.jumps} times, as where loops are closed; the track is cut there.")
         worst = too_much(self.scatter)
         if worst is not None:
             said.append(
@@ -189,8 +193,9 @@ NEARER = 4.0
 #: An arm's constant error, over what varies with the configuration: in 300 simulated arms 1.4 to 3.1 (rotation) and
 #: 0.9 to 1.9 (translation), by the spread of the configurations.
 CONSTANT = 2.0
-#: No arm's poses are farther apart (m).
-FARTHEST_M = 5.0
+#: No arm's poses are farther apart (m). The constant error is then of a map, and of six bent
+#: ones that were flown over this held all (chi2(6) of .6 to 2.2).
+FARTHEST_M, CONSTANT_OF_TRACKER = 5.0, 0.5
 #: Before the data, the odds that an arm has errors that matter beside the noise of detections: one in seven.
 LOG_ODDS = -2.0
 
@@ -265,6 +270,7 @@ def noise_in(
         systematic_probability=_probability(task, found),
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
         scatter=scatter,
+        jumps=len(task.jumps),
     )
 
 
@@ -299,7 +305,7 @@ def is_drift_untried(task: Task, found: Settled) -> bool:
 def is_no_arm(task: Task) -> bool:
     """Whether the carriers' poses are farther apart than an arm reaches: then they come from a tracker.
 
-    A tracker defines where the frames of what it tracks are, so no constant error can hide there, as an arm's does.
+    A tracker defines where the frames of what it tracks are. So what is constant is of a map that is bent, and smaller.
     """
     A = np.concatenate([item.residuals.A for item in task.data])
     ways = (A[:, :3, 3], se3.inverse(A)[:, :3, 3])  # of an arm in a far world, one of both is wide
@@ -315,10 +321,11 @@ def constant_variances(task: Task, found: Settled, state: State, mixture: Mixtur
     hardly show the part that varies, it may not be there: the ellipsoid is that of the average over both models.
     """
     active = found.fit.sizes.active
-    if C.SYSTEMATIC_ROTATION not in active or is_no_arm(task):
+    if C.SYSTEMATIC_ROTATION not in active:
         return np.zeros(6), np.zeros(6)
+    share = CONSTANT_OF_TRACKER if is_no_arm(task) else CONSTANT
     places = [active.index(c) for c in (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)]
-    deviations = CONSTANT * np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)
+    deviations = share * np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)
     probability = _probability(task, found)
 
     def of(poses: dict[str, gtsam.Pose3]) -> Array:

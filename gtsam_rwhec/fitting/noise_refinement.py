@@ -123,6 +123,7 @@ def under_noise(
     space = free_space_of(parts_of(problem), variables, state, data)
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
     task = Task(problem, data, variables, layout, Instants.of(data), options, space.directions, tell)
+    task = task.cut_at_jumps(state)
     found = settled(task, state, tell, before)
     return UnderNoise(task, found, solution, how)
 
@@ -174,6 +175,7 @@ def agreeing(
             for item in data_of(judged, variables, how)
         ]
         everything = replace(task, problem=judged, data=data, variables=variables, instants=Instants.of(data))
+        everything = everything.cut_at_jumps(state)
         for _ in range(STEPS):
             there = everything.model_like(found.model, state)
             step = there.evaluate(sigma)

@@ -10,7 +10,7 @@ track; u_k are the arm's systematic errors, which vary smoothly with its configu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import gtsam
@@ -68,6 +68,12 @@ class Instants:
         """The number of instants."""
         return len(self.first)
 
+    def cut(self, jumps: np.ndarray) -> Instants:
+        """The same, with as good as nothing known of a drift across some instants (J,)."""
+        step = self.step.copy()
+        step[jumps] = np.maximum(step[jumps], ACROSS)
+        return replace(self, step=step)
+
     @staticmethod
     def of(data: list[PairData]) -> Instants:
         """An instant has the measurements of one A (and stamp, where there are any), standstill or station."""
@@ -105,6 +111,30 @@ class Instants:
             step = step / np.median(usual) if len(usual) else np.ones(len(first))
             step = np.clip(step, 1e-3, 1e3)
         return Instants(order, first, index, chain, chains, np.where(begins, 0.0, step), seconds)
+
+
+#: A jump is judged by the medians of so many instants before and after it; beyond so many of their usual differences.
+BESIDE, FAR_OFF = 5, 6.0
+#: Across a jump the errors are known as little as after so many steps.
+ACROSS = 1e3
+
+
+def jumps_in(residual: Array, instants: Instants) -> np.ndarray:
+    """The instants (J,) at which a track's residuals (N, 6) step from one level to another: where a loop was closed."""
+    if instants.chains > 1 or instants.count < 8 * BESIDE:
+        return np.zeros(0, dtype=np.int64)
+    each = residual[instants.first]
+    windows = np.median(np.lib.stride_tricks.sliding_window_view(each, BESIDE, axis=0), axis=2)
+    step = windows[BESIDE:] - windows[:-BESIDE]  # of instant k + BESIDE, from the one before it
+    begins = np.convolve(instants.step == 0.0, np.ones(2 * BESIDE - 1))[2 * BESIDE - 1 : -1][: len(step)] > 0
+    usual = np.median(np.abs(step - np.median(step, axis=0)), axis=0) / 0.6745
+    score = (np.abs(step) / np.maximum(usual, 1e-12)).max(axis=1) * ~begins
+    found = []
+    while len(score) and score.max() > FAR_OFF:
+        k = int(np.argmax(score))
+        found.append(k + BESIDE)
+        score[max(k - BESIDE, 0) : k + BESIDE + 1] = 0.0
+    return np.sort(np.array(found, dtype=np.int64))
 
 
 def standstills(A: Array, stamps: np.ndarray) -> np.ndarray:

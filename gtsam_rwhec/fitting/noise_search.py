@@ -27,7 +27,7 @@ from gtsam_rwhec.fitting.fit_options import (
 )
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
-from gtsam_rwhec.fitting.noise_rows import Instants, Rows, prior_terms
+from gtsam_rwhec.fitting.noise_rows import Instants, Rows, jumps_in, prior_terms
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.unknowns import State, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
@@ -73,6 +73,8 @@ class Task:
     free_directions: tuple[FreeDirection, ...] = ()
     #: Is told each round, so that a long model is seen to move.
     tell: Progress = silent
+    #: The instants at which tracks are cut.
+    jumps: tuple[int, ...] = ()
     _known: list[tuple[State, Rows]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -106,12 +108,15 @@ class Task:
         del self._known[:-KEPT]
         return self._known[-1][1]
 
+    def cut_at_jumps(self, state: State) -> Task:
+        """The task with the tracks cut where residuals at an estimate jump: a drift does not reach across."""
+        jumps = jumps_in(self._rows(state).residual, self.instants)
+        return replace(self, instants=self.instants.cut(jumps), jumps=tuple(jumps.tolist())) if len(jumps) else self
+
     def sizes(self, model: NoiseModel, *, systematic: bool) -> Sizes:
         """The components' ranges, by the residuals at the start."""
-        typical = typical_sizes(
-            model.rows, model.drift, has_scale=bool(self.variables.scale_of_pair),
-            carrier=self.options.carrier, systematic=systematic and model.features.shape[1] > 0,
-        )  # fmt: skip
+        systematic = systematic and model.features.shape[1] > 0
+        typical = typical_sizes(model.rows, model.drift, carrier=self.options.carrier, systematic=systematic)
         return Sizes.of(typical, {c: s for c, s in self.options.stated.items() if c in typical})
 
     def settle(
@@ -280,9 +285,7 @@ def likeness_of_neighbours(tracks: Sequence[Array]) -> float:
 QUIETEST = 1e-7
 
 
-def typical_sizes(
-    rows: Rows, drift: DriftPrior | None, *, has_scale: bool, carrier: bool, systematic: bool
-) -> dict[Component, float]:
+def typical_sizes(rows: Rows, drift: DriftPrior | None, *, carrier: bool, systematic: bool) -> dict[Component, float]:
     """The components that are in the model, with their typical sizes."""
     r = rows.residual
     size_r, size_t = (max(float(np.sqrt(np.median((part**2).mean(axis=1)))), QUIETEST) for part in (r[:, :3], r[:, 3:]))
@@ -312,7 +315,7 @@ def typical_sizes(
             C.DRIFT_TRANSLATION: size_t / steps,
             C.DRIFT_SCALE: size_t / length / steps,
         }
-        active += DRIFT if has_scale else DRIFT[:2]
+        active += DRIFT
     if systematic:
         active += SYSTEMATIC
     return {component: typical[component] for component in active}

@@ -9,12 +9,13 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.fitting.block_agreement import Scatter, scatter_about, too_much
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
 from gtsam_rwhec.odometry.prior_knowledge import upside_down
 from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
-from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE
+from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE, Linear, eliminated
 from gtsam_rwhec.odometry.window_motions import axes_turned
 from gtsam_rwhec.odometry.window_solution import REACHES, Answer, Task, refined, seven_each
 from gtsam_rwhec.results.removed_measurements import Removed
@@ -38,7 +39,9 @@ def calibration_of(
     change, T, order = _in_frame_of(reference, task, state.T)
     scaled = [name for k, name in enumerate(names) if task.scaled[k]]
     C = answer.freedom.covariance()
-    covariance = change @ C @ change.T
+    scatter = _scatter_of_blocks(answer, task, change, order)
+    worst = too_much(scatter)
+    covariance = change @ C @ change.T * (1.0 if worst is None else worst.ratio)
     left = change @ answer.freedom.left
     if left.shape[1]:
         reached = (np.abs(left) > REACHES * np.abs(left).max(axis=0)).any(axis=1)
@@ -79,9 +82,40 @@ def calibration_of(
         residuals=sizes,
         influences=_influences(answer, task, change, order),
         others=others,
-        findings=tuple(_findings(answer, task, tracks, clocks, sigmas, sizes)),
+        findings=(*_findings(answer, task, tracks, clocks, sigmas, sizes), *_of_blocks(worst)),
         remarks=_remarks(task),
     )
+
+
+#: The windows are cut into so many blocks of time, with at least so many windows in each.
+BLOCKS, FEWEST_IN_BLOCK = (2, 4, 8), 8
+
+
+def _scatter_of_blocks(answer: Answer, task: Task, change: Array, order: tuple[str, ...]) -> list[Scatter]:
+    """How much blocks of time scatter, for each number of them and for the sensor for which it is most by chance."""
+    linear, count, found = answer.fit.linear, len(answer.windows), []
+    inverse, still = answer.freedom.inverse(), np.zeros(task.layout.size)
+    for blocks in BLOCKS if not answer.freedom.left.shape[1] else ():
+        if count < blocks * FEWEST_IN_BLOCK:
+            continue
+        parts = []
+        for rows in np.array_split(np.arange(count), blocks):
+            there = Linear(linear.r[:, rows], linear.J[:, rows], linear.B[:, rows])
+            normal = eliminated(there, answer.W[:, rows], task.layout)
+            parts.append((normal.H, normal.g))
+        each = (
+            scatter_about(name, change[6 * k : 6 * k + 6], "time", parts, still, inverse)
+            for k, name in enumerate(order)
+        )
+        found.append(min(each, key=lambda one: one.chance))
+    return found
+
+
+def _of_blocks(worst: Scatter | None) -> tuple[Finding, ...]:
+    """The finding that blocks disagree by far; the covariance is already as much larger."""
+    if worst is None or not worst.is_by_far:
+        return ()
+    return (Finding(Ground.CORRELATED, f"{worst}: its errors are no random walk, and last for long"),)
 
 
 def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tuple[str, ...]]:

@@ -133,7 +133,7 @@ def _settled(
         if len(other.directions) < len(space.directions):
             state, space = there, other
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
-    task = Task(problem, data, variables, layout, Instants.of(data), noise, space.directions, tell)
+    task = Task(problem, data, variables, layout, Instants.of(data), noise, space.directions, tell).cut_at_jumps(state)
     return task, settled(task, state, tell)
 
 
