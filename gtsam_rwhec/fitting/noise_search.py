@@ -116,7 +116,11 @@ class Task:
     def sizes(self, model: NoiseModel, *, systematic: bool) -> Sizes:
         """The components' ranges, by the residuals at the start."""
         systematic = systematic and model.features.shape[1] > 0
-        typical = typical_sizes(model.rows, model.drift, carrier=self.options.carrier, systematic=systematic)
+        typical = typical_sizes(
+            model.rows, model.drift, has_scale=bool(self.variables.scale_of_pair), carrier=self.options.carrier,
+            systematic=systematic,
+        )  # fmt: skip
+
         return Sizes.of(typical, {c: s for c, s in self.options.stated.items() if c in typical})
 
     def settle(
@@ -285,7 +289,9 @@ def likeness_of_neighbours(tracks: Sequence[Array]) -> float:
 QUIETEST = 1e-7
 
 
-def typical_sizes(rows: Rows, drift: DriftPrior | None, *, carrier: bool, systematic: bool) -> dict[Component, float]:
+def typical_sizes(
+    rows: Rows, drift: DriftPrior | None, *, has_scale: bool, carrier: bool, systematic: bool
+) -> dict[Component, float]:
     """The components that are in the model, with their typical sizes."""
     r = rows.residual
     size_r, size_t = (max(float(np.sqrt(np.median((part**2).mean(axis=1)))), QUIETEST) for part in (r[:, :3], r[:, 3:]))
@@ -315,7 +321,8 @@ def typical_sizes(rows: Rows, drift: DriftPrior | None, *, carrier: bool, system
             C.DRIFT_TRANSLATION: size_t / steps,
             C.DRIFT_SCALE: size_t / length / steps,
         }
-        active += DRIFT
+        # What walks is a trajectory, whose scale may walk too; a tag's size stays, and a late clock looks like that.
+        active += DRIFT if has_scale or (drift.correlation == 1.0 and drift.walk.frame != "detection") else DRIFT[:2]
     if systematic:
         active += SYSTEMATIC
     return {component: typical[component] for component in active}
