@@ -21,6 +21,7 @@ from gtsam_rwhec.errors import (
     StampError,
     UnderdeterminedError,
 )
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate.drives import Drive, SimulatedOdometry
 from gtsam_rwhec.simulate.drives import drive as simulated_drive
 
@@ -196,3 +197,32 @@ def test_heights_are_asked_for_the_ground_where_the_reference_may_hang_upside_do
     given = odometry.Given(heights_m={"rear": (1.0, 0.01), "wheels": (1.0, 0.01)}, ground=ground)
     found = odometry.calibrate_odometries(tracks(driven), reference="lidar", given=given, options=ONE_CLOCK)
     assert found.judgement.verdict == "use"
+
+
+def test_answers_from_short_and_long_windows_must_agree() -> None:
+    """A map that bends: short and long windows, or blocks of them, say more different things than they claim."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 60.0, 0.05)
+    frequency, phase = rng.uniform(0.05, 0.5, (6, 6)), rng.uniform(0.0, 6.28, (6, 6))
+    twist = np.sin(2.0 * np.pi * frequency * t[:, None, None] + phase).sum(axis=1) * [0.2, 0.2, 0.4, 0.5, 0.5, 0.2]
+    body = se3.expmap(twist * [1, 1, 1, 0, 0, 0])
+    body[:, :3, 3] = twist[:, 3:]
+    T_body_camera = se3.expmap(np.array([[0.3, -0.2, 0.1, 0.1, 0.05, -0.08]]))[0]
+    camera = np.linalg.inv(body[0] @ T_body_camera) @ body @ T_body_camera
+    about = camera[:, :3, 3] @ rng.normal(0.0, 0.02, (3, 3))
+    bent = camera.copy()
+    bent[:, :3, :3] = se3.expmap(np.c_[about, 0.0 * about])[:, :3, :3] @ camera[:, :3, :3]
+    noise = rng.normal(size=(2, len(t), 6)) * np.repeat([3e-4, 5e-4], 3)
+    stamps = np.round(1e9 * t).astype(np.int64)
+
+    def calibrated(of_camera: Array) -> odometry.OdometryCalibration:
+        tracks = [
+            odometry.OdometryTrack("body", stamps, np.linalg.inv(body[0]) @ body @ se3.expmap(noise[0])),
+            odometry.OdometryTrack("camera", stamps, of_camera @ se3.expmap(noise[1])),
+        ]
+        return odometry.calibrate_odometries(tracks, reference="body")
+
+    assert calibrated(camera).judgement.verdict is Verdict.USE
+    found = calibrated(bent)
+    assert found.judgement.verdict is Verdict.CARE
+    assert {Ground.COVARIANCE_DOUBTED, Ground.CORRELATED}.intersection(found.judgement.grounds)
