@@ -61,6 +61,7 @@ from .fitting import refine_corners as refine_corners
 # Keep it in files, print it, draw it; what changed since, and whether it still holds.
 from . import report as report
 from . import results as results
+from .results import accept as accept
 from .results import judge as judge
 from .results import read_refined as read_refined
 from .results import read_solution as read_solution

@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.calibrate_command import calibrate
 from gtsam_rwhec.cli.compare_methods import compare
-from gtsam_rwhec.cli.compare_results import diff, verify
+from gtsam_rwhec.cli.compare_results import accept, diff, verify
 from gtsam_rwhec.cli.convert_command import convert
 from gtsam_rwhec.cli.demo_and_data import demo, utias
 from gtsam_rwhec.cli.failures import HELP, ExitStatus, failures_in_words
@@ -78,7 +78,7 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff, verify):
+for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff, verify, accept):
     add(subcommand, app)
 add(utias, fetch_app)
 add(run, fleet_app)

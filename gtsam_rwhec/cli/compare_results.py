@@ -1,4 +1,4 @@
-"""``gtsam-rwhec diff``: what changed from one calibration to the next."""
+"""``diff``, ``verify`` and ``accept``: what changed, whether a calibration still holds, and whether it is good enough."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from gtsam_rwhec.cli.failures import ExitStatus, check_output
 from gtsam_rwhec.cli.report_command import read_of
 from gtsam_rwhec.cli.shared_options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.errors import FileFormatError, OptionError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
 #: A copy of ``rw.results.LEVEL``, as ``--help`` must not import that.
 LEVEL = 0.01
+#: A copy of ``rw.results.acceptance.LEVEL``.
+PROBABILITY = 0.95
 RESULT_HELP = "result.json, or the folder that calibrate wrote."
 LevelOption = Annotated[
     float, typer.Option(help="How often it may say that something changed where nothing did: 0.01 is once in 100.")
@@ -145,6 +147,90 @@ def verify(
     if not found.holds:
         return ExitStatus.CHANGED
     return ExitStatus.NOT_UNIQUE if found.unchecked_sensors else ExitStatus.DONE
+
+
+#: The exit status of each answer of ``accept``.
+STATUSES = {
+    "accepted": ExitStatus.DONE,
+    "not_accepted_yet": ExitStatus.NOT_UNIQUE,
+    "not_determined": ExitStatus.NOT_UNIQUE,
+    "rejected": ExitStatus.CHANGED,
+}
+
+
+def accept(
+    result: Annotated[Path, typer.Argument(help=f"The calibration: {RESULT_HELP}")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV file of touches (columns sensor_x_m, sensor_y_m, sensor_z_m, known_x_m, known_y_m, known_z_m), or "
+            f"measurements of a board that the calibration has not seen: as for verify, also a {FOLDER_OF_CSV}."
+        ),
+    ],
+    limit_mm: Annotated[float, typer.Option("--limit-mm", help="The largest allowed error of a point, mm.")],
+    sensor: Annotated[str | None, typer.Option(help="The sensor that is tested.", show_default="the only one")] = None,
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            help="Where it must hold: XMIN YMIN ZMIN XMAX YMAX ZMAX, m, in the frame that carries the sensor.",
+            show_default="the box around the points",
+        ),
+    ] = None,
+    ball: Annotated[
+        tuple[float, float, float, float] | None, typer.Option(help="The same as a ball: X Y Z RADIUS, m.")
+    ] = None,
+    level: Annotated[float, typer.Option(help="Probability of the statement.")] = PROBABILITY,
+    noise_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Standard deviation of one touch along an axis across the line of sight, and along it, mm.",
+            show_default="that of the residuals",
+        ),
+    ] = None,
+    known_to_mm: Annotated[
+        float, typer.Option(help="Error that all known points may share, as that of the tool tip, mm.")
+    ] = 0.0,
+    write: Annotated[bool, typer.Option("--write/--no-write", help="Whether the result file gets the answer.")] = True,
+    rig: RigOption = None,
+    targets: TargetsOption = "tag",
+    sensors: SensorsOption = "cam",
+    workers: WorkersOption = None,
+) -> ExitStatus:
+    """Whether a calibration is off by less than a limit in a volume: known points, or a new board, prove it with 95 %.
+
+    A calibration that is off by the limit is accepted in at most 5 % of all cases. Exit status 0: accepted. 1: rejected,
+    it is off by more. 3: not accepted yet, touch more; or the touches cannot tell.
+    """
+    if box is not None and ball is not None:
+        raise typer.BadParameter("give --box or --ball, not both")
+    volume = None if box is None else rw.results.Volume.box(box[:3], box[3:])
+    volume = volume if ball is None else rw.results.Volume.ball(ball[:3], ball[3])
+    old = rw.results.read_calibration(result)
+    with StageDisplay() as stage:
+        if rw.results.is_touches_file(source):
+            measured: rw.Problem | rw.results.Touches | None = rw.results.read_touches(source)
+        else:
+            if is_of_old_log(result, source):
+                raise OptionError(f"{source}: the calibration was made from it, which proves nothing: give a new one")
+            measured = _problem(source, old.solution.scale_mode, targets, sensors) if old.log is None else None
+        if measured is None:
+            found = rw.runs.accept_log(
+                result, source, None if rig is None else rw.rig.read_rig(rig), limit_mm=limit_mm, sensor=sensor,
+                volume=volume, level=level, noise_mm=noise_mm, known_to_mm=known_to_mm, workers=workers, progress=stage,
+            )  # fmt: skip
+        else:
+            stage("testing the poses")
+            found = rw.results.accept(
+                old, measured, limit_mm=limit_mm, sensor=sensor, volume=volume, level=level, noise_mm=noise_mm,
+                known_to_mm=known_to_mm,
+            )  # fmt: skip
+            found = replace(found, source=source.name)
+    rw.report.print_acceptance(found)
+    if write:
+        rw.results.write_acceptance(found, result)
+        file = shown_path(rw.results.result_path(result))
+        say(f"Written into {file}; gtsam-rwhec report {shown_path(result)} shows it.", to_errors=True)
+    return STATUSES[found.answer]
 
 
 def is_of_old_log(result: Path, source: Path) -> bool:

@@ -105,12 +105,13 @@ class ExitStatus(IntEnum):
     sensors and targets has a pose that the measurements determine and agree to."""
     CHANGED = 1
     """``diff``, ``fleet watch``: something changed by more than chance. ``verify``: the old one no longer holds.
+    ``accept``: it is off by more than the limit.
     ``fleet run``: a log or a robot failed, or the poses of one are not to be used."""
     BAD_INPUT = 2
     """An option, a file or a measurement cannot be used; the message says which."""
     NOT_UNIQUE = 3
     """The answer is certified, but the measurements do not determine every frame: do not use the poses. Or a target of
-    the rig file has too few measurements for any to be checked: do not use its pose."""
+    the rig file has too few measurements for any to be checked: do not use its pose. ``accept``: not accepted yet."""
     NOT_CERTIFIED = 4
     """The answer is not certified: a better answer may exist."""
     DOWNLOAD_FAILED = 5
@@ -123,8 +124,9 @@ class ExitStatus(IntEnum):
 
 
 HELP = (
-    "Exit status: 0 success, and the poses may be used; 1 diff, verify or fleet watch found a change, or some of a "
-    "fleet failed; 2 bad input; 3 the measurements do not determine every frame; 4 not proven optimal; 5 download "
+    "Exit status: 0 success, and the poses may be used; 1 diff, verify or fleet watch found a change, accept "
+    "rejected, or some of a fleet failed; 2 bad input; 3 the measurements do not determine every frame, or accept needs "
+    "more touches; 4 not proven optimal; 5 download "
     "failed; 6 the measurements contradict the answer (misread, a wrong size, a sensor or a target without an answer); "
     "130 interrupted."
 )

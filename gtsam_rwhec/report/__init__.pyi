@@ -1,3 +1,4 @@
+from .acceptance_section import print_acceptance as print_acceptance
 from .advice import certificate_sentence as certificate_sentence
 from .calibration_report import print_calibration as print_calibration
 from .calibration_report import print_refined as print_refined

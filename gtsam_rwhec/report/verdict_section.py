@@ -10,6 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Verdict, findings_of
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.report.acceptance_section import acceptance_blocks
 from gtsam_rwhec.report.advice import advice_of
 from gtsam_rwhec.report.report_blocks import (
     TONES,
@@ -50,6 +51,7 @@ def verdict_section(shown: ShownResult) -> Section:
     blocks: list[Block] = [Paragraph(f"{verdict.words}: {facts}.", TONES[verdict])]
     points = list(_points(shown))
     blocks += [block for block in points if isinstance(block, Paragraph)]
+    blocks += acceptance_blocks(shown)
     todo = list(_todo(shown, cure))
     if todo:
         blocks += [Paragraph("What to do next", "lead"), Listing(tuple(todo))]

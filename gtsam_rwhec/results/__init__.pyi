@@ -36,3 +36,13 @@ from .changed_frames import difference as difference
 from .verification import SensorCheck as SensorCheck
 from .verification import Verification as Verification
 from .verification import verify as verify
+
+# That it is off by less than a limit: known points, or a board that is new to it.
+from .acceptance import accept as accept
+from .acceptance import write_acceptance as write_acceptance
+from .acceptance_record import Acceptance as Acceptance
+from .acceptance_record import Answer as Answer
+from .acceptance_record import Volume as Volume
+from .touches import Touches as Touches
+from .touches import is_touches_file as is_touches_file
+from .touches import read_touches as read_touches

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from gtsam_rwhec.calibration.verdict import Choice
 from gtsam_rwhec.files.terminal_text import brief, printable, shown
+from gtsam_rwhec.results.acceptance_record import Acceptance
 from gtsam_rwhec.results.schema import PointFields
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.free_directions import FreeDirection
@@ -31,7 +32,7 @@ ROWS = ("residuals", "pairs", "noise", "inlier_counts")
 #: The field in which a record says in words what it means. It is for people and is not read back.
 SENTENCE = "sentence"
 #: Records with a sentence.
-SAID = (Certificate, FreeDirection, Choice, PointFields)
+SAID = (Certificate, FreeDirection, Choice, PointFields, Acceptance)
 #: Fields of a covariance of all unknowns; they have far more numbers than all others together.
 MATRICES = ("finite", "free", "unit")
 #: With more faults than this a message has their number alone: to list a million faults takes a gigabyte.
@@ -40,7 +41,7 @@ MOST_FAULTS = 1_000
 INFINITIES = {
     **dict.fromkeys(("lower_bound", "float_bound", "min_eigenvalue"), -math.inf),
     **dict.fromkeys(("weakest", "degrees_of_freedom", "standard_deviations_deg", "standard_deviations_mm"), math.inf),
-    **dict.fromkeys(("radius_mm", "stated_deviations", "innovation_deviations"), math.inf),
+    **dict.fromkeys(("estimate_mm", "upper_mm", "radius_mm", "stated_deviations", "innovation_deviations"), math.inf),
 }
 
 

@@ -19,6 +19,7 @@ from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.reprojection_record import SIZE, BoardShape, Intrinsics, Regions, lens_of
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.results.acceptance_record import Acceptance, Answer
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.schema import RefinedFields, SolutionFields
 from gtsam_rwhec.solver.certificate import Certificate, Status
@@ -92,6 +93,35 @@ def check_verdict(stated: Verdict, grounds: tuple[Ground, ...], found: Judgement
             f"$.verdict: the file says '{stated.value}' (grounds: {names[0]}), but its content leads to "
             f"'{found.verdict.value}' ({names[1]}); write it again"
         )
+
+
+def check_acceptance(acceptance: tuple[Acceptance, ...], sensors: Collection[str]) -> None:
+    """Each acceptance is of a sensor of the file, and its answer is the one that its bounds lead to."""
+    names = [one.sensor for one in acceptance]
+    _check_are_there(names, sensors, "$.acceptance", "sensors")
+    for index, one in enumerate(acceptance):
+        place = f"$.acceptance[{index}]"
+        if names.count(one.sensor) > 1:
+            raise ValueError(f"{place}.sensor: {shown(one.sensor)} is there twice; keep one")
+        for name in ("estimate_mm", "upper_mm", "lower_mm", "known_to_mm", "noise_mm", "degrees_of_freedom", "more"):
+            _check_not_negative(getattr(one, name), f"{place}.{name}")
+        _check_not_negative(one.volume.half_m, f"{place}.volume.half_m")
+        if not (one.limit_mm > 0.0 and 0.0 < one.level < 1.0 and one.count > 0):
+            raise ValueError(
+                f"{place}: a limit of {one.limit_mm} mm, level {one.level} and {one.count} {one.of} test nothing"
+            )
+        if not one.lower_mm <= one.upper_mm:
+            raise ValueError(f"{place}.lower_mm: {one.lower_mm} is above upper_mm, {one.upper_mm}")
+        leads_to = Answer.REJECTED if one.lower_mm > one.limit_mm else Answer.NOT_YET
+        if one.upper_mm < one.limit_mm:
+            leads_to = Answer.ACCEPTED
+        elif math.isinf(one.upper_mm):
+            leads_to = Answer.NOT_DETERMINED
+        if one.answer is not leads_to:
+            raise ValueError(
+                f"{place}.answer: '{one.answer}', but the limit, {one.limit_mm} mm, and the bounds, {one.lower_mm} to "
+                f"{one.upper_mm} mm, lead to '{leads_to}'"
+            )
 
 
 def check_log(log: LogFields) -> None:

@@ -22,9 +22,11 @@ from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.files.whole_files import checked_path, read_whole, write_atomically
 from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import movements
+from gtsam_rwhec.results.acceptance_record import Acceptance
 from gtsam_rwhec.results.json_tree import MOST_BYTES, POSED, from_json, in_words, parse_json, to_json
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_checks import (
+    check_acceptance,
     check_certificates,
     check_corners,
     check_joint,
@@ -64,6 +66,7 @@ class Result:
     refined: RefinedPoses | None  #: The refined calibration; None if the solution was not refined
     log: LogFields | None  #: What became of the measurements; None if they do not come from a log
     calibration: CalibrationFields | None = None  #: What ``calibrate`` found and chose; None if it did not run
+    acceptance: tuple[Acceptance, ...] = ()  #: By sensor, what `gtsam_rwhec.accept` showed of it
 
     @property
     def free_directions(self) -> tuple[FreeDirection, ...]:
@@ -148,7 +151,7 @@ def parse_result(content: bytes, path: str | Path) -> Result:
         if file.refined is not None:
             refined = _of_class(RefinedPoses, file.refined)
             refined = replace(refined, moved=movements(solution, refined.X, refined.Y))
-        result = Result(solution, refined, file.log, file.calibration)
+        result = Result(solution, refined, file.log, file.calibration, file.acceptance)
         check_verdict(file.verdict, file.verdict_grounds, result.judgement)
     except ValueError as error:
         raise FileFormatError(f"{path} is not a valid result: {in_words(error)}") from error
@@ -211,6 +214,7 @@ def checked_file(tree: dict[str, Any]) -> ResultFile:
     if file.refined is not None:
         check_corners(file.refined)
         check_joint(file.refined, file.certified)
+    check_acceptance(file.acceptance, file.certified.Y)
     return file
 
 

@@ -25,6 +25,7 @@ from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.results.acceptance_record import Acceptance
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.answers import Residual
 from gtsam_rwhec.solver.identification import Identifiability, PairIdentifiability
@@ -223,6 +224,10 @@ class ResultFile(BaseModel):
     refined: RefinedFields | None = Field(default=None, description="the refined calibration, if there is one")
     calibration: CalibrationFields | None = Field(default=None, description="what calibrate found and chose, if it ran")
     log: LogFields | None = Field(default=None, description="what became of the measurements, if they come from a log")
+    acceptance: tuple[Acceptance, ...] = Field(
+        default=(),
+        description="by sensor, whether known points that are new to it show that it is off by less than a limit",
+    )
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> ResultFile:

@@ -1,9 +1,10 @@
-"""Whether an old calibration still holds on a new log: detect, clean, and test, without calibrating anew."""
+"""Whether an old calibration still holds, or is to be accepted, by a new log: detect, clean, and test."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +19,10 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.results.acceptance import LEVEL as PROBABILITY
+from gtsam_rwhec.results.acceptance import accept
+from gtsam_rwhec.results.acceptance_record import Acceptance, Volume
 from gtsam_rwhec.results.change_test import LEVEL, checked_level
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.results.removed_measurements import RemovalReason
@@ -25,7 +30,7 @@ from gtsam_rwhec.results.result_file import Result, parse_result, read_result, r
 from gtsam_rwhec.results.verification import Verification, verify
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.sections import Intrinsics
-from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning, rig_for_solving
 from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import detected
@@ -140,8 +145,59 @@ def verify_log(
     checked_level(level)
     tell = progress or silent
     calibration = OldCalibration.read(old)
+    with _new_log(calibration, log_path, rig, workers, tell) as (log, given):
+        return _verified(calibration, log, given, level=level, targets_may_move=targets_may_move, tell=tell)
+
+
+@one_blas_thread()
+def accept_log(
+    result: str | Path,
+    log_path: str | Path | list[str | Path],
+    rig: Rig | None = None,
+    *,
+    limit_mm: float,
+    sensor: str | None = None,
+    volume: Volume | None = None,
+    level: float = PROBABILITY,
+    noise_mm: float | tuple[float, float] | None = None,
+    known_to_mm: float = 0.0,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Acceptance:
+    """Whether the calibration in an output folder is off by less than a limit, from a log that is new to it.
+
+    The log and the rig are read as by `verify_log`, and tested as by ``rw.accept``, whose options these are. The boards
+    may stand anywhere on the targets' carrier.
+
+    Raises
+    ------
+    RwhecError
+        A file cannot be read, the rigs differ, or the log is the one that was calibrated; the message says which.
+    """
+    tell = progress or silent
+    calibration = OldCalibration.read(result)
+    history = calibration.result.log
+    with _new_log(calibration, log_path, rig, workers, tell) as (log, given):
+        new = _NewMeasurements.read(calibration, log, given)
+        same = history is not None and are_same_images(history.detection, read_metadata(log).detection)
+        if same or _is_solved_in(log, calibration.result):
+            raise LogError("the calibration was made from this very log, which proves nothing of it: give a new one")
+        tell("testing the poses")
+        found = accept(
+            calibration.result, new.problem, limit_mm=limit_mm, sensor=sensor, volume=volume, level=level,
+            noise_mm=noise_mm, known_to_mm=known_to_mm,
+        )  # fmt: skip
+    source = log_path[0] if isinstance(log_path, list) else log_path
+    return replace(found, source=Path(source).name)
+
+
+@contextmanager
+def _new_log(
+    old: OldCalibration, log_path: str | Path | list[str | Path], rig: Rig | None, workers: int | None, tell: Progress
+) -> Iterator[tuple[Log, Rig | None]]:
+    """The new log, detected with the old intrinsics and cleaned, and the rig file where it is not the log's own."""
     given = rig
-    rig = rig or calibration.rig
+    rig = rig or old.rig
     with TemporaryDirectory(prefix="gtsam-rwhec-verify-") as folder:
         if rig is not None and not isinstance(log_path, list):
             source, recorded = Path(log_path), Path(folder) / f"new{RECORDED_LOG}"
@@ -160,11 +216,11 @@ def verify_log(
                         f"{log.files[0].path}: a raw log needs a rig file, and the old calibration has no "
                         f"{CALIBRATION_LOG} that holds one: give --rig FILE"
                     )
-                found = detected(log, with_cameras(rig, calibration.cameras), workers=workers, progress=tell)
+                found = detected(log, with_cameras(rig, old.cameras), workers=workers, progress=tell)
                 given = None
             if CLEANING_METADATA not in found.metadata():
-                found, given = _cleaned(found, given, calibration, tell), None
-            return _verified(calibration, found, given, level=level, targets_may_move=targets_may_move, tell=tell)
+                found, given = _cleaned(found, given, old, tell), None
+            yield found, given
 
 
 def _cleaned(detections: Log, given: Rig | None, old: OldCalibration, tell: Progress) -> RunLog:
@@ -191,39 +247,74 @@ def _cleaned(detections: Log, given: Rig | None, old: OldCalibration, tell: Prog
     return cleaned(detections, rig.model_copy(update={"sensors": sensors}), tell)
 
 
+@dataclass(frozen=True, eq=False)
+class _NewMeasurements:
+    """What the new log measures, with the intrinsics of the old calibration."""
+
+    rig: Rig
+    pairs: Pairs
+    motion: CarrierMotion
+    corners: LogCorners
+    cameras: dict[str, Camera]
+    free: tuple[str, ...]  #: Sensors whose time offset the rig file leaves to the data
+    problem: Problem
+
+    @staticmethod
+    def read(old: OldCalibration, log: Log, given: Rig | None) -> _NewMeasurements:
+        """Read the cleaned log."""
+        rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
+        pairs, motion = without_marks(read_pairs(log, rig), (RemovalReason.OUTLIER,)), read_carrier_motion(log, rig)
+        corners = LogCorners.of(log, rig, metadata.cameras)
+        _check_carriers(old.result, rig)
+        used = {measured.sensor for measured in pairs.values() if measured.used.any()}
+        free = tuple(name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used)
+        pairs = at_offsets(pairs, motion.trajectory, cleaning.time_offsets_s, free)
+        cameras = {**metadata.cameras, **old.cameras}
+        refined = old.result.refined
+        if refined is not None and any(_differ(cameras[name], metadata.cameras[name]) for name in metadata.cameras):
+            px = CORNER_PX if refined.reprojection is None else refined.reprojection.corner_px
+            pairs = with_intrinsics(pairs, corners, cameras, refined.X, refined.Y, px)
+        return _NewMeasurements(
+            rig, pairs, motion, corners, cameras, free, problem_of(pairs, rig, cleaning.time_offsets_s)
+        )
+
+
 def _verified(
     old: OldCalibration, log: Log, given: Rig | None, *, level: float, targets_may_move: bool, tell: Progress
 ) -> Verification:
-    rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
-    pairs, motion = without_marks(read_pairs(log, rig), (RemovalReason.OUTLIER,)), read_carrier_motion(log, rig)
-    corners = LogCorners.of(log, rig, metadata.cameras)
-    _check_carriers(old.result, rig)
-    used = {measured.sensor for measured in pairs.values() if measured.used.any()}
-    free = tuple(name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used)
-    pairs = at_offsets(pairs, motion.trajectory, cleaning.time_offsets_s, free)
-    cameras = {**metadata.cameras, **old.cameras}
-    refined = old.result.refined
-    if refined is not None and any(_differ(cameras[name], metadata.cameras[name]) for name in metadata.cameras):
-        px = CORNER_PX if refined.reprojection is None else refined.reprojection.corner_px
-        pairs = with_intrinsics(pairs, corners, cameras, refined.X, refined.Y, px)
-    problem = problem_of(pairs, rig, cleaning.time_offsets_s)
+    new, refined = _NewMeasurements.read(old, log, given), old.result.refined
     tell("testing the old poses")
     found = verify(
-        old.result, problem, level=level, targets_may_move=targets_may_move, carrier_noise=motion.noise,
-        time_offsets=free, carrier_path=motion.trajectory if free else None, progress=tell,
+        old.result, new.problem, level=level, targets_may_move=targets_may_move, carrier_noise=new.motion.noise,
+        time_offsets=new.free, carrier_path=new.motion.trajectory if new.free else None, progress=tell,
     )  # fmt: skip
     if refined is None:
         return found
-    taken = _taken_offsets(old.result, rig)
+    taken = _taken_offsets(old.result, new.rig)
     if taken:
         found = replace(found, remarks=(*found.remarks, *taken))
-    if old.result.log is not None and are_same_images(old.result.log.detection, metadata.detection):
+    if old.result.log is not None and are_same_images(old.result.log.detection, read_metadata(log).detection):
         remark = "the new log is the one that the old calibration comes from, so that it holds as a matter of course"
         found = replace(found, remarks=(remark, *found.remarks))
-    pixels = {name: pixel_errors(refined, pairs, corners, cameras, name) for name in found.sensors if name in cameras}
+    pixels = {
+        name: pixel_errors(refined, new.pairs, new.corners, new.cameras, name)
+        for name in found.sensors
+        if name in new.cameras
+    }
     return replace(
         found,
         sensors={name: replace(check, held_px=_median(pixels.get(name))) for name, check in found.sensors.items()},
+    )
+
+
+def _is_solved_in(log: Log, result: Result) -> bool:
+    """Whether a log is the one that this result was written into."""
+    content = log.attachment(RESULT_FILE)
+    if content is None:
+        return False
+    inside = parse_result(content, RESULT_FILE).solution.Y
+    return inside.keys() == result.solution.Y.keys() and all(
+        np.array_equal(inside[name].matrix(), pose.matrix()) for name, pose in result.solution.Y.items()
     )
 
 

@@ -1,0 +1,318 @@
+"""``rw.accept``: that a calibration is off by less than a limit, from touched points or from a board that is new to it.
+
+What is tested is the pose of one sensor on its carrier: an error of it is the same small motion in every pose of the
+robot. `gtsam_rwhec.results.equivalence_test` has the test and its source. A board need not have a known place: where
+each is on the targets' carrier is unknown too, and only its centre is used, since a board's tilt is seen badly.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.special import chdtri
+
+from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.point_uncertainty import checked_level
+from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief, rounded, shown
+from gtsam_rwhec.files.whole_files import read_whole, write_atomically
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import is_between
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.results.acceptance_record import Acceptance, Answer, Triple, Volume
+from gtsam_rwhec.results.changed_frames import as_result
+from gtsam_rwhec.results.equivalence_test import (
+    ErrorFit,
+    TouchRows,
+    amplification,
+    best_places,
+    error_rows,
+    fit_error,
+    largest_error,
+    lower_bound,
+    touches_needed,
+    upper_bound,
+)
+from gtsam_rwhec.results.evidence import checksum, evidence_path, read_evidence, write_evidence
+from gtsam_rwhec.results.json_tree import MOST_BYTES, to_json
+from gtsam_rwhec.results.result_file import Result, parse_result, parse_tree, result_path
+from gtsam_rwhec.results.touches import Touches
+
+#: The probability of the statement, unless another one is asked for.
+LEVEL = 0.95
+#: A volume whose worst corner is known so many times worse than the mean of all touches asks for other touches.
+FAR = 20.0
+#: Touches are on a line if their second principal deviation is below this share of the first; in a plane: the third.
+FLAT = 0.02
+#: So many places are proposed.
+PLACES = 3
+#: A touch is named that is this rarely so far from the others.
+RARE = 0.01
+
+
+@one_blas_thread()
+def accept(
+    result: Result | Calibration,
+    measured: Touches | Problem,
+    *,
+    limit_mm: float,
+    sensor: str | None = None,
+    volume: Volume | None = None,
+    level: float = LEVEL,
+    noise_mm: float | tuple[float, float] | None = None,
+    known_to_mm: float = 0.0,
+) -> Acceptance:
+    """Whether the calibration of a sensor is off by less than a limit everywhere in a volume, with 95 %.
+
+    This is an equivalence test: a calibration that is off by the limit or more is accepted in at most 5 % of all
+    cases, however few touches there are. (That a test of "no error" finds nothing shows nothing.) It is an
+    intersection-union test of one-sided t-tests: Schuirmann 1987, J. Pharmacokin. Biopharm. 15:657, in one dimension;
+    Berger and Hsu 1996, Statistical Science 11:283. The size is exact for noise that is normal, of one deviation in all
+    directions or stated; nearly so (Satterthwaite 1946) where the noise along the line of sight is estimated by itself.
+
+    Parameters
+    ----------
+    result : Result (``rw.results.read_result``) or Calibration
+    measured : Touches or Problem
+        Known points that the sensor measured, or poses of boards from a log that the calibration was not made from.
+        Their place on the targets' carrier may be unknown. The touches must be independent: never those of the
+        calibration.
+    limit_mm : float
+        The largest allowed error of a point, millimetres.
+    sensor : str, optional
+        The sensor; needed if the calibration has several.
+    volume : Volume, optional
+        ``Volume.box(low_m, high_m)`` or ``Volume.ball(centre_m, radius_m)`` in the frame that carries the sensor. By
+        default the box around the touched points.
+    level : float
+        The probability of the statement.
+    noise_mm : float or (across, along), optional
+        Standard deviation of one touch along each axis, mm; or across the sensor's line of sight, and along it. By
+        default it is estimated from the residuals.
+    known_to_mm : float
+        Largest error that all known points may share (such as that of the tool tip), mm. It is added to the bound.
+
+    Raises
+    ------
+    FrameError
+        There is no such sensor, none is named of several, or nothing was measured by it.
+    OptionError
+        Limit, level, noise or volume cannot be used.
+    """
+    found = as_result(result)
+    level = checked_level(level)
+    for name, value, least in (("limit_mm", limit_mm, 1e-9), ("known_to_mm", known_to_mm, 0.0)):
+        if not is_between(value, least, 1e6):
+            raise OptionError(f"{name}={brief(value)}; give millimetres, {'more' if least else 'not less'} than 0")
+    stated = _checked_noise(noise_mm)
+    answer = found.refined or found.solution
+    name = _checked_sensor(sensor, tuple(answer.Y))
+    has_scale = not isinstance(answer.scale, dict) and answer.scale_mode != "known"
+    if isinstance(measured, Problem):
+        points, errors, others, sight = _of_boards(found, measured, name)
+    elif isinstance(measured, Touches):
+        points, errors, others, sight = _of_touches(found, measured, name)
+    else:
+        raise OptionError(f"measured is a {type(measured).__name__}; give rw.results.Touches.of(...) or a rw.Problem")
+    given = volume
+    volume = volume or Volume.box(points.min(axis=0), points.max(axis=0))
+    corners_m = volume.corners_m
+    centre = points.mean(axis=0)
+    lever = max(float(np.linalg.norm(np.concatenate([corners_m, points]) - centre, axis=1).max()), 1e-9)
+    rows, corners = (error_rows(each, centre, lever, has_scale=has_scale) for each in (points, corners_m))
+    size = rows.shape[2]
+    fit = fit_error(TouchRows(np.concatenate([rows, others], axis=2), size, errors, sight), stated)
+    of_boards = isinstance(measured, Problem)
+    lacking, is_final = _lacking(fit, points, corners, is_stated=given is not None, of_boards=of_boards)
+    limit_m, known_m = 1e-3 * limit_mm, 1e-3 * known_to_mm
+    bound = None if math.isinf(amplification(fit, corners)) else upper_bound(fit, corners, level)
+    lower_m = 0.0 if bound is None else max(0.0, lower_bound(fit, corners, level) - known_m)
+    if lower_m > limit_m:
+        said = Answer.REJECTED
+    elif bound is not None and not is_final and bound.value_m + known_m < limit_m:
+        said = Answer.ACCEPTED
+    else:
+        said = Answer.NOT_DETERMINED if lacking else Answer.NOT_YET
+    if said is Answer.NOT_DETERMINED:
+        bound = None
+    places = best_places(fit, corners, PLACES) if said in (Answer.NOT_YET, Answer.NOT_DETERMINED) else []
+    estimate_m = largest_error(fit, corners)
+    return Acceptance(
+        sensor=name,
+        answer=said,
+        limit_mm=float(limit_mm),
+        level=level,
+        volume=volume,
+        of="images" if of_boards else "touches",
+        count=fit.count,
+        source="" if isinstance(measured, Problem) else measured.source,
+        estimate_mm=math.inf if bound is None else 1e3 * estimate_m,
+        upper_mm=math.inf if bound is None else 1e3 * (bound.value_m + known_m),
+        lower_mm=1e3 * lower_m,
+        worst_m=_triple(corners_m[0 if bound is None else bound.corner]),
+        noise_mm=(1e3 * fit.noise_m[0], 1e3 * fit.noise_m[1]),
+        noise="estimated" if fit.is_estimated else "stated",
+        degrees_of_freedom=tuple(fit.freedoms.tolist()),
+        known_to_mm=float(known_to_mm),
+        scale_is_free=has_scale,
+        more=touches_needed(fit, corners, limit_m - known_m, level) if said is Answer.NOT_YET else None,
+        places_m=tuple(_triple(corners_m[index]) for index in dict.fromkeys(places)),
+        lacking=lacking if said is Answer.NOT_DETERMINED else "",
+        remarks=tuple(_remarks(found, fit, points, level, given=given, stated=stated, of_boards=of_boards)),
+    )
+
+
+def _checked_noise(noise_mm: float | tuple[float, float] | None) -> tuple[float, float] | None:
+    if noise_mm is None:
+        return None
+    both = (noise_mm, noise_mm) if not isinstance(noise_mm, Sequence) else tuple(noise_mm)
+    if len(both) != 2 or not all(is_between(value, 1e-9, 1e6) for value in both):
+        raise OptionError(f"noise_mm={brief(noise_mm)}; give one positive number, or (across, along), millimetres")
+    return 1e-3 * both[0], 1e-3 * both[1]
+
+
+def _checked_sensor(sensor: str | None, names: tuple[str, ...]) -> str:
+    listed = ", ".join(map(shown, names))
+    if sensor is None and len(names) > 1:
+        raise FrameError(f"the calibration has the sensors {listed}; say which one is tested: sensor=NAME")
+    if sensor is not None and sensor not in names:
+        raise FrameError(f"there is no sensor {brief(sensor)}; the calibration has {listed}")
+    return names[0] if sensor is None else sensor
+
+
+Equations = tuple[Array, Array, Array, Array]
+
+
+def _of_touches(result: Result, touches: Touches, sensor: str) -> Equations:
+    """Known points on the sensor's carrier, errors of the predictions, no further unknowns, and lines of sight."""
+    answer = result.refined or result.solution
+    scale = 1.0 if isinstance(answer.scale, dict) else float(answer.scale)
+    T = answer.Y[sensor].matrix()
+    known = touches.known_m
+    if touches.A is not None:
+        known = np.einsum("nij,nj->ni", touches.A[:, :3, :3], known) + touches.A[:, :3, 3]
+    seen = touches.sensor_m / scale @ T[:3, :3].T
+    return known, seen + T[:3, 3] - known, np.zeros((len(known), 3, 0)), _units(seen, T[:3, 2])
+
+
+def _of_boards(result: Result, problem: Problem, sensor: str) -> Equations:
+    """The same for the boards' centres; where each board is on the targets' carrier is unknown (three columns)."""
+    problem.require_pairs()
+    problem.require_raw_measurements("accept")
+    answer = result.refined or result.solution
+    T = answer.Y[sensor].matrix()
+    pairs = [pair for pair in problem.pairs if pair.sensor == sensor and not pair.is_motion]
+    if not pairs:
+        raise FrameError(
+            f"nothing in the new measurements is seen by {shown(sensor)}; they have the sensors "
+            f"{', '.join(map(shown, problem.sensors))}"
+        )
+    points, errors, others, sights = [], [], [], []
+    for place, pair in enumerate(pairs):
+        one = problem.measurements(*pair)
+        scale = answer.scale.get(pair.target, 1.0) if isinstance(answer.scale, dict) else float(answer.scale)
+        seen = one.B[:, :3, 3] / scale @ T[:3, :3].T
+        at = seen + T[:3, 3]
+        R, t = one.A[:, :3, :3], one.A[:, :3, 3]
+        board = np.einsum("nji,nj->ni", R, at - t).mean(axis=0)
+        columns = np.zeros((len(R), 3, 3 * len(pairs)))
+        columns[:, :, 3 * place : 3 * place + 3] = R
+        points.append(at)
+        errors.append(at - (R @ board + t))
+        others.append(columns)
+        sights.append(_units(seen, T[:3, 2]))
+    return np.concatenate(points), np.concatenate(errors), np.concatenate(others), np.concatenate(sights)
+
+
+def _units(vectors: Array, otherwise: Array) -> Array:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(lengths > 0.0, vectors / np.maximum(lengths, 1e-300), otherwise)
+
+
+def _lacking(fit: ErrorFit, points: Array, corners: Array, *, is_stated: bool, of_boards: bool) -> tuple[str, bool]:
+    """What the touches lack to tell the error in the volume, and what to do; empty if they tell it.
+
+    And whether that stands however small the bound is: the box around touches on a line is no volume.
+    """
+    far = amplification(fit, corners) > FAR
+    if of_boards:
+        words = (
+            "the images do not tell the error in this volume; take more of them, with the carrier turned about two "
+            "axes, and the board near the volume's corners"
+        )
+        return words if far else "", False
+    if len(points) < 3:
+        few = "one touch" if len(points) == 1 else "two touches"
+        return f"{few} cannot tell it; touch 3 points or more, not on a line", not is_stated
+    first, second, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if second <= FLAT * first and (far or not is_stated):
+        words = (
+            "the touches lie on a line, and nothing tells how far off points beside it are; touch points away from the"
+        )
+        return f"{words} line", not is_stated
+    near = "the touches are too near to one another for this volume; touch points near its corners"
+    return near if far else "", False
+
+
+def _remarks(
+    result: Result, fit: ErrorFit, points: Array, level: float, *, given: Volume | None,
+    stated: tuple[float, float] | None, of_boards: bool,
+) -> list[str]:  # fmt: skip
+    remarks = []
+    if result.judgement.verdict is Verdict.DO_NOT_USE:
+        remarks.append(f"the calibration's own verdict is another one: {result.judgement}")
+    if fit.is_contradicted and stated is not None:
+        remarks.append(
+            f"the residuals are larger than the stated noise allows; the estimated one counts: "
+            f"{rounded(1e3 * fit.noise_m[0])} mm across the line of sight and {rounded(1e3 * fit.noise_m[1])} mm along"
+        )
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if given is None and not of_boards and len(spread) == 3 and FLAT * spread[0] >= spread[2]:
+        remarks.append(
+            "the touches lie in a plane, and the answer is for the box around them alone: state the volume, or touch "
+            "points above and below"
+        )
+    if fit.is_estimated and len(fit.freedoms) == 1 and fit.freedoms[0] > 0.0:
+        remarks.append(
+            "from so few touches the noise counts as the same in all directions; if the sensor's depth is noisier than "
+            "that, state noise_mm=(across, along)"
+        )
+    lengths = np.linalg.norm(fit.residuals_m, axis=1)
+    largest = int(lengths.argmax())
+    most = math.sqrt(fit.mean_variance_m2 * float(chdtri(3, RARE / len(lengths))))
+    if lengths[largest] > most > 0.0:
+        what = "image" if of_boards else "touch"
+        remarks.append(f"{what} {largest + 1} is {1e3 * lengths[largest]:.2f} mm off the others: look at it")
+    return remarks
+
+
+def _triple(values: Array) -> Triple:
+    x, y, z = (float(value) + 0.0 for value in values)
+    return x, y, z
+
+
+def write_acceptance(found: Acceptance, path: str | Path) -> None:
+    """Write an acceptance into the result file it is of (or the one in a folder), in place of an older one.
+
+    Poses, covariances and verdict stay as they are; the evidence beside it stays its evidence. Raises FileFormatError
+    if the file is no result, has no such sensor, or cannot be written.
+    """
+    path = result_path(path)
+    content = read_whole(path, MOST_BYTES, "A result was")
+    tree = parse_tree(content, path)
+    parse_result(content, path)
+    kept = [one for one in tree.get("acceptance", []) if one["sensor"] != found.sensor]
+    tree["acceptance"] = [*kept, to_json(found, "$.acceptance")]
+    new = (json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+    parse_result(new, path)
+    beside = evidence_path(path)
+    evidence = read_evidence(beside) if beside.exists() else None
+    write_atomically(path, new)
+    if evidence is not None and evidence.result_sha256 == checksum(content):
+        write_evidence(evidence, beside, path)  # its checksum is that of the new file
