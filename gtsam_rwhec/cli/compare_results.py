@@ -1,4 +1,4 @@
-"""``diff``, ``verify`` and ``accept``: what changed, whether a calibration still holds, and whether it is good enough."""
+"""``diff``, ``verify`` and ``accept``: what changed, does a calibration still hold, is it good enough."""
 
 from __future__ import annotations
 
@@ -163,8 +163,9 @@ def accept(
     source: Annotated[
         Path,
         typer.Argument(
-            help="CSV file of touches (columns sensor_x_m, sensor_y_m, sensor_z_m, known_x_m, known_y_m, known_z_m), or "
-            f"measurements of a board that the calibration has not seen: as for verify, also a {FOLDER_OF_CSV}."
+            help="CSV file of touches, with the columns sensor_x_m, sensor_y_m, sensor_z_m, known_x_m, known_y_m, "
+            "known_z_m; or measurements of a board that the calibration has not seen, as for verify: also a "
+            f"{FOLDER_OF_CSV}."
         ),
     ],
     limit_mm: Annotated[float, typer.Option("--limit-mm", help="The largest allowed error of a point, mm.")],
@@ -198,8 +199,8 @@ def accept(
 ) -> ExitStatus:
     """Whether a calibration is off by less than a limit in a volume: known points, or a new board, prove it with 95 %.
 
-    A calibration that is off by the limit is accepted in at most 5 % of all cases. Exit status 0: accepted. 1: rejected,
-    it is off by more. 3: not accepted yet, touch more; or the touches cannot tell.
+    A calibration that is off by the limit is accepted in at most 5 % of all cases. Exit status 0: accepted. 1:
+    rejected. 3: not accepted yet, touch more; or the touches cannot tell.
     """
     if box is not None and ball is not None:
         raise typer.BadParameter("give --box or --ball, not both")

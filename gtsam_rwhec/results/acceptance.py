@@ -27,18 +27,7 @@ from gtsam_rwhec.geometry.real_numbers import is_between
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.acceptance_record import Acceptance, Answer, Triple, Volume
 from gtsam_rwhec.results.changed_frames import as_result
-from gtsam_rwhec.results.equivalence_test import (
-    ErrorFit,
-    TouchRows,
-    amplification,
-    best_places,
-    error_rows,
-    fit_error,
-    largest_error,
-    lower_bound,
-    touches_needed,
-    upper_bound,
-)
+from gtsam_rwhec.results.equivalence_test import ErrorFit, TouchRows, VolumeTest, best_places, error_rows, fit_error
 from gtsam_rwhec.results.evidence import checksum, evidence_path, read_evidence, write_evidence
 from gtsam_rwhec.results.json_tree import MOST_BYTES, to_json
 from gtsam_rwhec.results.result_file import Result, parse_result, parse_tree, result_path
@@ -129,39 +118,39 @@ def accept(
     size = rows.shape[2]
     fit = fit_error(TouchRows(np.concatenate([rows, others], axis=2), size, errors, sight), stated)
     of_boards = isinstance(measured, Problem)
-    lacking, is_final = _lacking(fit, points, corners, is_stated=given is not None, of_boards=of_boards)
+    test = VolumeTest(fit, corners, level)
+    lacking, is_final = _lacking(test, points, is_stated=given is not None, of_boards=of_boards)
     limit_m, known_m = 1e-3 * limit_mm, 1e-3 * known_to_mm
-    bound = None if math.isinf(amplification(fit, corners)) else upper_bound(fit, corners, level)
-    lower_m = 0.0 if bound is None else max(0.0, lower_bound(fit, corners, level) - known_m)
+    bound, corner = (None, 0) if math.isinf(test.amplification) else test.upper()
+    lower_m = 0.0 if bound is None else max(0.0, test.lower_m() - known_m)
     if lower_m > limit_m:
         said = Answer.REJECTED
-    elif bound is not None and not is_final and bound.value_m + known_m < limit_m:
+    elif bound is not None and not is_final and bound + known_m < limit_m:
         said = Answer.ACCEPTED
     else:
         said = Answer.NOT_DETERMINED if lacking else Answer.NOT_YET
     if said is Answer.NOT_DETERMINED:
         bound = None
     places = best_places(fit, corners, PLACES) if said in (Answer.NOT_YET, Answer.NOT_DETERMINED) else []
-    estimate_m = largest_error(fit, corners)
     return Acceptance(
         sensor=name,
         answer=said,
         limit_mm=float(limit_mm),
         level=level,
         volume=volume,
-        of="images" if of_boards else "touches",
+        of="views" if of_boards else "touches",
         count=fit.count,
         source="" if isinstance(measured, Problem) else measured.source,
-        estimate_mm=math.inf if bound is None else 1e3 * estimate_m,
-        upper_mm=math.inf if bound is None else 1e3 * (bound.value_m + known_m),
+        estimate_mm=math.inf if bound is None else 1e3 * test.estimate_m,
+        upper_mm=math.inf if bound is None else 1e3 * (bound + known_m),
         lower_mm=1e3 * lower_m,
-        worst_m=_triple(corners_m[0 if bound is None else bound.corner]),
+        worst_m=_triple(corners_m[corner]),
         noise_mm=(1e3 * fit.noise_m[0], 1e3 * fit.noise_m[1]),
         noise="estimated" if fit.is_estimated else "stated",
         degrees_of_freedom=tuple(fit.freedoms.tolist()),
         known_to_mm=float(known_to_mm),
         scale_is_free=has_scale,
-        more=touches_needed(fit, corners, limit_m - known_m, level) if said is Answer.NOT_YET else None,
+        more=test.needed(limit_m - known_m) if said is Answer.NOT_YET else None,
         places_m=tuple(_triple(corners_m[index]) for index in dict.fromkeys(places)),
         lacking=lacking if said is Answer.NOT_DETERMINED else "",
         remarks=tuple(_remarks(found, fit, points, level, given=given, stated=stated, of_boards=of_boards)),
@@ -235,15 +224,15 @@ def _units(vectors: Array, otherwise: Array) -> Array:
     return np.where(lengths > 0.0, vectors / np.maximum(lengths, 1e-300), otherwise)
 
 
-def _lacking(fit: ErrorFit, points: Array, corners: Array, *, is_stated: bool, of_boards: bool) -> tuple[str, bool]:
+def _lacking(test: VolumeTest, points: Array, *, is_stated: bool, of_boards: bool) -> tuple[str, bool]:
     """What the touches lack to tell the error in the volume, and what to do; empty if they tell it.
 
     And whether that stands however small the bound is: the box around touches on a line is no volume.
     """
-    far = amplification(fit, corners) > FAR
+    far = test.amplification > FAR
     if of_boards:
         words = (
-            "the images do not tell the error in this volume; take more of them, with the carrier turned about two "
+            "the views do not tell the error in this volume; take more of them, with the carrier turned about two "
             "axes, and the board near the volume's corners"
         )
         return words if far else "", False
@@ -275,8 +264,8 @@ def _remarks(
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if given is None and not of_boards and len(spread) == 3 and FLAT * spread[0] >= spread[2]:
         remarks.append(
-            "the touches lie in a plane, and the answer is for the box around them alone: state the volume, or touch "
-            "points above and below"
+            "the touches lie in a plane: touch points above and below it too, or state the volume in which the "
+            "calibration is used"
         )
     if fit.is_estimated and len(fit.freedoms) == 1 and fit.freedoms[0] > 0.0:
         remarks.append(
@@ -287,7 +276,7 @@ def _remarks(
     largest = int(lengths.argmax())
     most = math.sqrt(fit.mean_variance_m2 * float(chdtri(3, RARE / len(lengths))))
     if lengths[largest] > most > 0.0:
-        what = "image" if of_boards else "touch"
+        what = "view" if of_boards else "touch"
         remarks.append(f"{what} {largest + 1} is {1e3 * lengths[largest]:.2f} mm off the others: look at it")
     return remarks
 

@@ -18,7 +18,7 @@ from gtsam_rwhec.results.equivalence_test import spread_directions
 
 Triple = tuple[float, float, float]
 #: A ball is tested at the corners of a solid that holds it: so many points, this much farther out.
-BALL_CORNERS, BALL_MARGIN = 400, 1.01
+BALL_CORNERS, BALL_MARGIN = 250, 1.015
 
 
 class Answer(StrEnum):
@@ -98,7 +98,7 @@ class Acceptance:
     limit_mm: float
     level: float  #: Probability of the statement: a calibration that is off by the limit is accepted in 1 - level
     volume: Volume  #: In the axes of the frame that carries the sensor
-    of: Literal["touches", "images"]  #: What measured it: touched points, or images of boards
+    of: Literal["touches", "views"]  #: What measured it: touched points, or views of boards
     count: int  #: How many of them
     source: str  #: The name of their file or folder; empty where they come from memory
     estimate_mm: float  #: The largest error in the volume by the least-squares estimate; infinite if not determined
@@ -111,8 +111,8 @@ class Acceptance:
     degrees_of_freedom: tuple[float, ...]  #: Of the noise: across and along, or of both together; infinite if stated
     known_to_mm: float  #: Error that all known points may share, as stated; it is part of both bounds
     scale_is_free: bool  #: Whether a scale of the sensor's lengths counts as unknown too
-    #: Touches of the same kind after which it is accepted with a chance of 80 %, if the estimate is the true error. None
-    #: where it is not asked, or where no number is enough
+    #: How many more touches of the same kind lead to acceptance with a chance of 80 %, if the estimate is the true
+    #: error. None where it is not asked, or where no number is enough
     more: int | None
     places_m: tuple[Triple, ...]  #: Corners of the volume where the next ones tell most, the first one first
     lacking: str  #: What the touches lack, and what to do; empty if the error is determined
@@ -121,7 +121,7 @@ class Acceptance:
     def __str__(self) -> str:
         where = f"in {self.volume}, in the axes of the frame that carries {shown(self.sensor)}"
         level, limit = f"{100.0 * self.level:g} %", f"{self.limit_mm:g} mm"
-        of = f"{self.count} {self.of if self.count > 1 else self.of.removesuffix('s' if self.of == 'images' else 'es')}"
+        of = f"{self.count} {self.of if self.count > 1 else self.of.removesuffix('s' if self.of == 'views' else 'es')}"
         if self.answer is Answer.NOT_DETERMINED:
             return f"Not determined: {self.lacking} ({of}; the limit is {limit} {where})."
         by = f"estimate {rounded(self.estimate_mm)} mm, {of}"
@@ -145,7 +145,7 @@ class Acceptance:
     def advice(self) -> str:
         """What to do where it is not accepted yet, as sentences."""
         verb = "Touch" if self.of == "touches" else "Take"
-        what = "" if self.of == "touches" else " images"
+        what = "" if self.of == "touches" else " views of a board"
         if self.estimate_mm + self.known_to_mm >= self.limit_mm:
             said = (
                 f"The estimate itself is not below the limit, by no more than chance. {verb} {self.count} more{what} "

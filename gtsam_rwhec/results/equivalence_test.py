@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
@@ -36,8 +37,8 @@ NULL = 1e-6
 SEPARATE = 6.0
 #: It is taken as at least this share of the variance of both together: few residuals may show none by chance.
 LEAST_SHARE = 0.1
-#: Directions u that are tried first, and steps that climb from the best of them.
-DIRECTIONS, STEPS = 200, 30
+#: Directions u that are tried at every corner, how many of the best climb on from there, and by how many steps.
+DIRECTIONS, CLIMBERS, STEPS = 100, 8, 12
 #: The chance with which a calibration whose error is the estimated one is accepted after the touches that are asked
 #: for, and the most that are asked for.
 CHANCE, MOST_TOUCHES = 0.8, 10_000
@@ -93,7 +94,7 @@ class ErrorFit:
     widths: Array  #: (c,): how many numbers of one touch each component has
     noise_m: tuple[float, float]  #: Standard deviations along each axis across the line of sight, and along it
     information: Array  #: (k, k): of all touches, for noise of variance 1 m^2
-    count: int
+    count: int  #: Touches
     free: Array  #: (k, q): directions of delta that the touches leave free
     residuals_m: Array  #: (n, 3)
     is_contradicted: bool = False  #: Whether stated noise is too small for the residuals, so that it was estimated
@@ -107,13 +108,6 @@ class ErrorFit:
     def mean_variance_m2(self) -> float:
         """Of the noise along all axes."""
         return (2.0 * self.noise_m[0] ** 2 + self.noise_m[1] ** 2) / 3.0
-
-    def after(self, touches: int) -> ErrorFit:
-        """The same estimate after so many touches of the same kind."""
-        more = touches - self.count
-        return replace(
-            self, parts=self.parts * self.count / touches, freedoms=self.freedoms + more * self.widths, count=touches
-        )
 
 
 def fit_error(touches: TouchRows, noise_m: tuple[float, float] | None = None) -> ErrorFit:
@@ -176,104 +170,134 @@ def _information(rows: Array, size: int) -> Array:
     return np.asarray(N[:size, :size] - N[:size, size:] @ np.linalg.pinv(others) @ N[size:, :size])
 
 
-@dataclass(frozen=True)
-class Bound:
-    """A bound on the error in a volume, and where it is attained."""
+@dataclass(frozen=True, eq=False)
+class VolumeTest:
+    """The bounds on the error in a volume, whose corners move by ``corners`` (V, 3, k) times the error."""
 
-    value_m: float
-    corner: int  #: Index of the point
+    fit: ErrorFit
+    corners: Array
+    level: float  #: Probability of each bound
+
+    @cached_property
+    def _theta(self) -> Array:
+        """The estimated error (V, 3) of every corner, metres."""
+        return np.asarray(self.corners @ self.fit.estimate)
+
+    @cached_property
+    def _covariances(self) -> Array:
+        """Covariances (c, V, 3, 3) of these by component of the noise, m^2."""
+        parts = self.fit.variances[:, None, None] * self.fit.parts
+        return np.asarray(self.corners @ parts[:, None] @ np.swapaxes(self.corners, 1, 2))
+
+    @cached_property
+    def _grid(self) -> tuple[Array, Array]:
+        """u'J(p) d (V * j) of all corners p and directions u, and its variances (c, V * j)."""
+        own = self._theta / np.maximum(np.linalg.norm(self._theta, axis=1, keepdims=True), 1e-300)
+        along = np.concatenate([self._theta @ U.T, np.einsum("va,va->v", own, self._theta)[:, None]], axis=1)
+        variances = np.einsum("ja,cvab,jb->cvj", U, self._covariances, U, optimize=True)
+        of_own = np.einsum("va,cvab,vb->cv", own, self._covariances, own)
+        return along.ravel(), np.concatenate([variances, of_own[:, :, None]], axis=2).reshape(len(variances), -1)
+
+    @cached_property
+    def estimate_m(self) -> float:
+        """The largest estimated error of all corners, metres."""
+        return float(np.linalg.norm(self._theta, axis=1).max())
+
+    @cached_property
+    def amplification(self) -> float:
+        """How many times worse the worst corner is known than the mean of all touches; infinite if it is not at all."""
+        if np.linalg.norm(self.corners @ self.fit.free, axis=1).max(initial=0.0) > math.sqrt(NULL):
+            return math.inf
+        worst = float(np.linalg.eigvalsh(self._covariances.sum(axis=0))[:, -1].max())
+        return math.sqrt(self.fit.count * worst / self.fit.mean_variance_m2) if worst > 0.0 else 1.0
+
+    def upper(self) -> tuple[float, int]:
+        """The error everywhere in the volume is below this, metres; and the corner at which it is attained."""
+        return self._climbed(*self._largest(self._student, 1.0, self.fit.freedoms))
+
+    def lower_m(self) -> float:
+        """The largest error in the volume is above this, metres; 0 where nothing says that."""
+        k = self.corners.shape[2]
+
+        def scheffe(freedoms: Array) -> Array:
+            return np.sqrt(k * np.asarray(fdtri(k, np.minimum(freedoms, 1e6), self.level)))
+
+        return max(0.0, float(self._largest(scheffe, -1.0, self.fit.freedoms)[0].max()))
+
+    def needed(self, limit_m: float) -> int | None:
+        """How many more touches of the same kind the acceptance needs, if the estimate is the true error.
+
+        After them the calibration is accepted with the chance ``CHANCE``. None where the estimate is above the limit,
+        or where ``MOST_TOUCHES`` are not enough.
+        """
+        n, fit = self.fit.count, self.fit
+
+        def enough(more: int) -> bool:
+            shrunk = math.sqrt(n / (n + more))
+            return bool(
+                self._largest(
+                    lambda freedoms: shrunk * (self._student(freedoms) + ndtri(CHANCE)), 1.0,
+                    fit.freedoms + more * fit.widths,
+                )[0].max() < limit_m
+            )  # fmt: skip
+
+        low, high = 1, 1
+        while not enough(high):
+            if high >= MOST_TOUCHES:
+                return None
+            low, high = high + 1, min(2 * high, MOST_TOUCHES)
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (low, middle) if enough(middle) else (middle + 1, high)
+        return high
+
+    def _student(self, freedoms: Array) -> Array:
+        return np.asarray(np.where(freedoms > 1e6, ndtri(self.level), stdtrit(np.minimum(freedoms, 1e6), self.level)))
+
+    def _largest(self, reach: Reach, sign: float, freedoms: Array) -> tuple[Array, Array]:
+        """The largest values of u'J(p) d + sign * reach * deviation on the grid, and where they are.
+
+        The reach falls with the degrees of freedom, which are between the least of a component and all together; so
+        most of the grid cannot have the largest value, and is left out.
+        """
+        along, variances = self._grid
+        deviations = np.sqrt(variances.sum(axis=0))
+        ends = reach(np.array([freedoms.min(), freedoms.sum()]))
+        low, high = (along + sign * end * deviations for end in (ends if sign < 0.0 else ends[::-1]))
+        kept = np.flatnonzero(high >= low.max())
+        values = along[kept] + sign * reach(_satterthwaite(variances[:, kept], freedoms)) * deviations[kept]
+        order = np.argsort(values)[::-1][:CLIMBERS]
+        return values[order], kept[order]
+
+    def _climbed(self, values: Array, at: Array) -> tuple[float, int]:
+        """The maximum between the directions of the grid; each step along the gradient of a convex function climbs."""
+        number = len(U) + 1
+        corner = at // number
+        theta, C = self._theta[corner], self._covariances[:, corner]
+        own = theta / np.maximum(np.linalg.norm(theta, axis=1, keepdims=True), 1e-300)
+        u = np.where((at % number < len(U))[:, None], U[np.minimum(at % number, len(U) - 1)], own)
+        best = values
+        for _ in range(STEPS):
+            variances = np.einsum("va,cvab,vb->cv", u, C, u)
+            deviations = np.sqrt(variances.sum(axis=0))
+            reach = self._student(_satterthwaite(variances, self.fit.freedoms))
+            best = np.maximum(best, np.einsum("va,va->v", u, theta) + reach * deviations)
+            pull = np.einsum("cvab,vb->va", C, u) / np.maximum(deviations, 1e-300)[:, None]
+            gradient = theta + reach[:, None] * pull
+            lengths = np.linalg.norm(gradient, axis=1, keepdims=True)
+            u = np.where(lengths > 0.0, gradient / np.maximum(lengths, 1e-300), u)
+        return float(best.max()), int(corner[best.argmax()])
 
 
-def _deviations(fit: ErrorFit, C: Array, u: Array) -> tuple[Array, Array]:
-    """Standard deviations (v, j) of u'J d for directions u (v, j, 3), and Satterthwaite's degrees of freedom."""
-    shares = fit.variances[:, None, None] * np.einsum("vja,cvab,vjb->cvj", u, C, u)
-    whole = shares.sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        freedoms = whole**2 / (shares**2 / fit.freedoms[:, None, None]).sum(axis=0)
-    return np.sqrt(whole), np.where(np.isnan(freedoms), math.inf, freedoms)
+Reach = Callable[[Array], Array]
 
 
-def _student(level: float, freedoms: Array) -> Array:
-    return np.where(freedoms > 1e6, ndtri(level), stdtrit(np.minimum(freedoms, 1e6), level))
-
-
-def upper_bound(fit: ErrorFit, corners: Array, level: float, chance: float = 0.5) -> Bound:
-    """The error at every corner (V, 3, k) is below this with probability ``level``, as the intersection-union test has.
-
-    With a ``chance``, the value that the bound will not exceed with this chance if the estimate is the true error.
-    """
-    theta, C = corners @ fit.estimate, corners @ fit.parts[:, None] @ np.swapaxes(corners, 1, 2)
-
-    def values(u: Array) -> tuple[Array, Array, Array]:
-        deviations, freedoms = _deviations(fit, C, u)
-        reach = _student(level, freedoms) + ndtri(chance)
-        return np.einsum("vja,va->vj", u, theta) + reach * deviations, deviations, reach
-
-    u = np.broadcast_to(U, (len(theta), DIRECTIONS, 3))
-    found = values(u)[0]
-    u = np.take_along_axis(u, found.argmax(axis=1)[:, None, None], axis=1)
-    best = found.max(axis=1)
-    Cov = np.einsum("c,cvab->vab", fit.variances, C)
-    for _ in range(STEPS):  # a convex function of u: each step along its gradient climbs
-        at, deviations, reach = values(u)
-        best = np.maximum(best, at[:, 0])
-        gradient = theta + (reach / np.maximum(deviations, 1e-300)) * (Cov @ u[:, 0, :, None])[:, :, 0]
-        lengths = np.linalg.norm(gradient, axis=1, keepdims=True)
-        u = np.where(lengths > 0.0, gradient / np.maximum(lengths, 1e-300), u[:, 0])[:, None]
-    return Bound(float(best.max()), int(best.argmax()))
-
-
-def lower_bound(fit: ErrorFit, corners: Array, level: float) -> float:
-    """The largest error of all corners is above this with probability ``level``; 0 where nothing says that."""
-    theta, C = corners @ fit.estimate, corners @ fit.parts[:, None] @ np.swapaxes(corners, 1, 2)
-    lengths = np.maximum(np.linalg.norm(theta, axis=1), 1e-300)
-    own = (theta / lengths[:, None])[:, None]
-    u = np.concatenate([np.broadcast_to(U, (len(theta), DIRECTIONS, 3)), own], axis=1)
-    deviations, freedoms = _deviations(fit, C, u)
-    k = len(fit.estimate)
-    reach = np.sqrt(k * fdtri(k, np.clip(freedoms, 1.0, 1e6), level))
-    return max(0.0, float((np.einsum("vja,va->vj", u, theta) - reach * deviations).max()))
-
-
-def largest_error(fit: ErrorFit, corners: Array) -> float:
-    """The largest estimated error of all corners, metres."""
-    return float(np.linalg.norm(corners @ fit.estimate, axis=1).max())
-
-
-def amplification(fit: ErrorFit, corners: Array) -> float:
-    """How many times worse the worst corner is known than the mean of all touches; infinite if it is not at all."""
-    if np.linalg.norm(corners @ fit.free, axis=1).max(initial=0.0) > math.sqrt(NULL):
-        return math.inf
-    covariance = np.einsum("c,cab->ab", fit.variances, fit.parts)
-    worst = np.linalg.eigvalsh(corners @ covariance @ np.swapaxes(corners, 1, 2))[:, -1].max()
-    return math.sqrt(fit.count * worst / fit.mean_variance_m2) if worst > 0.0 else 1.0
-
-
-def touches_needed(fit: ErrorFit, corners: Array, limit_m: float, level: float) -> int | None:
-    """How many more touches of the same kind the acceptance needs, if the estimate is the true error.
-
-    After them the calibration is accepted with the chance ``CHANCE``. None where the estimate is above the limit, or
-    where ``MOST_TOUCHES`` are not enough.
-    """
-
-    def enough(touches: int) -> bool:
-        return upper_bound(fit.after(touches), corners, level, CHANCE).value_m < limit_m
-
-    return _least(enough, fit.count + 1, fit.count + MOST_TOUCHES, fit.count)
-
-
-def _least(holds: Callable[[int], bool], low: int, high: int, base: int) -> int | None:
-    """The least number from ``low`` to ``high`` for which ``holds``, less ``base``, by doubling and halving."""
-    step = 1
-    while not holds(min(base + step, high)):
-        if base + step >= high:
-            return None
-        low, step = base + step + 1, 2 * step
-    high = min(base + step, high)
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if holds(middle) else (middle + 1, high)
-    return high - base
+def _satterthwaite(variances: Array, freedoms: Array) -> Array:
+    """Degrees of freedom of sums over the first axis of ``variances``, whose rows have these ``freedoms``."""
+    whole = variances.sum(axis=0)
+    shares = variances / np.maximum(whole, 1e-300)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(whole > 0.0, 1.0 / (shares**2 / freedoms[:, None]).sum(axis=0), freedoms.min()))
 
 
 def best_places(fit: ErrorFit, corners: Array, number: int) -> list[int]:

@@ -82,8 +82,8 @@ def read_touches(path: str | Path) -> Touches:
     wanted = (*POINTS, *POSES) if any(name in POSES for name in names) else POINTS
     if sorted(names) != sorted(wanted):
         raise FileFormatError(
-            f"{path}, line 1: the columns are {brief(', '.join(names))}; give a header with {', '.join(POINTS)} (metres), "
-            f"and, where known is in the frame that carries the targets, {', '.join(POSES)}."
+            f"{path}, line 1: the columns are {brief(', '.join(names))}; give a header with {', '.join(POINTS)} "
+            f"(metres), and, where known is in the frame that carries the targets, {', '.join(POSES)}."
         )
     rows = [_numbers(path, number, line, names) for number, line in enumerate(lines[1:], start=2) if line.strip()]
     if not rows:
