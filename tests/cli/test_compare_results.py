@@ -119,3 +119,82 @@ def test_a_log_that_the_calibration_was_made_from_is_known_again(tmp_path: Path)
 def test_a_path_that_is_none_is_refused(tmp_path: Path, folder: Path) -> None:
     done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path / "nothing.json")])
     assert done.exit_code == ExitStatus.BAD_INPUT
+
+
+def touches(folder: Path, file: Path, off_m: float) -> Path:
+    """A file of touched points, if predictions of the right camera are off by so much."""
+    T = rw.results.read_refined(folder / "old" / "result.json").Y["right"].matrix()
+    chance = np.random.default_rng(4)
+    seen = (chance.random((8, 3)) - 0.5) * [0.4, 0.3, 0.2] + [0.0, 0.0, 0.6]
+    known = seen @ T[:3, :3].T + T[:3, 3] + [off_m, 0.0, 0.0] + 1e-4 * chance.standard_normal((8, 3))
+    names = "sensor_x_m,sensor_y_m,sensor_z_m,known_x_m,known_y_m,known_z_m"
+    np.savetxt(file, np.hstack([seen, known]), delimiter=",", header=names, comments="")
+    return file
+
+
+def test_touches_accept_a_calibration_or_not(folder: Path, tmp_path: Path) -> None:
+    result = tmp_path / "result.json"
+    result.write_bytes((folder / "old" / "result.json").read_bytes())
+    good, bad = (touches(folder, tmp_path / f"{off_m}.csv", off_m) for off_m in (0.0, 0.003))
+    calls = (
+        ([str(good), "--limit-mm", "1"], ExitStatus.DONE, "Accepted: right is off by less than 1 mm with 95 %"),
+        ([str(good), "--limit-mm", "0.15"], ExitStatus.NOT_UNIQUE, "Not accepted yet: "),
+        ([str(good), "--limit-mm", "1", "--ball", "9", "9", "9", "1"], ExitStatus.NOT_UNIQUE, "Not determined: "),
+        ([str(bad), "--limit-mm", "1", "--box", *"000111"], ExitStatus.CHANGED, "Rejected: "),
+    )
+    for arguments, status, begins in calls:
+        done = CliRunner().invoke(app, ["accept", str(result), *arguments, "--sensor", "right"])
+        assert done.exit_code == status, done.output
+        assert done.stdout.startswith(begins)
+        (found,) = rw.results.read_result(result).acceptance
+        assert done.stdout.startswith(str(found))
+        assert found.source == Path(arguments[0]).name
+    before = result.read_bytes()
+    done = CliRunner().invoke(app, ["accept", str(result), *calls[0][0], "--sensor", "right", "--no-write"])
+    assert done.exit_code == ExitStatus.DONE
+    assert result.read_bytes() == before
+    refused = CliRunner().invoke(app, ["accept", str(result), str(good), "--limit-mm", "1"])
+    assert refused.exit_code == ExitStatus.BAD_INPUT  # of two sensors none is named
+    assert "say which one is tested" in refused.output
+    both = ["--box", *"000111", "--ball", *"0001"]
+    assert CliRunner().invoke(app, ["accept", str(result), *calls[0][0], *both]).exit_code == ExitStatus.BAD_INPUT
+
+
+def test_the_answer_of_touches_stays_where_other_commands_read_the_result(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_bytes((folder / "old" / "result.json").read_bytes())
+    file = touches(folder, tmp_path / "touches.csv", 0.0)
+    options = ["--limit-mm", "1", "--sensor", "right"]
+    assert CliRunner().invoke(app, ["accept", str(tmp_path), str(file), *options]).exit_code == ExitStatus.DONE
+    assert CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path)]).exit_code == ExitStatus.DONE
+    page = tmp_path / "page.html"
+    assert CliRunner().invoke(app, ["report", str(tmp_path), "-o", str(page)]).exit_code == ExitStatus.DONE
+    assert "right is off by less than 1 mm with 95 %" in page.read_text("utf-8")
+    assert len(rw.results.read_result(tmp_path / "result.json").acceptance) == 1
+
+
+def test_a_board_in_other_csv_files_accepts_a_calibration_of_csv_files(tmp_path: Path) -> None:
+    for name, log in (("old", log_of(0)), ("new", log_of(1, count=40))):
+        (tmp_path / name).mkdir()
+        one = log.measurements("board" if name == "old" else "tag", "left")
+        for side, poses in (("A", one.A), ("B", one.B)):
+            q = [gtsam.Rot3(T[:3, :3]).toQuaternion() for T in poses]
+            rows = [[each.w(), each.x(), each.y(), each.z(), *T[:3, 3]] for each, T in zip(q, poses, strict=True)]
+            np.savetxt(tmp_path / name / f"tag_{len(name) + len(log.pairs)}_cam_0_{side}.csv", rows, delimiter=",")
+    result = tmp_path / "result.json"
+    done = CliRunner().invoke(app, ["calibrate", str(tmp_path / "old"), "-o", str(result)])
+    assert done.exit_code == ExitStatus.DONE, done.output
+    answers = [
+        CliRunner().invoke(app, ["accept", str(result), str(tmp_path / name), "--limit-mm", "10"])
+        for name in ("new", "old")
+    ]
+    assert answers[0].exit_code == ExitStatus.DONE, answers[0].output
+    assert answers[0].stdout.startswith("Accepted: cam_0 is off by less than 10 mm")
+    assert answers[1].exit_code == ExitStatus.BAD_INPUT
+    assert "the calibration was made from it" in answers[1].output
+
+
+def test_the_probability_is_that_of_the_library() -> None:
+    from gtsam_rwhec.results import acceptance
+
+    assert compare_results.PROBABILITY == acceptance.LEVEL
+    assert set(compare_results.STATUSES) == {answer.value for answer in rw.results.Answer}

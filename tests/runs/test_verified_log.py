@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +116,16 @@ def test_a_result_without_its_log_needs_a_rig_file(old: Path, tmp_path: Path) ->
     log = new_log(tmp_path)
     with pytest.raises(LogError, match="give --rig FILE"):
         verify_log(tmp_path / "result.json", log)
+
+
+def test_a_new_log_accepts_a_calibration_and_its_own_log_does_not(old: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(old, out)
+    log = new_log(tmp_path)
+    done = CliRunner().invoke(app, ["accept", str(out), str(log), "--limit-mm", "100", "--sensor", "cam_1"])
+    assert done.exit_code == ExitStatus.DONE, done.output
+    assert done.stdout.startswith("Accepted: cam_1 is off by less than 100 mm with 95 %")
+    (found,) = rw.results.read_calibration(out).acceptance
+    assert (found.of, found.source) == ("views", log.name)
+    with pytest.raises(LogError, match="made from this very log"):
+        rw.runs.accept_log(old, old / "calibration.mcap", limit_mm=100.0, sensor="cam_1")
