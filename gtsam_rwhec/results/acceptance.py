@@ -25,10 +25,11 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_between
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.results.acceptance_record import Acceptance, Answer, Triple, Volume
+from gtsam_rwhec.results.acceptance_record import Acceptance, Answer, Volume
 from gtsam_rwhec.results.changed_frames import as_result
 from gtsam_rwhec.results.equivalence_test import ErrorFit, TouchRows, VolumeTest, best_places, error_rows, fit_error
 from gtsam_rwhec.results.evidence import checksum, evidence_path, read_evidence, write_evidence
+from gtsam_rwhec.results.file_record import triple
 from gtsam_rwhec.results.json_tree import MOST_BYTES, to_json
 from gtsam_rwhec.results.result_file import Result, parse_result, parse_tree, result_path
 from gtsam_rwhec.results.touches import Touches
@@ -41,6 +42,8 @@ FAR = 20.0
 FLAT = 0.02
 #: So many places are proposed.
 PLACES = 3
+#: Of more boards, those that were seen most often count.
+MOST_BOARDS = 50
 #: A touch is named that is this rarely so far from the others.
 RARE = 0.01
 
@@ -144,16 +147,16 @@ def accept(
         estimate_mm=math.inf if bound is None else 1e3 * test.estimate_m,
         upper_mm=math.inf if bound is None else 1e3 * (bound + known_m),
         lower_mm=1e3 * lower_m,
-        worst_m=_triple(corners_m[corner]),
+        worst_m=triple(corners_m[corner]),
         noise_mm=(1e3 * fit.noise_m[0], 1e3 * fit.noise_m[1]),
         noise="estimated" if fit.is_estimated else "stated",
         degrees_of_freedom=tuple(fit.freedoms.tolist()),
         known_to_mm=float(known_to_mm),
         scale_is_free=has_scale,
         more=test.needed(limit_m - known_m) if said is Answer.NOT_YET else None,
-        places_m=tuple(_triple(corners_m[index]) for index in dict.fromkeys(places)),
+        places_m=tuple(triple(corners_m[index]) for index in dict.fromkeys(places)),
         lacking=lacking if said is Answer.NOT_DETERMINED else "",
-        remarks=tuple(_remarks(found, fit, points, level, given=given, stated=stated, of_boards=of_boards)),
+        remarks=tuple(_remarks(found, fit, points, given=given, stated=stated, of_boards=of_boards)),
     )
 
 
@@ -202,6 +205,7 @@ def _of_boards(result: Result, problem: Problem, sensor: str) -> Equations:
             f"nothing in the new measurements is seen by {shown(sensor)}; they have the sensors "
             f"{', '.join(map(shown, problem.sensors))}"
         )
+    pairs = sorted(pairs, key=lambda pair: len(problem.measurements(*pair).B), reverse=True)[:MOST_BOARDS]
     points, errors, others, sights = [], [], [], []
     for place, pair in enumerate(pairs):
         one = problem.measurements(*pair)
@@ -250,7 +254,7 @@ def _lacking(test: VolumeTest, points: Array, *, is_stated: bool, of_boards: boo
 
 
 def _remarks(
-    result: Result, fit: ErrorFit, points: Array, level: float, *, given: Volume | None,
+    result: Result, fit: ErrorFit, points: Array, *, given: Volume | None,
     stated: tuple[float, float] | None, of_boards: bool,
 ) -> list[str]:  # fmt: skip
     remarks = []
@@ -279,11 +283,6 @@ def _remarks(
         what = "view" if of_boards else "touch"
         remarks.append(f"{what} {largest + 1} is {1e3 * lengths[largest]:.2f} mm off the others: look at it")
     return remarks
-
-
-def _triple(values: Array) -> Triple:
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
 
 
 def write_acceptance(found: Acceptance, path: str | Path) -> None:

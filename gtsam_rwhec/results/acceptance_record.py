@@ -15,8 +15,8 @@ from gtsam_rwhec.files.terminal_text import rounded, shown
 from gtsam_rwhec.geometry.poses import LARGEST_M, Array
 from gtsam_rwhec.geometry.real_numbers import real_array
 from gtsam_rwhec.results.equivalence_test import spread_directions
+from gtsam_rwhec.results.file_record import Triple, triple
 
-Triple = tuple[float, float, float]
 #: A ball is tested at the corners of a solid that holds it: so many points, this much farther out.
 BALL_CORNERS, BALL_MARGIN = 250, 1.015
 
@@ -44,7 +44,7 @@ class Volume:
         low, high = _three(low_m, "low_m"), _three(high_m, "high_m")
         if not (high >= low).all():
             raise OptionError(f"the box from {low.tolist()} to {high.tolist()} has a negative length; exchange them")
-        return Volume("box", _triple((low + high) / 2.0), _triple((high - low) / 2.0))
+        return Volume("box", triple((low + high) / 2.0), triple((high - low) / 2.0))
 
     @staticmethod
     def ball(centre_m: ArrayLike, radius_m: float) -> Volume:
@@ -52,15 +52,15 @@ class Volume:
         radius = _three([radius_m, radius_m, radius_m], "radius_m")
         if not radius[0] > 0.0:
             raise OptionError(f"a ball of radius {radius_m} m; give a positive one")
-        return Volume("ball", _triple(_three(centre_m, "centre_m")), _triple(radius))
+        return Volume("ball", triple(_three(centre_m, "centre_m")), triple(radius))
 
     @property
     def corners_m(self) -> Array:
         """Points (V, 3) whose convex hull holds the volume: the eight corners of a box."""
         if self.shape == "ball":
-            return np.array(self.centre_m) + BALL_MARGIN * self.half_m[0] * spread_directions(BALL_CORNERS)
+            return self.centre_m + BALL_MARGIN * self.half_m[0] * spread_directions(BALL_CORNERS)
         signs = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij")).reshape(3, 8).T
-        return np.array(self.centre_m) + signs * self.half_m
+        return self.centre_m + signs * self.half_m
 
     def __str__(self) -> str:
         if self.shape == "ball":
@@ -77,11 +77,6 @@ def _three(values: ArrayLike, name: str) -> Array:
     if array.shape != (3,) or not (np.abs(array) <= LARGEST_M).all():
         raise OptionError(f"{name} of the volume is {array.tolist()}; give three finite numbers, metres")
     return array
-
-
-def _triple(values: Array) -> Triple:
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
 
 
 def place_words(point_m: Triple) -> str:
@@ -146,6 +141,8 @@ class Acceptance:
         """What to do where it is not accepted yet, as sentences."""
         verb = "Touch" if self.of == "touches" else "Take"
         what = "" if self.of == "touches" else " views of a board"
+        if self.known_to_mm >= self.limit_mm:
+            return "The points themselves are not known to the limit: measure the tool tip better."
         if self.estimate_mm + self.known_to_mm >= self.limit_mm:
             said = (
                 f"The estimate itself is not below the limit, by no more than chance. {verb} {self.count} more{what} "

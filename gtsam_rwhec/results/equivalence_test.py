@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from rwhec_factors import se3
 from scipy.special import chdtrc, fdtri, ndtri, stdtrit
 
@@ -75,8 +76,7 @@ class TouchRows:
 def error_rows(points_m: Array, centre_m: Array, lever_m: float, *, has_scale: bool) -> Array:
     """J (n, 3, 6 or 7) of points; rotations are about ``centre_m``, and in units of 1 / ``lever_m``."""
     levers = (points_m - centre_m) / lever_m
-    turned = -np.array([se3.hat(lever) for lever in levers]).reshape(-1, 3, 3)
-    blocks = [turned, np.broadcast_to(np.eye(3), (len(levers), 3, 3))]
+    blocks = [-se3.hat(levers), np.broadcast_to(np.eye(3), (len(levers), 3, 3))]
     return np.concatenate([*blocks, levers[:, :, None]] if has_scale else blocks, axis=2)
 
 
@@ -196,7 +196,9 @@ class VolumeTest:
         along = np.concatenate([self._theta @ U.T, np.einsum("va,va->v", own, self._theta)[:, None]], axis=1)
         variances = np.einsum("ja,cvab,jb->cvj", U, self._covariances, U, optimize=True)
         of_own = np.einsum("va,cvab,vb->cv", own, self._covariances, own)
-        return along.ravel(), np.concatenate([variances, of_own[:, :, None]], axis=2).reshape(len(variances), -1)
+        return np.asarray(along.ravel()), np.concatenate([variances, of_own[:, :, None]], axis=2).reshape(
+            len(variances), -1
+        )
 
     @cached_property
     def estimate_m(self) -> float:
@@ -220,7 +222,7 @@ class VolumeTest:
         k = self.corners.shape[2]
 
         def scheffe(freedoms: Array) -> Array:
-            return np.sqrt(k * np.asarray(fdtri(k, np.minimum(freedoms, 1e6), self.level)))
+            return np.asarray(np.sqrt(k * fdtri(k, np.minimum(freedoms, 1e6), self.level)))
 
         return max(0.0, float(self._largest(scheffe, -1.0, self.fit.freedoms)[0].max()))
 
@@ -254,7 +256,7 @@ class VolumeTest:
     def _student(self, freedoms: Array) -> Array:
         return np.asarray(np.where(freedoms > 1e6, ndtri(self.level), stdtrit(np.minimum(freedoms, 1e6), self.level)))
 
-    def _largest(self, reach: Reach, sign: float, freedoms: Array) -> tuple[Array, Array]:
+    def _largest(self, reach: Reach, sign: float, freedoms: Array) -> tuple[Array, NDArray[np.intp]]:
         """The largest values of u'J(p) d + sign * reach * deviation on the grid, and where they are.
 
         The reach falls with the degrees of freedom, which are between the least of a component and all together; so
@@ -269,7 +271,7 @@ class VolumeTest:
         order = np.argsort(values)[::-1][:CLIMBERS]
         return values[order], kept[order]
 
-    def _climbed(self, values: Array, at: Array) -> tuple[float, int]:
+    def _climbed(self, values: Array, at: NDArray[np.intp]) -> tuple[float, int]:
         """The maximum between the directions of the grid; each step along the gradient of a convex function climbs."""
         number = len(U) + 1
         corner = at // number
