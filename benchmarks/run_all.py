@@ -49,6 +49,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "report_cost": ("", ""),
     "gallery": ("--runs 10", None),
     "changes": ("--runs 1000", "--runs 1"),
+    "acceptance": ("", "--runs 20"),
     "odometry_bounds": ("--runs 40", "--runs 1"),
     "odometry_planar": ("--runs 200", "--runs 1"),
     "fleet_scale": ("", None),

@@ -199,8 +199,9 @@ def accept(
 ) -> ExitStatus:
     """Whether a calibration is off by less than a limit in a volume: known points, or a new board, prove it with 95 %.
 
-    A calibration that is off by the limit is accepted in at most 5 % of all cases. Exit status 0: accepted. 1:
-    rejected. 3: not accepted yet, touch more; or the touches cannot tell.
+    A calibration that is off by the limit is accepted in at most 5 % of all cases.
+
+    Exit status 0: accepted. 1: rejected. 3: not accepted yet, touch more; or the touches cannot tell.
     """
     if box is not None and ball is not None:
         raise typer.BadParameter("give --box or --ball, not both")
