@@ -157,7 +157,7 @@ class Acceptance:
             )
         if self.places_m:
             places = "; ".join(map(place_words, self.places_m))
-            said += f" Fewer do near {places}." if self.of == "touches" else f" Fewer do with the board near {places}."
+            said += f" {'Points' if self.of == 'touches' else 'Boards'} near {places} tell most."
         return said
 
     @property
