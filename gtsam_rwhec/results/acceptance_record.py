@@ -58,9 +58,9 @@ class Volume:
     def corners_m(self) -> Array:
         """Points (V, 3) whose convex hull holds the volume: the eight corners of a box."""
         if self.shape == "ball":
-            return self.centre_m + BALL_MARGIN * self.half_m[0] * spread_directions(BALL_CORNERS)
+            return np.asarray(self.centre_m + BALL_MARGIN * self.half_m[0] * spread_directions(BALL_CORNERS))
         signs = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij")).reshape(3, 8).T
-        return self.centre_m + signs * self.half_m
+        return np.asarray(self.centre_m + signs * self.half_m)
 
     def __str__(self) -> str:
         if self.shape == "ball":

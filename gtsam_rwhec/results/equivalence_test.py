@@ -269,7 +269,7 @@ class VolumeTest:
         kept = np.flatnonzero(high >= low.max())
         values = along[kept] + sign * reach(_satterthwaite(variances[:, kept], freedoms)) * deviations[kept]
         order = np.argsort(values)[::-1][:CLIMBERS]
-        return values[order], kept[order]
+        return np.asarray(values[order]), np.asarray(kept[order], dtype=np.intp)
 
     def _climbed(self, values: Array, at: NDArray[np.intp]) -> tuple[float, int]:
         """The maximum between the directions of the grid; each step along the gradient of a convex function climbs."""
