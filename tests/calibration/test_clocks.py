@@ -157,7 +157,7 @@ def why_of(calibration: rw.Calibration) -> rw.Choice:
     return next(choice for choice in calibration.choices if choice.what == "time offsets")
 
 
-@pytest.mark.parametrize("late_s", [0.004, 0.03, -0.07])
+@pytest.mark.parametrize("late_s", [0.004, -0.07])
 def test_a_late_clock_is_found_and_estimated(late_s: float) -> None:
     """70 ms at 10 Hz look like rows that are shifted by one; the stamps say that the clock is late."""
     problem, Y = moving(0, late_s)
@@ -215,7 +215,7 @@ def test_the_clock_of_a_sensor_that_the_option_leaves_out_is_not_passed_over() -
     """A tuple names the sensors whose offsets are estimated; the others count as right, and are asked too."""
     problem = rw.Problem()
     for sensor, late_s in (("cam", 0.0), ("late", 0.03)):
-        raw = moving(0, late_s, count=60)[0].measurements("tag", "cam")
+        raw = moving(0, late_s, count=40)[0].measurements("tag", "cam")
         problem.add("tag", sensor, raw.A, raw.B, stamps_ns=raw.stamps_ns)
     found = rw.calibrate(problem, rw.CalibrateOptions(time_offsets=("cam",), misreadings=False))
     assert rw.Ground.LATE_CLOCK in found.judgement.grounds

@@ -154,9 +154,14 @@ def test_a_size_that_hangs_on_single_measurements_is_said() -> None:
     assert found.sizes[0].is_untested
 
 
-@pytest.mark.parametrize("sizes", ["check", "correct"])
-@pytest.mark.parametrize("options", [{}, {"time_offsets": False}])
-@pytest.mark.parametrize("noise", [None, rw.CarrierNoise(0.02, 0.02)])
+@pytest.mark.parametrize(
+    ("sizes", "options", "noise"),
+    [
+        ("check", {}, rw.CarrierNoise(0.02, 0.02)),
+        ("check", {"time_offsets": False}, None),
+        ("correct", {"time_offsets": False}, rw.CarrierNoise(0.02, 0.02)),
+    ],
+)
 def test_too_much_noise_of_A_or_clocks_that_are_chosen_do_not_end_the_check_of_sizes(
     sizes: str, options: dict[str, bool], noise: rw.CarrierNoise | None
 ) -> None:

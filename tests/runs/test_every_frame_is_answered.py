@@ -18,6 +18,8 @@ from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.failures import exit_status
 from gtsam_rwhec.simulate import frame_distance
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 FILES = set(rw.rig.FILES)
 
 

@@ -16,6 +16,8 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.recorded_logs import samples_problem
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 RIG = """\
 carriers: {{sensors: {sensors}, targets: {targets}, poses: {{frames: [base, hand]}}}}
 sensors:
