@@ -159,7 +159,7 @@ def why_of(calibration: rw.Calibration) -> rw.Choice:
 
 @pytest.mark.parametrize("late_s", [0.0, 0.004, -0.07])
 def test_a_late_clock_is_found_and_estimated(late_s: float) -> None:
-    """70 ms at 10 Hz look like rows that are shifted by one; none taken as right would be missing in the covariances."""
+    """70 ms at 10 Hz look like rows that are shifted by one; one of 0 has its share in the covariances."""
     problem, Y = moving(0, late_s)
     calibration = rw.calibrate(problem)
     assert calibration.verdict is rw.Verdict.USE

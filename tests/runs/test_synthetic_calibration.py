@@ -57,10 +57,8 @@ def test_what_contradicts_is_named_with_its_exit_status_and_no_file_for_others_i
     (tmp_path / "rig.yaml").write_text(made.rig_text(sizes="sizes: known"), encoding="utf-8")
     done = given("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
     assert done.exit_code == 6, done.output
-    said = " ".join(done.stdout.split())
-    assert said.startswith(
-        "Do not use these poses: the time offset of cam_1 is 0 s in the rig file, but its rotations "
-    )
+    words = "Do not use these poses: the time offset of cam_1 is 0 s in the rig file, but its rotations "
+    assert " ".join(done.stdout.split()).startswith(words)
     grounds = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["verdict_grounds"]
     assert set(grounds) & {"late_clock", "contradicted"}
     written = sorted(path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith("."))
