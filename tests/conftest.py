@@ -11,26 +11,37 @@ import pytest
 from places import REPOSITORY
 
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.report.figures import SvgFigure
 
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/detect/test_other_opencv.py brings OpenCV 4.
 BESIDE_OPENCV_4 = ["methods/test_beside_opencv4.py", "methods/test_opencv4.py"]
 collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OPENCV_4
 
-#: Packages whose functions users reach only through calls that hold the limit of one BLAS thread.
-BELOW_THE_LIMIT = ("fitting", "solver")
+#: The tests of the limit itself, which begin with several threads.
+OF_THE_LIMIT = "test_blas_threads.py"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread_below_the_limit(request: pytest.FixtureRequest) -> Iterator[None]:
-    """One BLAS thread for tests of inner functions, as their callers in the library hold it.
+def one_thread_of_blas(request: pytest.FixtureRequest) -> Iterator[None]:
+    """One BLAS thread, as every public call holds it, for what tests compute around those calls too.
 
-    Without it the threads of two workers wait for each other: minutes in place of seconds where cores are busy.
+    Without it the threads of BLAS wait in busy loops after each small matrix: twice the processor's time, and
+    minutes in place of seconds where cores are busy.
     """
-    if request.path.parent.name in BELOW_THE_LIMIT:
+    if request.path.name == OF_THE_LIMIT:
+        yield
+    else:
         with one_blas_thread():
             yield
-    else:
-        yield
+
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports whose figures are empty, for tests that read other words: to draw ten takes as long as to calibrate.
+
+    Figures of whole runs are drawn in tests/runs/test_whole_runs.py, test_hostile_names.py and test_bad_logs.py.
+    """
+    monkeypatch.setattr(SvgFigure, "in_page", "<svg></svg>")
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,7 @@ MODES: dict[str, dict[str, Any]] = {
     "shared": dict(scale="shared"),
     "per_target": dict(scale="per_target", known_sizes=("target0",)),
 }
-few = settings(max_examples=12, deadline=None)
+few = settings(max_examples=6, deadline=None)
 
 
 def matrices(poses: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ def answers(folder: Path, out: Path, place: str) -> dict[str, np.ndarray]:
         return dict(found)
 
 
-@pytest.mark.parametrize(("data", "others"), [("demo", ["two", "four", "four on one core"]), ("utias", ["four"])])
+@pytest.mark.parametrize(("data", "others"), [("demo", ["two", "four on one core"]), ("utias", ["four"])])
 def test_threads_cores_and_workers(
     data: str, others: list[str], request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:

@@ -98,7 +98,7 @@ def test_the_enclosure_holds_the_exact_cost_and_is_narrow() -> None:
 
 
 def test_the_exact_cost_is_the_papers() -> None:
-    for one in solved(range(60), sane=True, most=12):
+    for one in solved(range(30), sane=True, most=12):
         gauge = Gauge(np.array([0.3, -0.2, 0.1]), np.array([-0.1, 0.4, 0.2]))
         form = "direct" if one.case.scale != "per_target" else "inverse"
         cost, poses = stated(one, form, gauge)
@@ -139,7 +139,7 @@ def test_answers_in_pairs_cost_what_their_fractions_cost() -> None:
 
 
 def test_descent_ends_at_a_minimum_to_the_last_digit() -> None:
-    for one in solved(range(20), sane=True):
+    for one in solved(range(10), sane=True):
         cost, poses = stated(one)
         if not cost.rows.free:
             continue
@@ -152,7 +152,7 @@ def test_descent_ends_at_a_minimum_to_the_last_digit() -> None:
 
 def test_a_bound_above_the_least_cost_by_one_part_in_ten_to_the_thirteen_is_found() -> None:
     found = 0
-    for one in solved(range(20), sane=True):
+    for one in solved(range(10), sane=True):
         cost, poses = stated(one)
         if not cost.rows.free or one.solution.cost < 1e-3:
             continue
@@ -164,7 +164,7 @@ def test_a_bound_above_the_least_cost_by_one_part_in_ten_to_the_thirteen_is_foun
         # Answers whose rotations are rounded to doubles, the returned one too, may cost a little less than this.
         assert "bound above an answer" not in one.judged(lower_bound=least * (1.0 - 1e-13), cost=2.0 * least)
         found += 1
-    assert found > 10
+    assert found > 5
 
 
 def test_a_cost_below_the_answers_by_two_ulps_is_found() -> None:
@@ -180,7 +180,7 @@ def test_a_cost_below_the_answers_by_two_ulps_is_found() -> None:
 def test_a_local_minimum_that_claims_to_be_the_least_is_found_out() -> None:
     """A bound at the cost of another valley: the search from random starts finds the lower one."""
     found = 0
-    for one in solved(range(24), sane=True):
+    for one in solved(range(12), sane=True):
         rng = np.random.default_rng(one.case.seed)
         q = rng.standard_normal(4)
         turn = quaternions.rotations(Pairs.of(q[None])).hi[0]
@@ -200,7 +200,7 @@ def test_a_local_minimum_that_claims_to_be_the_least_is_found_out() -> None:
             assert "bound above an answer" in {violation.kind for violation in verdict.violations}
             assert verdict.best <= stated(one)[0].of_poses(stated(one)[1]).value.hi[0] * (1.0 + 1e-12) + 1e-12
             found += 1
-    assert found > 15
+    assert found > 7
 
 
 def test_a_region_keeps_answers_outside_it_out_of_the_verdict() -> None:

@@ -157,9 +157,9 @@ def why_of(calibration: rw.Calibration) -> rw.Choice:
     return next(choice for choice in calibration.choices if choice.what == "time offsets")
 
 
-@pytest.mark.parametrize("late_s", [0.004, 0.03, -0.07])
+@pytest.mark.parametrize("late_s", [0.0, 0.004, -0.07])
 def test_a_late_clock_is_found_and_estimated(late_s: float) -> None:
-    """70 ms at 10 Hz look like rows that are shifted by one; the stamps say that the clock is late."""
+    """70 ms at 10 Hz look like rows that are shifted by one; one of 0 has its share in the covariances."""
     problem, Y = moving(0, late_s)
     calibration = rw.calibrate(problem)
     assert calibration.verdict is rw.Verdict.USE
@@ -167,15 +167,6 @@ def test_a_late_clock_is_found_and_estimated(late_s: float) -> None:
     assert calibration.time_offsets_s["cam"] == pytest.approx(late_s, abs=max(4.0 * sigma_s, 2e-4))
     assert calibration.contains("cam", Y, 0.9999)
     assert why_of(calibration).chosen == "estimated for cam"
-
-
-def test_clocks_that_are_right_are_estimated_too() -> None:
-    """A small offset that was taken as none would be missing in the covariances."""
-    problem, Y = moving(1)
-    calibration = rw.calibrate(problem)
-    sigma_s = np.sqrt(calibration.covariance("time_offset:cam")[0, 0])
-    assert abs(calibration.time_offsets_s["cam"]) < 4.0 * sigma_s
-    assert calibration.contains("cam", Y, 0.9999)
 
 
 def test_calibrate_says_why_an_offset_is_not_estimated() -> None:
@@ -215,7 +206,7 @@ def test_the_clock_of_a_sensor_that_the_option_leaves_out_is_not_passed_over() -
     """A tuple names the sensors whose offsets are estimated; the others count as right, and are asked too."""
     problem = rw.Problem()
     for sensor, late_s in (("cam", 0.0), ("late", 0.03)):
-        raw = moving(0, late_s, count=60)[0].measurements("tag", "cam")
+        raw = moving(0, late_s, count=40)[0].measurements("tag", "cam")
         problem.add("tag", sensor, raw.A, raw.B, stamps_ns=raw.stamps_ns)
     found = rw.calibrate(problem, rw.CalibrateOptions(time_offsets=("cam",), misreadings=False))
     assert rw.Ground.LATE_CLOCK in found.judgement.grounds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,14 +155,15 @@ def test_a_size_that_hangs_on_single_measurements_is_said() -> None:
     assert found.sizes[0].is_untested
 
 
-@pytest.mark.parametrize("sizes", ["check", "correct"])
-@pytest.mark.parametrize("options", [{}, {"time_offsets": False}])
-@pytest.mark.parametrize("noise", [None, rw.CarrierNoise(0.02, 0.02)])
+@pytest.mark.parametrize(
+    ("sizes", "clocks", "of_A"), [("check", "auto", 0.02), ("check", False, 0), ("correct", False, 0.02)]
+)
 def test_too_much_noise_of_A_or_clocks_that_are_chosen_do_not_end_the_check_of_sizes(
-    sizes: str, options: dict[str, bool], noise: rw.CarrierNoise | None
+    sizes: Any, clocks: Any, of_A: float
 ) -> None:
     """With either, a board that is 5 % too large was not told."""
-    found = rw.calibrate(good(size=1.05), rw.CalibrateOptions(sizes=sizes, carrier_noise=noise, **options))  # type: ignore[arg-type]
+    noise = rw.CarrierNoise(of_A, of_A) if of_A else None
+    found = rw.calibrate(good(size=1.05), rw.CalibrateOptions(sizes=sizes, carrier_noise=noise, time_offsets=clocks))
     assert set(found.judgement.grounds) & {rw.Ground.SIZE_DOUBTED, rw.Ground.NO_SIZE_FITS}
     assert [one.what for one in found.choices].count("sizes of targets") == 1
 

@@ -1,4 +1,4 @@
-"""The command as people type it: a process of its own, its output and its exit status."""
+"""The command as people type it: its output and its exit status; a few in a process of their own."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from given_commands import given
 from places import CELL, DEMO
 
 import gtsam_rwhec as rw
@@ -29,11 +30,11 @@ NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 COMMAND = (sys.executable, "-m", "gtsam_rwhec")
 
 
-def run(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
-    environment = {**os.environ, "NO_PROXY": "127.0.0.1", "PYTHONIOENCODING": "utf-8"}
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end, in a process of its own."""
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8"}
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, encoding="utf-8", cwd=cwd, env=environment
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, encoding="utf-8", env=environment
     )
 
 
@@ -102,8 +103,8 @@ def slow_address() -> Iterator[str]:
 
 def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path) -> None:
     result = tmp_path / "result.json"
-    done = run("calibrate", utias_folder, "--certified-only", "--sigma", 1, "--kappa", 1, "-v", "-o", result)
-    assert done.returncode == 0, done.stderr
+    done = given("calibrate", utias_folder, "--certified-only", "--sigma", 1, "--kappa", 1, "-v", "-o", result)
+    assert done.exit_code == 0, done.stderr
     assert "16 targets, 8 sensors, 73 pairs, 3230 measurements" in done.stdout
     assert "no answer below 8.281245" in done.stdout
     assert f"Written to {result}; report: {tmp_path / 'report.html'}." in done.stderr
@@ -113,8 +114,8 @@ def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path
 
 
 def test_scale_and_method(utias_folder: Path) -> None:
-    done = run("calibrate", utias_folder, "--certified-only", "--scale", "shared", "--sigma", "1", "--kappa", "1")
-    assert done.returncode == 0, done.stderr
+    done = given("calibrate", utias_folder, "--certified-only", "--scale", "shared", "--sigma", "1", "--kappa", "1")
+    assert done.exit_code == 0, done.stderr
     assert "Scale: 1.025" in done.stdout
 
 
@@ -125,35 +126,28 @@ def test_a_misread_folder_is_named_without_refinement_too(tmp_path: Path) -> Non
         if path.stem.endswith("_B"):
             rows = rows[:, [1, 2, 3, 0, 4, 5, 6]]
         np.savetxt(tmp_path / path.name, rows, delimiter=",")
-    done = run("calibrate", tmp_path, "--certified-only")
-    assert done.returncode == 6, done.stderr
+    done = given("calibrate", tmp_path, "--certified-only")
+    assert done.exit_code == 6, done.stderr
     assert done.stdout.startswith("Do not use these poses: the quaternions of B are xyzw, and were read as wxyz")
 
 
-def test_local_from_an_earlier_result(tmp_path: Path) -> None:
-    assert run("calibrate", DEMO, "-o", tmp_path / "first.json").returncode == 0
-    done = run("calibrate", DEMO, "--certified-only", "--method", "local", "--initial", tmp_path / "first.json")
-    assert done.returncode == 0, done.stderr
-    assert "given start" in done.stdout
-
-
 def test_the_relaxation() -> None:
-    done = run("calibrate", DEMO, "--certified-only", "--method", "sdp", "--sigma", 0.005, "--kappa", 6565)
-    assert done.returncode == 0, done.stderr
+    done = given("calibrate", DEMO, "--certified-only", "--method", "sdp", "--sigma", 0.005, "--kappa", 6565)
+    assert done.exit_code == 0, done.stderr
     assert "relaxation" in done.stdout
 
 
 def test_unit_weights_are_called_relative() -> None:
-    assert "costs and covariances are relative" in run("calibrate", DEMO, "--certified-only", "--verbose").stdout
-    whole = run("calibrate", DEMO, "--verbose").stdout
+    assert "costs and covariances are relative" in given("calibrate", DEMO, "--certified-only", "--verbose").stdout
+    whole = given("calibrate", DEMO, "--verbose").stdout
     assert "The covariances are not: they come from the noise that the residuals show." in whole
 
 
 def test_words_of_file_names(tmp_path: Path) -> None:
     for path in DEMO.iterdir():
         shutil.copy(path, tmp_path / path.name.replace("tag_", "board_").replace("cam_", "lidar_"))
-    done = run("calibrate", tmp_path, "--targets", "board", "--sensors", "lidar")
-    assert done.returncode == 0, done.stderr
+    done = given("calibrate", tmp_path, "--targets", "board", "--sensors", "lidar")
+    assert done.exit_code == 0, done.stderr
     assert "\nboard_3 " in done.stdout
     assert "\nlidar_2 " in done.stdout
 
@@ -189,17 +183,16 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_done_is_status_2(arguments: list[object], said: str) -> None:
-    done = run(*arguments)
-    assert done.returncode == 2
+    done = given(*arguments)
+    assert done.exit_code == 2
     assert said in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_files_that_are_not_read_are_warned_of(tmp_path: Path) -> None:
     folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
     (folder / "README.txt").touch()
-    done = run("calibrate", folder)
-    assert done.returncode == 0
+    done = given("calibrate", folder)
+    assert done.exit_code == 0
     (warning,) = without_stages(done.stderr)
     assert warning.startswith("Warning: ")
     assert "README.txt" in warning
@@ -207,18 +200,19 @@ def test_files_that_are_not_read_are_warned_of(tmp_path: Path) -> None:
 
 def test_not_unique_is_status_3(tmp_path: Path) -> None:
     folder = write_csv(general(2, 2, seed=5, motion="planar", noise=NOISE).problem, tmp_path)
-    done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "-v", "-o", tmp_path / "result.json")
-    assert done.returncode == 3
+    done = given("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "-v", "-o", tmp_path / "result.json")
+    assert done.exit_code == 3
     assert "not unique" in done.stdout
     assert done.stdout.startswith("Do not use these poses: ")
     assert rw.read_solution(tmp_path / "result.json").certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     result = tmp_path / "refined.json"
-    given = ("calibrate", DEMO, "--sigma", 0.005, "--kappa", 6565, "--noise", "given", "--verbose")
-    done = run(*given, "-o", result)
-    assert done.returncode == 0, done.stderr
+    options = ("calibrate", DEMO, "--sigma", 0.005, "--kappa", 6565, "--noise", "given", "--verbose")
+    done = given(*options, "-o", result)
+    assert done.exit_code == 0, done.stderr
     assert done.stdout.startswith("Use these poses: ")
     assert done.stdout.index("How far off a point is") < done.stdout.index("What was chosen, and why")
     assert re.search(r"cam_0 +the frame that carries cam_0 +2\.60 +95 +3\.91 ", done.stdout)
@@ -233,16 +227,16 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             [float(cell) for cell in row.split()[7:10]], refined.standard_deviations(name)[1], atol=0.0051
         )
-    noisier = run(*given, "--carrier-noise-deg", 0.3, "--carrier-noise-mm", 2, "-o", tmp_path / "noisier.json")
+    noisier = given(*options, "--carrier-noise-deg", 0.3, "--carrier-noise-mm", 2, "-o", tmp_path / "noisier.json")
     assert "Noise of A: 0.3° and 2 mm for each axis of the target carrier, as given." in noisier.stdout
     wider = rw.read_refined(tmp_path / "noisier.json")
     assert (wider.standard_deviations("cam_0")[1] > refined.standard_deviations("cam_0")[1]).all()
-    again = run(
-        "calibrate", DEMO, "--certified-only", "--method", "local", "--initial", result
-    )  # the certified part of the file
-    assert again.returncode == 0, again.stderr
+    again = given("calibrate", DEMO, "--certified-only", "--method", "local", "--initial", result)
+    assert again.exit_code == 0, again.stderr
+    assert "given start" in again.stdout
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_outliers_are_left_out(tmp_path: Path) -> None:
     folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
     path = folder / "tag_0_cam_1_B.csv"
@@ -252,12 +246,12 @@ def test_outliers_are_left_out(tmp_path: Path) -> None:
         lines[i] = ",".join([*rotation, str(float(x) + 0.7), y, z])
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     weights = ("--sigma", 0.005, "--kappa", 6565, "--noise", "given", "--verbose")
-    done = run("calibrate", folder, *weights, "-o", tmp_path / "result.json")
-    assert done.returncode == 0, done.stderr
+    done = given("calibrate", folder, *weights, "-o", tmp_path / "result.json")
+    assert done.exit_code == 0, done.stderr
     kept, number = rw.read_refined(tmp_path / "result.json").inlier_counts["tag_0", "cam_1"]
     assert kept == number - 3
     assert f"3 of {number} of tag_0-cam_1" in done.stdout
-    all_count = run("calibrate", folder, "--robust", "none", "--verbose")
+    all_count = given("calibrate", folder, "--robust", "none", "--verbose")
     assert "every measurement counts, because an option says so" in all_count.stdout
     assert all_count.stdout.startswith("Use these poses with care: 3 of ")
     assert "--robust auto" in all_count.stdout.partition("Sensors in the frame")[0]
@@ -290,32 +284,31 @@ def test_not_certified_is_status_4(tmp_path: Path) -> None:
     elsewhere = dataclasses.replace(earlier, X={"tag_0": gtsam.Pose3()}, Y={"cam_0": gtsam.Pose3()})
     rw.write_solution(elsewhere, tmp_path / "start.json")
     local = ("--certified-only", "--method", "local", "--initial", tmp_path / "start.json")
-    done = run("calibrate", folder, "--sigma", 1, "--kappa", 1, *local)
-    assert done.returncode == 4, done.stderr
+    done = given("calibrate", folder, "--sigma", 1, "--kappa", 1, *local)
+    assert done.exit_code == 4, done.stderr
     assert "Not certified: this answer costs" in done.stdout
     assert without_stages(done.stderr) == []
 
 
 def test_a_log_gets_a_line_for_what_takes_long(slow_address: str, tmp_path: Path) -> None:
-    done = run("fetch", "utias", tmp_path / "utias", "--base-url", slow_address)
-    assert done.stderr.startswith("[1 s] downloading file 1 of 146: tag_0_cam_0_A.csv\nError: ")
+    done = given("fetch", "utias", tmp_path / "utias", "--base-url", slow_address)
+    assert re.match(r"\[\d+ s\] downloading file 1 of 146: tag_0_cam_0_A\.csv\nError: ", done.stderr)
 
 
 def test_fetch_then_calibrate(serve: str, tmp_path: Path) -> None:
-    first = run("fetch", "utias", "--base-url", serve, cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
+    first = given("fetch", "utias", "--base-url", serve, cwd=tmp_path)
+    assert first.exit_code == 0, first.stderr
     assert "146 files downloaded to utias, 0 existed already; all are verified." in first.stdout
-    again = run("fetch", "utias", "utias", "--base-url", serve, cwd=tmp_path)
+    again = given("fetch", "utias", "utias", "--base-url", serve, cwd=tmp_path)
     assert "0 files downloaded to utias, 146 existed already" in again.stdout
     next_command = again.stdout.splitlines()[-1].removeprefix("Next: gtsam-rwhec ").split()
-    assert run(*next_command, "--certified-only", cwd=tmp_path).returncode == 0
+    assert given(*next_command, "--certified-only", cwd=tmp_path).exit_code == 0
 
 
 def test_a_failed_download_is_status_5(serve: str, tmp_path: Path) -> None:
-    done = run("fetch", "utias", tmp_path / "utias", "--base-url", f"{serve}/elsewhere")
-    assert done.returncode == 5
+    done = given("fetch", "utias", tmp_path / "utias", "--base-url", f"{serve}/elsewhere")
+    assert done.exit_code == 5
     assert "not found (404)" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_ctrl_c_is_status_130(slow_address: str, tmp_path: Path) -> None:
@@ -340,8 +333,8 @@ def test_ctrl_c_is_status_130(slow_address: str, tmp_path: Path) -> None:
 
 def test_version_and_help() -> None:
     assert run("--version").stdout == f"gtsam-rwhec {rw.__version__} (gtsam {version('gtsam')})\n"
-    assert "3 the measurements do not determine" in " ".join(run("--help").stdout.split())
-    assert "--kappa" in run("calibrate", "--help").stdout
+    assert "3 the measurements do not determine" in " ".join(given("--help").stdout.split())
+    assert "--kappa" in given("calibrate", "--help").stdout
 
 
 def test_a_terminal_without_our_signs_gets_others() -> None:

@@ -7,12 +7,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from given_commands import given
 from two_logs import calibrated, log_of
-from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli import compare_results
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.failures import ExitStatus
 
 BAD_NAME = "\x1b[31mleft<script>"
@@ -44,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_the_verdict_is_the_first_line_and_the_status(folder: Path, new: str, status: ExitStatus, begins: str) -> None:
     page = folder / f"{new}.html"
-    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(folder / new), "-o", str(page)])
+    done = given("diff", folder / "old", folder / new, "-o", page)
     assert done.exit_code == status, done.output
     assert done.stdout.startswith(begins)
     assert "\x1b" not in done.output
@@ -66,10 +65,10 @@ def test_a_calibration_of_csv_files_is_verified_on_others(folder: Path, tmp_path
             np.savetxt(tmp_path / name / f"tag_0_cam_0_{side}.csv", rows, delimiter=",")
     rw.write_calibration(rw.calibrate(rw.read_csv(tmp_path / "old")), tmp_path / "old.json")
     for name in ("old", "new"):
-        done.append(CliRunner().invoke(app, ["verify", str(tmp_path / "old.json"), str(tmp_path / name)]))
+        done.append(given("verify", tmp_path / "old.json", tmp_path / name))
     assert [one.exit_code for one in done] == [ExitStatus.DONE, ExitStatus.CHANGED], done[1].output
     assert done[1].stdout.startswith("The calibration no longer holds: ")
-    refused = CliRunner().invoke(app, ["verify", str(tmp_path / "old.json"), "log.mcap"])
+    refused = given("verify", tmp_path / "old.json", "log.mcap")
     assert refused.exit_code == ExitStatus.BAD_INPUT
 
 
@@ -80,7 +79,7 @@ def test_the_level_is_that_of_the_library() -> None:
 def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path, tmp_path: Path) -> None:
     answer = rw.results.read_solution(folder / "knocked" / "result.json")
     rw.write_solution(answer, tmp_path / "solved.json")
-    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path / "solved.json")])
+    done = given("diff", folder / "old", tmp_path / "solved.json")
     assert done.exit_code == ExitStatus.BAD_INPUT
     assert done.output.startswith("Not tested: NEW has no covariances")
     assert "not tested" in done.output  # in the table, beside each movement
@@ -94,7 +93,7 @@ def test_files_with_the_same_checksums_are_not_tested(folder: Path, tmp_path: Pa
         result.write_bytes((folder / name / "result.json").read_bytes())
         inputs = rw.results.Inputs(files=(file,), versions={})
         rw.results.write_evidence(rw.results.Evidence(inputs=inputs), rw.results.evidence_path(result), result)
-    done = CliRunner().invoke(app, ["diff", str(tmp_path / "old"), str(tmp_path / "same")])
+    done = given("diff", tmp_path / "old", tmp_path / "same")
     assert done.exit_code == ExitStatus.BAD_INPUT
     assert done.stdout.startswith("Not tested: both rest on the same measurements")
 
@@ -117,7 +116,7 @@ def test_a_log_that_the_calibration_was_made_from_is_known_again(tmp_path: Path)
 
 
 def test_a_path_that_is_none_is_refused(tmp_path: Path, folder: Path) -> None:
-    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path / "nothing.json")])
+    done = given("diff", folder / "old", tmp_path / "nothing.json")
     assert done.exit_code == ExitStatus.BAD_INPUT
 
 

@@ -7,20 +7,17 @@ import subprocess
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
+from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.methods import METHODS
 
 
 def complete(instruction: str, **environment: str) -> str:
     """What the command prints for a shell."""
-    done = subprocess.run(
-        [sys.executable, "-m", "gtsam_rwhec"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "_GTSAM_RWHEC_COMPLETE": instruction, **environment},
-    )
-    assert "Traceback" not in done.stderr
-    return done.stdout
+    done = CliRunner(env={"_GTSAM_RWHEC_COMPLETE": instruction, **environment}).invoke(app)
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return str(done.stdout)
 
 
 def words(line: str) -> list[str]:
@@ -45,4 +42,9 @@ def test_subcommands_options_and_values() -> None:
 
 
 def test_the_names_of_methods() -> None:
-    assert words("gtsam-rwhec compare --method ") == list(METHODS)
+    """In a process of its own, as a shell asks."""
+    line = "gtsam-rwhec compare --method "
+    asked = {"_GTSAM_RWHEC_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": "3"}
+    done = subprocess.run([sys.executable, "-m", "gtsam_rwhec"], capture_output=True, text=True, env=os.environ | asked)
+    assert "Traceback" not in done.stderr
+    assert done.stdout.split() == list(METHODS)

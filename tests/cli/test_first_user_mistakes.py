@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.targets import Checkerboard, Tag
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"
 CELL = f"""\

@@ -15,6 +15,8 @@ from given_commands import command
 from places import DEMO
 from scipy.spatial.transform import Rotation
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 Change = Callable[[Path], object]
 
 

@@ -120,10 +120,6 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "png of one bit": (lambda: png(SIDE, SIDE, depth=1), MORE),
     "png of 16 bits and four channels": (lambda: png(5000, 5000, depth=16, colour=6), MORE),
     "jpeg": (lambda: jpeg_of(SIDE, SIDE), MORE),
-    "jpeg, whole": (
-        lambda: black(SIDE, SIDE, ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_OPTIMIZE, 1), MORE,
-    ),
-    "webp": (lambda: black(16_383, 16_383, ".webp"), MORE),
     "webp, lossy header": (lambda: webp_of(16_383, 16_383, b"VP8 "), MORE),
     "webp, lossless header": (lambda: webp_of(SIDE, SIDE, b"VP8L"), MORE),
     "webp, canvas": (lambda: webp_of(1 << 24, 1 << 24, b"VP8X"), MORE),

@@ -10,7 +10,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 
-RUNS = 100
+RUNS = 60
 CARRIER = rw.CarrierNoise(rotation_rad=np.radians(0.3), translation_m=0.002)
 
 

@@ -6,7 +6,7 @@ import inspect
 from pathlib import Path
 
 import pytest
-from cli.given_commands import command
+from given_commands import command
 from guide.test_links import guide
 from places import REPOSITORY
 

@@ -12,6 +12,8 @@ from synthetic_logs import BEGIN_NS, rig_text, solved
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import LogWarning, StampError
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 ESTIMATED = "detections: /cam_1/tags\n    time_offset: estimate"
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from given_commands import given
 from ros2_twin import CELL, write_twins
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.logs import ImageRecord, open_log
 
 IMAGES = 5
@@ -20,9 +20,7 @@ IMAGES_OF_INIT = 1
 
 
 def run(*arguments: object, status: int = 0) -> Result:
-    """Run the command to its end; other tests run it in a process of its own."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    done = given(*arguments)
     assert done.exit_code == status, done.output
     return done
 

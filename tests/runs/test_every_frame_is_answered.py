@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 import synthetic_logs as made
 import yaml
-from typer.testing import CliRunner, Result
+from given_commands import given
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.verdict import Ground
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.failures import exit_status
 from gtsam_rwhec.simulate import frame_distance
+
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 FILES = set(rw.rig.FILES)
 
@@ -36,10 +37,6 @@ def seen(
     return result
 
 
-def command(*arguments: object) -> Result:
-    return CliRunner().invoke(app, list(map(str, arguments)))
-
-
 def words(text: str) -> str:
     return " ".join(text.split())
 
@@ -50,7 +47,7 @@ def test_one_that_nothing_was_seen_of_is_named_and_files_are_written_only_on_req
     rig = tmp_path / "rig.yaml"
     rig.write_text(made.rig_text(cam_1="detections: /cam_1/tags\n    time_offset: estimate"), encoding="utf-8")
     out = tmp_path / "out"
-    done = command("calibrate", log, "--rig", rig, "-o", out, "--anyway")
+    done = given("calibrate", log, "--rig", rig, "-o", out, "--anyway")
     assert done.exit_code == 6, done.stderr
     needed = "at least 3 poses with two turning axes are needed"
     for said in (
@@ -72,7 +69,7 @@ def test_one_that_nothing_was_seen_of_is_named_and_files_are_written_only_on_req
     frames = yaml.safe_load((out / "tf.yaml").read_text(encoding="utf-8"))["transforms"]
     assert {frame["child_frame_id"] for frame in frames} == {"cam_0", "tag_0", "tag_1"}
 
-    again = command("export", out / "calibration.mcap", "-o", out)
+    again = given("export", out / "calibration.mcap", "-o", out)
     assert again.exit_code == 6
     assert not FILES & {path.name for path in out.iterdir()}  # those of before are not left as if they were of now
     assert "Not written, as the poses are not to be used: static_tf.launch.py" in words(again.stderr)

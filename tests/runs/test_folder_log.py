@@ -24,6 +24,8 @@ from gtsam_rwhec.runs.recorded_logs import is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG
 from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 _, PNG = cv2.imencode(".png", np.zeros((4, 6), dtype=np.uint8))
 SENSOR = "  {name}: {{images: {name}/image, poses: {poses}, intrinsics: {{K: [6, 6, 3, 2], size: [6, 4]}}{more}}}\n"
 

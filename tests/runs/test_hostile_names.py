@@ -13,11 +13,10 @@ from pathlib import Path
 import pytest
 import synthetic_logs as made
 import yaml
+from given_commands import given
 from places import DEMO
-from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.rig import RigFrames
 from gtsam_rwhec.rig.exported_files import export_all
 from gtsam_rwhec.runs.output_folder import LIST_FILE
@@ -35,11 +34,9 @@ FILE_NAMES = ((STEERING + LINES).replace("/", "|"), ".. [red] -rf")
 
 def run(*arguments: object, status: int) -> str:
     """Run the command; what it prints can neither steer a terminal nor fill it."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    done = given(*arguments)
     text = done.stdout + done.stderr
     assert done.exit_code == status, text[:3000]
-    assert "Traceback" not in text
     unprintable = {sign for sign in text if not sign.isprintable()} - {"\n"}
     assert unprintable == set()
     assert "\nError: nothing is wrong" not in text

@@ -24,6 +24,8 @@ from gtsam_rwhec.runs.output_folder import LIST_FILE, earlier_run
 from gtsam_rwhec.runs.run_log import DETECTION_METADATA
 from gtsam_rwhec.runs.whole_runs import calibrate_log, solve_into
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 try:
     import resource
 except ImportError:  # Windows

@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from given_commands import given
 from intrinsics_samples import CAMCHAIN, ROS
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogWarning
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
 from gtsam_rwhec.rig import read_rig
@@ -169,7 +169,7 @@ def convert(folder: Path, layout: str, log: Path) -> Result:
     """The one command, on a folder with such a layout."""
     folder.mkdir()
     (folder / "rig.yaml").write_text(LAYOUTS[layout][0](folder))
-    return CliRunner().invoke(app, ["convert", str(folder), "--rig", str(folder / "rig.yaml"), "-o", str(log)])
+    return given("convert", folder, "--rig", folder / "rig.yaml", "-o", log)
 
 
 @pytest.mark.parametrize("layout", sorted(LAYOUTS))
@@ -241,9 +241,7 @@ def test_what_is_missing_is_named_with_its_line(tmp_path: Path, layout: str, mis
     folder.mkdir()
     (folder / "rig.yaml").write_text(write(folder))
     (folder / missing).rename(tmp_path / "elsewhere")
-    done = CliRunner().invoke(
-        app, ["convert", str(folder), "--rig", str(folder / "rig.yaml"), "-o", str(tmp_path / "log.mcap")]
-    )
+    done = given("convert", folder, "--rig", folder / "rig.yaml", "-o", tmp_path / "log.mcap")
     assert done.exit_code != 0
     assert words.format(folder=folder) in said(done)
     assert "rig.yaml, line" in said(done)

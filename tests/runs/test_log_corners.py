@@ -83,10 +83,13 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_l
         np.testing.assert_array_equal(measured.B, read[pair].B)
 
 
+@pytest.mark.filterwarnings("ignore:.*poses have no image")
 def test_two_sensors_with_one_camera_have_one_set_of_intrinsics(workcell_camera2: Path, tmp_path: Path) -> None:
     """The same images stand for two cameras that share intrinsics; one of another size is refused by name."""
     for name in ("left", "right"):
-        shutil.copytree(workcell_camera2 / "image", tmp_path / "cell" / name)
+        (tmp_path / "cell" / name).mkdir(parents=True)
+        for image in sorted((workcell_camera2 / "image").glob("*.png"))[::3]:
+            shutil.copy(image, tmp_path / "cell" / name)
     shutil.copytree(workcell_camera2 / "pose", tmp_path / "cell" / "pose")
     shutil.copy(workcell_camera2 / "intrinsic_pars_file.yaml", tmp_path / "cell")
     one = "  camera2: {images: image, poses: pose, intrinsics: intrinsic_pars_file.yaml}\n"

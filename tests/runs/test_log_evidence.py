@@ -25,6 +25,8 @@ from gtsam_rwhec.runs.log_evidence import (
 )
 from gtsam_rwhec.runs.solving_stage import Calibrated
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 STAMP_NS = made.BEGIN_NS + 5
 
 

@@ -21,6 +21,8 @@ from gtsam_rwhec.runs.measured_pairs import read_pairs
 from gtsam_rwhec.runs.solving_stage import Solved
 from gtsam_rwhec.simulate import frame_distance
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 SECONDS = 10.0
 #: T_hand_sensor, and of the second the measured over the true length.
 MOUNTS = {"tracker": made.pose((30, -50, 100), (0.1, -0.2, 0.15)), "vo": made.pose((-100, 10, 60), (-0.1, 0.05, 0.2))}

@@ -17,6 +17,8 @@ from gtsam_rwhec.runs.output_folder import LIST_FILE
 from gtsam_rwhec.runs.run_log import DETECTION_METADATA, RIG_METADATA
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 TAG = f"{{type: tag, family: tag36h11, id: 0, size_m: {made.SIZE_M}}}"
 ELSEWHERE = "../../x"
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sample_files
-from typer.testing import CliRunner
+from given_commands import given
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.recorded_logs import samples_problem
+
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 RIG = """\
 carriers: {{sensors: {sensors}, targets: {targets}, poses: {{frames: [base, hand]}}}}
@@ -62,7 +63,7 @@ def test_samples_that_tell_no_setup_are_refused(tmp_path: Path) -> None:
 
 
 def command(*arguments: object, status: int = 0) -> str:
-    done = CliRunner().invoke(app, list(map(str, arguments)))
+    done = given(*arguments)
     assert done.exit_code == status, done.output
     return " ".join(done.output.split())
 

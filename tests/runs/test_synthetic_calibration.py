@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import synthetic_logs as made
+from given_commands import given
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.report.advice import log_advice
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 from gtsam_rwhec.simulate import frame_distance
+
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 
 def test_truth_comes_out(tmp_path: Path) -> None:
@@ -53,14 +55,10 @@ def test_a_stated_size_that_the_motion_contradicts_is_no_success(tmp_path: Path)
 def test_what_contradicts_is_named_with_its_exit_status_and_no_file_for_others_is_written(tmp_path: Path) -> None:
     log = made.write(tmp_path / "raw.mcap", made.recording(6.0, offsets_s={"cam_1": 0.3}))
     (tmp_path / "rig.yaml").write_text(made.rig_text(sizes="sizes: known"), encoding="utf-8")
-    command = [sys.executable, "-m", "gtsam_rwhec", "calibrate", log, "--rig", tmp_path / "rig.yaml"]
-    done = subprocess.run([*command, "-o", tmp_path / "out"], capture_output=True, text=True)
-    assert done.returncode == 6, done.stdout + done.stderr
-    said = " ".join(done.stdout.split())
-    assert said.startswith("Do not use these poses: ")
-    assert said.startswith(
-        "Do not use these poses: the time offset of cam_1 is 0 s in the rig file, but its rotations "
-    )
+    done = given("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert done.exit_code == 6, done.output
+    words = "Do not use these poses: the time offset of cam_1 is 0 s in the rig file, but its rotations "
+    assert " ".join(done.stdout.split()).startswith(words)
     grounds = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["verdict_grounds"]
     assert set(grounds) & {"late_clock", "contradicted"}
     written = sorted(path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith("."))

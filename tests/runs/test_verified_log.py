@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_logs as made
+from given_commands import given
 from rwhec_factors import se3
-from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.failures import ExitStatus
 from gtsam_rwhec.errors import FrameError, LogError
 from gtsam_rwhec.runs.verified_log import OldCalibration, verify_log, with_cameras
@@ -39,7 +38,7 @@ def new_log(folder: Path, seed: int = 1, **changed: object) -> Path:
 
 def test_it_holds_and_the_command_says_so(old: Path, tmp_path: Path) -> None:
     log = new_log(tmp_path)
-    done = CliRunner().invoke(app, ["verify", str(old), str(log), "-o", str(tmp_path / "page.html")])
+    done = given("verify", old, log, "-o", tmp_path / "page.html")
     assert done.exit_code == ExitStatus.DONE, done.output
     assert done.stdout.startswith("The calibration still holds at 1 %: ")
     assert "<h1" in (tmp_path / "page.html").read_text("utf-8")
@@ -48,7 +47,7 @@ def test_it_holds_and_the_command_says_so(old: Path, tmp_path: Path) -> None:
 def test_a_camera_that_was_knocked_is_named(old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(made.Y, "cam_1", made.Y["cam_1"] @ KNOCK)
     log = new_log(tmp_path)
-    done = CliRunner().invoke(app, ["verify", str(old / "result.json"), str(log)])
+    done = given("verify", old / "result.json", log)
     assert done.exit_code == ExitStatus.CHANGED, done.output
     assert done.stdout.startswith("The calibration no longer holds: cam_1 moved ")
 
@@ -57,7 +56,7 @@ def test_a_camera_that_sees_nothing_is_named(old: Path, tmp_path: Path) -> None:
     messages = [one for one in made.recording(SECONDS, seed=1) if one.topic != "/cam_1/tags"]
     messages += [made.detections("/cam_1/tags", made.BEGIN_NS + 10**9, "cam_1", [])]
     log = made.write(tmp_path / "new.mcap", sorted(messages, key=lambda one: one.logged_ns))
-    done = CliRunner().invoke(app, ["verify", str(old), str(log)])
+    done = given("verify", old, log)
     assert done.exit_code == ExitStatus.NOT_UNIQUE, done.output
     assert done.stdout.splitlines()[0].endswith("Not checked: cam_1.")
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_logs as made
+from given_commands import given
 from mcap.reader import make_reader
-from typer.testing import CliRunner
 
-from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogError, OptionError
 from gtsam_rwhec.logs import ImageRecord, Log, LogWriter, open_log
 from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, solve_into
@@ -65,7 +64,7 @@ def test_a_drivers_detections_cannot_be_drawn(tmp_path: Path) -> None:
     raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
     (tmp_path / "rig.yaml").write_text(made.rig_text(), encoding="utf-8")
     arguments = ["detect", raw, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "d.mcap", "--draw", tmp_path / "pics"]
-    done = CliRunner().invoke(app, list(map(str, arguments)))
+    done = given(*arguments)
     assert done.exit_code == 2
     assert "(--draw) counts only for images, and no sensor of the rig file has images" in " ".join(done.stderr.split())
     assert {path.name for path in tmp_path.iterdir()} == {"raw.mcap", "rig.yaml"}

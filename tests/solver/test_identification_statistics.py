@@ -14,7 +14,7 @@ from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.simulate import Motion, Noise, general, perturb
 
 #: `benchmarks/few_measurements.py` counts thousands.
-RUNS = 30
+RUNS = 18
 
 
 def verdicts(

@@ -17,7 +17,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise
 
-DISTURBANCES = 11
+DISTURBANCES = 5
 
 
 def facts(problem: rw.Problem) -> tuple[object, ...]:
