@@ -324,8 +324,7 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
         return None
     found = steps[0][1]
     kept = [one.kept for pair, one in measured.items() if found.frame in pair.frames]
-    fewer = sum(min(int(of.sum()), int((~of).sum())) for of in kept)
-    if sum(_moment(of)[1] for of in kept) > MISPLACED * fewer:
+    if _come_and_go(kept):
         return None
     return replace(found, from_row=_moment(kept[0])[0] if len(kept) == 1 else None)
 
@@ -351,7 +350,8 @@ def mixed_sensors(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPos
         of_sensor, kept = np.concatenate([both[1] for _, both, _ in rows]), np.concatenate([one for *_, one in rows])
         of_target = np.concatenate([both[0] for _, both, _ in rows])
         away, near = of_sensor[~kept], NEAR * np.maximum(np.median(_sizes(of_sensor[kept]), axis=0), LEAST)
-        if len(away) < FEWEST_MIXED:
+        masks = [one for *_, one in rows]
+        if len(away) < FEWEST_MIXED or not _come_and_go(masks):
             continue
         anchors = away[:: -(-len(away) // ANCHORS)]
         for share, loose in MIXED_SHARES:
@@ -401,6 +401,12 @@ def _step_with_outliers(
 def _sizes(twists: Array) -> Array:
     """Angles and distances (N, 2) of twists (N, 6)."""
     return np.asarray(np.linalg.norm(twists.reshape(-1, 2, 3), axis=2))
+
+
+def _come_and_go(kept: list[np.ndarray]) -> bool:
+    """Whether measurements that are left out, of some pairs, are not all before or after one moment."""
+    fewer = sum(min(int(of.sum()), int((~of).sum())) for of in kept)
+    return sum(_moment(of)[1] for of in kept) > MISPLACED * fewer
 
 
 def _moment(kept: np.ndarray) -> tuple[int | None, int]:
