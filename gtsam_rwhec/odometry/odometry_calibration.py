@@ -261,7 +261,7 @@ def _check_windows(windows: WindowMotions, names: tuple[str, ...]) -> None:
             )
 
 
-def _first_variances(windows: WindowMotions, tracks: list[OdometryTrack]) -> Array:
+def _first_variances(windows: WindowMotions, tracks: Sequence[OdometryTrack]) -> Array:
     """Starts (m, 2), or what is stated."""
     variances = np.c_[first_rotation_variances(windows), np.zeros(len(tracks))]
     for k, track in enumerate(tracks):
