@@ -50,6 +50,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "gallery": ("--runs 10", None),
     "changes": ("--runs 1000", "--runs 1"),
     "acceptance": ("", "--runs 20"),
+    "trajectories": ("--runs 6", "--runs 1 --kinds walk --movers held"),
     "odometry_bounds": ("--runs 40", "--runs 1"),
     "odometry_planar": ("--runs 200", "--runs 1"),
     "fleet_scale": ("", None),

@@ -185,3 +185,18 @@ def test_a_rendered_cell_is_calibrated_and_compared_with_fixed_models(
     )
     table = {row.what.strip(): row for row in cells.rows_of("hand", [found], 0.9, 1.0)}
     assert table["left out of those whose board is read"].met == (found["left_out"] <= 0.01 * found["read"])
+
+
+def test_simulated_trajectories_are_right_but_for_their_own_error(imported: Callable[[str], ModuleType]) -> None:
+    trajectories = imported("trajectories")
+    for kind in trajectories.KINDS:
+        one = trajectories.simulate(kind, "held", 1)
+        at = one.path.at(one.stamps_ns)[0] @ one.T_body_camera
+        off = np.linalg.inv(np.linalg.inv(at[0]) @ at) @ np.linalg.inv(one.T_map_camera[0]) @ one.T_map_camera
+        far = np.linalg.norm(off[:, :3, 3], axis=1)
+        assert np.median(far[1:6]) < 0.01  # white noise, and a clock that is up to 0.03 s off
+        assert 0.003 < far.max() < 1.0, kind
+    found = trajectories.run("odometry", "walk", "held", 0)
+    assert found["verdict"] == "use"
+    assert found["chance"] > 1e-4
+    assert len(trajectories.rows_of([found])) == 5

@@ -142,31 +142,31 @@ def test_touches_accept_a_calibration_or_not(folder: Path, tmp_path: Path) -> No
         ([str(bad), "--limit-mm", "1", "--box", *"000111"], ExitStatus.CHANGED, "Rejected: "),
     )
     for arguments, status, begins in calls:
-        done = CliRunner().invoke(app, ["accept", str(result), *arguments, "--sensor", "right"])
+        done = given("accept", str(result), *arguments, "--sensor", "right")
         assert done.exit_code == status, done.output
         assert done.stdout.startswith(begins)
         (found,) = rw.results.read_result(result).acceptance
         assert done.stdout.startswith(str(found))
         assert found.source == Path(arguments[0]).name
     before = result.read_bytes()
-    done = CliRunner().invoke(app, ["accept", str(result), *calls[0][0], "--sensor", "right", "--no-write"])
+    done = given("accept", str(result), *calls[0][0], "--sensor", "right", "--no-write")
     assert done.exit_code == ExitStatus.DONE
     assert result.read_bytes() == before
-    refused = CliRunner().invoke(app, ["accept", str(result), str(good), "--limit-mm", "1"])
+    refused = given("accept", str(result), str(good), "--limit-mm", "1")
     assert refused.exit_code == ExitStatus.BAD_INPUT  # of two sensors none is named
     assert "say which one is tested" in refused.output
     both = ["--box", *"000111", "--ball", *"0001"]
-    assert CliRunner().invoke(app, ["accept", str(result), *calls[0][0], *both]).exit_code == ExitStatus.BAD_INPUT
+    assert given("accept", str(result), *calls[0][0], *both).exit_code == ExitStatus.BAD_INPUT
 
 
 def test_the_answer_of_touches_stays_where_other_commands_read_the_result(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "result.json").write_bytes((folder / "old" / "result.json").read_bytes())
     file = touches(folder, tmp_path / "touches.csv", 0.0)
     options = ["--limit-mm", "1", "--sensor", "right"]
-    assert CliRunner().invoke(app, ["accept", str(tmp_path), str(file), *options]).exit_code == ExitStatus.DONE
-    assert CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path)]).exit_code == ExitStatus.DONE
+    assert given("accept", str(tmp_path), str(file), *options).exit_code == ExitStatus.DONE
+    assert given("diff", str(folder / "old"), str(tmp_path)).exit_code == ExitStatus.DONE
     page = tmp_path / "page.html"
-    assert CliRunner().invoke(app, ["report", str(tmp_path), "-o", str(page)]).exit_code == ExitStatus.DONE
+    assert given("report", str(tmp_path), "-o", str(page)).exit_code == ExitStatus.DONE
     assert "right is off by less than 1 mm with 95 %" in page.read_text("utf-8")
     assert len(rw.results.read_result(tmp_path / "result.json").acceptance) == 1
 
@@ -180,12 +180,9 @@ def test_a_board_in_other_csv_files_accepts_a_calibration_of_csv_files(tmp_path:
             rows = [[each.w(), each.x(), each.y(), each.z(), *T[:3, 3]] for each, T in zip(q, poses, strict=True)]
             np.savetxt(tmp_path / name / f"tag_{len(name) + len(log.pairs)}_cam_0_{side}.csv", rows, delimiter=",")
     result = tmp_path / "result.json"
-    done = CliRunner().invoke(app, ["calibrate", str(tmp_path / "old"), "-o", str(result)])
+    done = given("calibrate", str(tmp_path / "old"), "-o", str(result))
     assert done.exit_code == ExitStatus.DONE, done.output
-    answers = [
-        CliRunner().invoke(app, ["accept", str(result), str(tmp_path / name), "--limit-mm", "10"])
-        for name in ("new", "old")
-    ]
+    answers = [given("accept", str(result), str(tmp_path / name), "--limit-mm", "10") for name in ("new", "old")]
     assert answers[0].exit_code == ExitStatus.DONE, answers[0].output
     assert answers[0].stdout.startswith("Accepted: cam_0 is off by less than 10 mm")
     assert answers[1].exit_code == ExitStatus.BAD_INPUT
