@@ -121,7 +121,7 @@ def test_a_new_log_accepts_a_calibration_and_its_own_log_does_not(old: Path, tmp
     out = tmp_path / "out"
     shutil.copytree(old, out)
     log = new_log(tmp_path)
-    done = CliRunner().invoke(app, ["accept", str(out), str(log), "--limit-mm", "100", "--sensor", "cam_1"])
+    done = given("accept", str(out), str(log), "--limit-mm", "100", "--sensor", "cam_1")
     assert done.exit_code == ExitStatus.DONE, done.output
     assert done.stdout.startswith("Accepted: cam_1 is off by less than 100 mm with 95 %")
     (found,) = rw.results.read_calibration(out).acceptance
