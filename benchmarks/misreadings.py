@@ -164,15 +164,23 @@ def named(name: str, problem: rw.Problem, kinds: tuple[Kind, ...]) -> tuple[list
     return rows, seconds
 
 
+def accused(number: int, kinds: dict[str, Callable[[int, np.random.Generator], rw.Problem]]) -> tuple[str, list[str]]:
+    """The kind of a good problem, and what it is accused of."""
+    kind = list(kinds)[number % len(kinds)]
+    problem = kinds[kind](number, np.random.default_rng(number))
+    solution = solved(problem)
+    return kind, [str(one) for one in (*misreadings(problem, solution), implausible(problem, solution)) if one]
+
+
 def rows(good: int, seed: int) -> list[Row]:
     warnings.simplefilter("ignore")
     table = []
     for name, problem, is_graph in rigs():
         begin = time.process_time()
-        accused = misreadings(problem, solved(problem))
+        found_as_it_is = misreadings(problem, solved(problem))
         cost = time.process_time() - begin
         found, seconds = named(name, problem, KINDS + (KINDS_OF_GRAPHS if is_graph else ()))
-        table.append(Row(f"{name}: as it is", str(len(accused)), "0", not accused))
+        table.append(Row(f"{name}: as it is", str(len(found_as_it_is)), "0", not found_as_it_is))
         table.append(
             Row(f"{name}: seconds as it is, with solving; a misreading", f"{cost:.3f}; {seconds / len(found):.2f}")
         )
@@ -180,14 +188,11 @@ def rows(good: int, seed: int) -> list[Row]:
     accusations: Counter[str] = Counter()
     kinds = good_problems()
     begin = time.process_time()
-    for number in range(good):
-        kind = list(kinds)[number % len(kinds)]
-        problem = kinds[kind](seed + number, np.random.default_rng(seed + number))
-        solution = solved(problem)
-        reasons = [*misreadings(problem, solution), implausible(problem, solution)]
-        for reason in filter(None, reasons):
+    for number in range(seed, seed + good):
+        kind, reasons = accused(number, kinds)
+        for reason in reasons:
             accusations[kind] += 1
-            print(f"accused: {kind}, seed {seed + number}: {reason}")
+            print(f"accused: {kind}, seed {number}: {reason}")
     seconds = time.process_time() - begin
     total = accusations.total()
     table.append(Row("good problems accused", f"{total} of {good}", "0", total == 0))
