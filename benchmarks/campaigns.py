@@ -43,6 +43,8 @@ from gtsam_rwhec.files.whole_files import write_atomically
 
 HERE = Path(__file__).resolve().parent
 KEPT = HERE / "campaigns.json"
+#: A part ends after the seed in which it has taken so many seconds of the processor.
+PART_S = 20.0
 sys.path.append(str(HERE / "adversary"))
 Counts = Counter[str]
 #: What a seed counted, and its failing cases, in words.
@@ -51,10 +53,9 @@ Found = tuple[Counts, list[str]]
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign of ``size`` seeds, ``block`` of them a part; ``bars`` are of sums and open failures."""
+    """A campaign of ``size`` seeds; ``bars`` are of sums and open failures."""
 
     size: int
-    block: int
     of: str
     one: Callable[[int], Found]
     bars: Callable[[Counts, int], list[Row]]
@@ -252,7 +253,6 @@ def bars_of_changes(sums: Counts, _: int) -> list[Row]:
 CAMPAIGNS = {
     "adversary": Campaign(
         100_000,
-        250,
         "problems",
         lambda seed: adversary(seed, sane=False),
         bars_of_adversary,
@@ -260,28 +260,26 @@ CAMPAIGNS = {
     ),
     "adversary_sane": Campaign(
         20_000,
-        250,
         "problems",
         lambda seed: adversary(seed, sane=True),
         bars_of_adversary,
         "adversary/campaign.py --sane --seeds {}:{}",
     ),
-    "few_measurements": Campaign(2000, 5, "trials at each N", few, bars_of_few, "few_measurements.py --trials {1}"),
-    "boards": Campaign(2000, 5, "images a kind", boards, bars_of_boards, "rendered_boards.py --images {1}"),
+    "few_measurements": Campaign(2000, "trials at each N", few, bars_of_few, "few_measurements.py --trials {1}"),
+    "boards": Campaign(2000, "images a kind", boards, bars_of_boards, "rendered_boards.py --images {1}"),
     "misreadings": Campaign(
         1000,
-        16,
         "good problems",
         accusations,
         lambda sums, open_cases: [none_of("accused", open_cases, f" of {sums['good']}")],
         "misreadings.py --good {1}",
     ),
     "wrong_assumptions": Campaign(
-        1000, 1, "runs a row", assumptions, bars_of_assumptions, "wrong_assumptions.py --runs {1}"
+        1000, "runs a row", assumptions, bars_of_assumptions, "wrong_assumptions.py --runs {1}"
     ),
-    "split_halves": Campaign(300, 1, "logs", halves, bars_of_halves, "split_halves.py --runs {1}"),
-    "gallery": Campaign(150, 3, "bad and good runs", faults, bars_of_gallery, "gallery.py --runs 10"),
-    "changes": Campaign(1000, 5, "pairs a kind of noise", pairs, bars_of_changes, "changes.py --runs {1}"),
+    "split_halves": Campaign(300, "logs", halves, bars_of_halves, "split_halves.py --runs {1}"),
+    "gallery": Campaign(150, "bad and good runs", faults, bars_of_gallery, "gallery.py --runs 10"),
+    "changes": Campaign(1000, "pairs a kind of noise", pairs, bars_of_changes, "changes.py --runs {1}"),
 }
 
 
@@ -303,17 +301,17 @@ def parts_of(name: str, parts: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def next_seeds(name: str, parts: list[dict[str, Any]]) -> range:
-    """The first block that no part covers; empty where all seeds are."""
-    campaign, at = CAMPAIGNS[name], 0
-    end = campaign.size
+    """The first that no part covers; none where all are done."""
+    at, end = 0, CAMPAIGNS[name].size
     for first, last in (part["seeds"] for part in parts_of(name, parts)):
         if first > at:
             end = first
             break
         at = max(at, last)
-    return range(at, min(at + campaign.block, end))
+    return range(at, end)
 
 
+@cache
 def product() -> str:
     """The commit that last changed what is tested, with a "+" where the files are not as committed."""
 
@@ -321,12 +319,12 @@ def product() -> str:
         return subprocess.run(["git", "-C", HERE, *words], capture_output=True, text=True, check=True).stdout.strip()
 
     library = [str(HERE.parent / folder) for folder in ("gtsam_rwhec", "factors")]
-    changed = git("status", "--porcelain", "--", *library, str(HERE), f":(exclude){KEPT}")
+    changed = git("status", "--porcelain", "--", *library, str(HERE), f":(exclude){HERE}/campaign*")
     return git("log", "-1", "--format=%h", "--abbrev=8", "--", *library) + "+" * bool(changed)
 
 
 def run(name: str, seeds: range) -> dict[str, Any]:
-    """A part. What a seed raises is a failing case of its own, and its counts are lost."""
+    """A part: as many of the seeds as take ``PART_S``. What a seed raises is a failing case, and its counts are lost."""
     counts, failing, start = Counts(), [], time.process_time()
     for seed in seeds:
         try:
@@ -337,9 +335,11 @@ def run(name: str, seeds: range) -> dict[str, Any]:
             of_seed, cases = Counts(), [f"raised {type(error).__name__}: {error}"]
         counts.update(of_seed)
         failing += [{"seed": seed, "case": case} for case in cases]
+        if time.process_time() - start > PART_S:
+            break
     return {
         "campaign": name,
-        "seeds": [seeds.start, seeds.stop],
+        "seeds": [seeds.start, seed + 1],
         "commit": product(),
         "date": time.strftime("%Y-%m-%d"),
         "seconds": round(time.process_time() - start, 2),
