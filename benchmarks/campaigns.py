@@ -27,6 +27,7 @@ from bars import Row, benchmark_parser, print_rows
 from campaign_sums import CAMPAIGNS, Counts, none_of
 
 from gtsam_rwhec.files.whole_files import write_atomically
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 
 HERE = Path(__file__).resolve().parent
 KEPT = HERE / "campaigns.json"
@@ -76,7 +77,7 @@ def run(name: str, seeds: range) -> dict[str, Any]:
     counts, failing, start = Counts(), [], time.process_time()
     for seed in seeds:
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), one_blas_thread():
                 warnings.simplefilter("ignore")
                 of_seed, cases = CAMPAIGNS[name].one(seed)
         except Exception as error:  # noqa: BLE001  (whatever it is, it is a finding)
