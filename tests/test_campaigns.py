@@ -83,7 +83,7 @@ def test_a_case_that_fails_no_longer_is_mended(kept: Path, monkeypatch: pytest.M
     add(0, 4)
     cured = Campaign(12, "numbers", lambda seed: (Counts(), ["odd: still"] * (seed == 3)), lambda *_: [], "")
     monkeypatch.setitem(campaigns.CAMPAIGNS, name, cured)
-    campaigns.run_again(name, [], campaigns.kept_parts())
+    campaigns.run_again(name, [])
     first, second = campaigns.kept_parts()[0]["failing"]
     assert (first["seed"], first.get("mended"), second["seed"], second.get("mended")) == (1, "abc", 3, None)
     assert campaigns.sums_of(name, campaigns.kept_parts())[3] == 1
