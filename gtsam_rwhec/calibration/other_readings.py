@@ -24,6 +24,10 @@ Rows = tuple[Array, Array]
 Change = Callable[[Array], Array]
 
 
+#: How to have rows shifted.
+REPAIR = "CalibrateOptions(repair=True) or --repair"
+
+
 class Mistake(StrEnum):
     """What was likely misread."""
 
@@ -43,6 +47,8 @@ class Mistake(StrEnum):
     SCALE = "scale"
     #: Rows of A and B are shifted against each other.
     ROWS_SHIFTED = "rows_shifted"
+    #: From some row on, B belongs to the A of another row.
+    ROWS_SLIPPED = "rows_slipped"
     #: Angles in radians were read as degrees, or the reverse.
     ANGLE_UNIT = "angle_unit"
 
@@ -169,8 +175,8 @@ def shifted(shift: int) -> OtherReading:
     return OtherReading(
         Mistake.ROWS_SHIFTED,
         f"the rows of {first} come {n} {rows} later than those of {second}, or the clocks differ by as much",
-        f"leave out the first {n} {rows} of {first} and the last {n} of {second}, in each pair; or give stamps and "
-        "estimate the time offsets",
+        f"leave out the first {n} {rows} of {first} and the last {n} of {second}, in each pair, or let the rows be "
+        f"shifted: {REPAIR}; or give stamps and estimate the time offsets",
         lambda A, B: (A, B),
         shift=shift,
     )
