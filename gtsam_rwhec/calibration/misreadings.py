@@ -21,6 +21,7 @@ import numpy as np
 from rwhec_factors.se3 import inverse, so3_logmap
 
 from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.euler_readings import readings_of_euler_angles
 from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.other_readings import (
     A_INVERTED,
@@ -267,7 +268,8 @@ def misreadings(
         return ()
     angles = list(readings_of_angles(*sampled.all_poses))
     # Readings that say all rotations are small come first: such rotations fit any other reading too.
-    found = trial.found([each for each in angles if each.of_small_angles]) or trial.found(SINGLE)
+    found = trial.found([each for each in angles if each.of_small_angles])
+    found = found or trial.found([*SINGLE, *readings_of_euler_angles(sampled.as_read())])
     found = found or trial.found(trial.shifts())
     if not found and problem.scale == "known":
         found = trial.found([AS_READ], "shared")
@@ -384,8 +386,9 @@ class _Trial:
         """The logarithm of the product of both residuals' ratios; 0 if small, by chance, or residuals stay large."""
         before, after = self._floored(self.base.residual), self._floored(fit.residual)
         ratios = (before.rotation_rad / after.rotation_rad, before.translation_m / after.translation_m)
-        # Another unit of angles changes the variation of B.
-        signal = signal_of(self.sampled.by(reading)) if reading.mistake is Mistake.ANGLE_UNIT else self.signal
+        # Another unit of angles, or another convention, changes the variation of B.
+        is_other = reading.mistake in (Mistake.ANGLE_UNIT, Mistake.EULER_AXES)
+        signal = signal_of(self.sampled.by(reading)) if is_other else self.signal
         for ratio, share in zip(ratios, shares_of(after, signal), strict=True):
             if ratio < 1.0 / NOT_WORSE or (ratio > NOT_WORSE and share > EXPLAINED_SHARE):
                 return 0.0
