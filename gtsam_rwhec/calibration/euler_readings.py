@@ -2,13 +2,13 @@
 
 Three numbers a, b, c make R = R_i(a) R_j(b) R_k(c), or R_k(c) R_j(b) R_i(a), for twelve choices of axes, or they are a
 rotation vector. So a rotation that was read by one convention is turned into its numbers, and these into a rotation by
-each other one. Whatever X and Y are, the motion between two rows turns A and B by the same angle. That tells the few
-conventions that may explain both; translations tell those apart that only rename the axes.
+each other one. A fit in closed form of all at once tells the few that may explain A and B; numbers of more than half a
+turn, or a second angle of more than a quarter, are not found again from a rotation.
 """
 
 from __future__ import annotations
 
-import itertools
+import math
 import warnings
 from collections.abc import Iterator
 
@@ -17,56 +17,49 @@ from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.calibration.other_readings import Mistake, OtherReading, of_sides
-from gtsam_rwhec.calibration.trial_fits import Sample, angles
+from gtsam_rwhec.calibration.row_shifts import closed_forms
+from gtsam_rwhec.calibration.trial_fits import Sample
 from gtsam_rwhec.geometry.poses import Array
 
-#: The turning axes of all Euler angles: no axis twice in a row.
-ORDERS = tuple("".join(of) for of in itertools.product("XYZ", repeat=3) if of[0] != of[1] and of[1] != of[2])
+#: The turning axes of all Euler angles, no axis twice in a row; the common ones first.
+ORDERS = ("ZYX", "XYZ", "ZYZ", "ZXZ", "ZXY", "YXZ", "XZY", "YZX", "XYX", "XZX", "YXY", "YZY")
 #: SciPy's names of all conventions: capitals for turning axes, small letters for fixed ones.
-CONVENTIONS = (*ORDERS, *(of.lower() for of in ORDERS), "rotvec")
-#: Rows that are looked at.
-MOST_ROWS = 120
-#: A convention is promising if the angles of A and B differ by at most this share of what they differ by as read.
-PROMISING = 0.6
-#: And by at most this many times what they differ by under the best one: such conventions only rename axes.
-ALIKE = 1.3
+CONVENTIONS = ("rotvec", *ORDERS, *(of.lower() for of in ORDERS))
+#: So many rows are looked at; with fewer, everything fits.
+MOST_ROWS, FEWEST_ROWS = 60, 8
+#: A convention is promising if the product of both residuals is below this share of that as read.
+PROMISING = 0.5
 #: At most so many are fitted.
-MOST = 12
+MOST = 6
 
 
 def readings_of_euler_angles(sample: Sample) -> list[OtherReading]:
-    """The readings of Euler angles under which motions of A and B turn by the same angles, the best first."""
-    chosen = [
-        (A[rows], B[rows])
-        for A, B in sample.values()
-        for rows in [np.unique(np.linspace(0, len(A) - 1, MOST_ROWS // len(sample) + 1).astype(int))]
-        if len(rows) > 2
-    ]
-    if not chosen:
+    """The readings of Euler angles that fit the pair with the most rows better in closed form, the best first."""
+    A, B = max(sample.values(), key=lambda poses: len(poses[0]))
+    rows = np.unique(np.linspace(0, len(A) - 1, MOST_ROWS).astype(int))
+    A, B = A[rows], B[rows]
+    if len(rows) < FEWEST_ROWS:
         return []
-    lengths = np.cumsum([len(A) for A, _ in chosen])[:-1]
-    sides = {"A": np.concatenate([A for A, _ in chosen]), "B": np.concatenate([B for _, B in chosen])}
-
-    def turned_by(R: Array) -> Array:
-        return np.concatenate(
-            [angles(np.roll(of, lag, axis=0), of) for of in np.split(R, lengths) for lag in (1, len(of) // 2)]
-        )
-
-    by = {side: turned_by(T[:, :3, :3]) for side, T in sides.items()}
-    as_read = float(np.median(np.abs(by["A"] - by["B"])))
-    found = []
-    for side, T in sides.items():
-        other = by["B" if side == "A" else "A"]
-        for read, meant, R in _conventions(T[:, :3, :3]):
-            found.append((float(np.median(np.abs(turned_by(R) - other))), side, read, meant))
-    found.sort()
-    likely = [one for one in found if one[0] < min(PROMISING * as_read, ALIKE * found[0][0])][:MOST]
-    return [_reading(*one) for _, *one in likely]
+    tried = {
+        (side, read, meant): R for side, T in (("A", A), ("B", B)) for read, meant, R in _conventions(T[:, :3, :3])
+    }
+    of_A, of_B = (
+        np.stack([T, *(pose(R, T[:, :3, 3]) if at == side else T for (at, *_), R in tried.items())])
+        for side, T in (("A", A), ("B", B))
+    )
+    errors = closed_forms(of_A, of_B, np.ones(of_A.shape[:2]), is_scaled=True)[3]
+    remains = np.log(np.maximum(errors, [1e-6, 1e-9])).sum(axis=1)
+    # some conventions differ by names of axes only, and fit alike: the most common one is named
+    best: dict[tuple[str, float], tuple[str, str, str]] = {}
+    for value, one in zip(remains[1:].tolist(), tried, strict=True):
+        if value < remains[0] + math.log(PROMISING):
+            best.setdefault((one[0], round(value, 4)), one)
+    return [_reading(*best[key]) for key in sorted(best, key=lambda key: key[1])[:MOST]]
 
 
 def _conventions(R: Array) -> Iterator[tuple[str, str, Array]]:
     """Each convention that may have been read, each that may have been meant, and the rotations that were meant."""
-    for read in (*ORDERS, "rotvec"):
+    for read in ("rotvec", *ORDERS):
         numbers = _numbers(R, read)
         for meant in CONVENTIONS:
             if meant != read:

@@ -106,7 +106,7 @@ def likely_shifts(
         there = (own >= 0) & (own < len(A))
         part, shift = np.nonzero(there.sum(axis=-1) >= min(FEWEST_OF_A_PART, length))
         of_A, of_B, weight = np.clip(own[part, shift], 0, len(A) - 1), parts[part], there[part, shift].astype(float)
-        Y, X, scale, spread = _closed_forms(A[of_A], B[of_B], weight, is_scaled=is_scaled)
+        Y, X, scale, spread = closed_forms(A[of_A], B[of_B], weight, is_scaled=is_scaled)
         costs = costs_of(errors_at_shifts(A, B, rows, Y, X, scale), spread, signal)
         for states, total in zip(*cheapest(costs, price), strict=True):
             key = states.tobytes()
@@ -115,7 +115,7 @@ def likely_shifts(
     return [states for _, states in sorted(found.values(), key=lambda one: one[0])[:most]]
 
 
-def _closed_forms(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tuple[Array, Array, Array, Array]:
+def closed_forms(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tuple[Array, Array, Array, Array]:
     """Y and X (W, 4, 4), the scales (W,) and the median errors (W, 2) of W parts A, B (W, w, 4, 4); weights (W, w)."""
     parts, w = weight.shape
     R_A, R_B, t_A, t_B = A[..., :3, :3], B[..., :3, :3], A[..., :3, 3], B[..., :3, 3]
