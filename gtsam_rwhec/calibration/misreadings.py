@@ -44,6 +44,7 @@ from gtsam_rwhec.calibration.trial_fits import (
     TrialFit,
     fitted,
     implausible,
+    likelihood_of_a_wrong_one,
     residual_of,
     signal_of,
 )
@@ -398,7 +399,10 @@ class _Trial:
             return 0.0
         # Vuong's test of two models that do not contain each other, over blocks of neighbouring measurements.
         remains = self.sampled.remains(reading)
-        sums = _sums(fit.log_likelihoods - self.base.log_likelihoods[remains], self.sampled.blocks()[remains])
+        # A wrong measurement is one in either reading, however far it is from the better one.
+        wrong = likelihood_of_a_wrong_one(self.signal)
+        gains = np.maximum(fit.log_likelihoods, wrong) - np.maximum(self.base.log_likelihoods[remains], wrong)
+        sums = _sums(gains, self.sampled.blocks()[remains])
         is_significant = float(sums.mean()) > BEYOND_CHANCE * float(sums.std(ddof=1)) / math.sqrt(len(sums))
         return gain if is_significant else 0.0
 
