@@ -54,6 +54,9 @@ class CalibrateOptions(PoseOptions):
     #: Look for likely mistakes in the reading of A and B. If one is found, nothing else is computed. The same holds for
     #: residuals that no sensor has, which are always looked for.
     misreadings: bool = True
+    #: Where rows of A and B are shifted against each other, all or from some row on, shift them back. The verdict is
+    #: then "use with care" at best, and names the rows. Not for logs, whose A and B belong together by their stamps.
+    repair: bool = False
     #: For targets with known sizes (``scale="known"``). "check": report a stated size that the motion contradicts.
     #: "known": do not check sizes. "correct": report such a size, and estimate it. "estimate": estimate all sizes.
     sizes: SizesChoice = "check"
@@ -77,9 +80,13 @@ class CalibrateOptions(PoseOptions):
         choices = {"drift": Drift, "robust": RobustChoice, "sizes": SizesChoice, "observations": ObservationChoice}
         check_choices(self, choices if self.hand is None else choices | {"hand": About})
         self.check_share("level", 0.0)
-        for name in ("misreadings", "systematic"):
+        for name in ("misreadings", "repair", "systematic"):
             if not isinstance(getattr(self, name), bool):
                 raise OptionError(f"CalibrateOptions.{name}={brief(getattr(self, name))}; give True or False")
+        if self.repair and not self.misreadings:
+            raise OptionError(
+                "CalibrateOptions.repair=True needs the misreadings that are looked for: leave out misreadings=False"
+            )
         offsets = self.time_offsets
         is_word = isinstance(offsets, bool) or (isinstance(offsets, str) and offsets == "auto")
         if not is_word and not (isinstance(offsets, tuple) and all(isinstance(name, str) for name in offsets)):
@@ -195,6 +202,7 @@ class Run:
     stated: Problem | None = None
     #: By sensor: the time that was added to its stamps when A was taken from the carriers' path
     moved_s: Mapping[str, float] = field(default_factory=dict)
+    is_repaired: bool = False  #: Whether rows of A and B were shifted, as an option says
     #: The certified solution of the measurements that agree, and which these are, if the stage of clocks and sizes
     #: found them
     agreed: tuple[Solution, Inliers] | None = None

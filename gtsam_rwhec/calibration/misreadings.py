@@ -13,19 +13,21 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from rwhec_factors.se3 import inverse, so3_logmap
 
 from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.euler_readings import readings_of_euler_angles
 from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.other_readings import (
     A_INVERTED,
     AS_READ,
     DOUBLE,
+    REPAIR,
     SINGLE,
     Mistake,
     OtherReading,
@@ -34,6 +36,7 @@ from gtsam_rwhec.calibration.other_readings import (
     shifted,
     wrong_unit,
 )
+from gtsam_rwhec.calibration.slipped_rows import Slips, slips_of
 from gtsam_rwhec.calibration.trial_fits import (
     Implausible,
     Sampled,
@@ -41,6 +44,7 @@ from gtsam_rwhec.calibration.trial_fits import (
     TrialFit,
     fitted,
     implausible,
+    likelihood_of_a_wrong_one,
     residual_of,
     signal_of,
 )
@@ -51,6 +55,7 @@ from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, solve
 
@@ -126,6 +131,23 @@ class Misreading:
     translation_mm: tuple[float, float]
     of_B: bool = False  #: Whether B was misread
     inverts_A: bool = False  #: Whether A, alone, is the inverse of what was meant: the carriers are exchanged
+    #: By pair, how many rows after its own (N,) the A of each B is; empty where rows are not shifted
+    shifts: Mapping[Pair, np.ndarray] = field(default_factory=dict, repr=False)
+
+    @staticmethod
+    def of_slips(slips: Slips) -> Misreading:
+        """The record of rows that slipped."""
+        first = slips.slips[0]
+        lost = "an image without a detection" if first.shift > first.before else "a pose that was not recorded"
+        left = ("B", "A") if first.shift > first.before else ("A", "B")
+        return Misreading(
+            Mistake.ROWS_SLIPPED,
+            f"rows slipped: {slips.words}; this is what {lost} does that is left out of {left[0]} and not of {left[1]}",
+            f"leave out of {left[1]} too what is left out of {left[0]} (write a pose and a detection together, or "
+            f"neither), or let the rows be shifted: {REPAIR}",
+            *_figures(slips.before, slips.after),
+            shifts=slips.shifts,
+        )
 
     @staticmethod
     def of(reading: OtherReading, before: Spread, after: Spread, unit: WrongUnit | None = None) -> Misreading:
@@ -135,8 +157,7 @@ class Misreading:
             parts[0].mistake,
             ", and ".join(part.likely for part in parts),
             "; ".join(part.cure for part in parts),
-            (math.degrees(before.rotation_rad), math.degrees(after.rotation_rad)),
-            (1e3 * before.translation_m, 1e3 * after.translation_m / (unit.of_B if unit else 1.0)),
+            *_figures(before, after, unit.of_B if unit else 1.0),
             reading.of_B,
             reading.inverts_A,
         )
@@ -147,6 +168,12 @@ class Misreading:
             for deg, mm in zip(self.rotation_deg, self.translation_mm, strict=True)
         )
         return f"{self.likely}: the median residual is {before} as read, and {after} otherwise; {self.cure}"
+
+
+def _figures(before: Spread, after: Spread, of_B: float = 1.0) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The residuals of two readings in degrees, and in millimetres."""
+    degrees = (math.degrees(before.rotation_rad), math.degrees(after.rotation_rad))
+    return degrees, (1e3 * before.translation_m, 1e3 * after.translation_m / of_B)
 
 
 @one_blas_thread()
@@ -229,6 +256,9 @@ def misreadings(
         return ()
     signal = signal_of(sampled.as_read())
     given = residual_of(problem, solution) if solution is not None else None
+    slips = slips_of(problem, solution, is_plain=given is not None and is_plain(given, signal))
+    if slips is not None:
+        return (Misreading.of_slips(slips),)
     is_late = solution is not None and _rows_are_late(sampled, solution)
     if given is not None and is_plain(given, signal) and not is_late:
         return ()
@@ -239,7 +269,8 @@ def misreadings(
         return ()
     angles = list(readings_of_angles(*sampled.all_poses))
     # Readings that say all rotations are small come first: such rotations fit any other reading too.
-    found = trial.found([each for each in angles if each.of_small_angles]) or trial.found(SINGLE)
+    found = trial.found([each for each in angles if each.of_small_angles])
+    found = found or trial.found([*SINGLE, *readings_of_euler_angles(sampled.as_read())])
     found = found or trial.found(trial.shifts())
     if not found and problem.scale == "known":
         found = trial.found([AS_READ], "shared")
@@ -356,8 +387,9 @@ class _Trial:
         """The logarithm of the product of both residuals' ratios; 0 if small, by chance, or residuals stay large."""
         before, after = self._floored(self.base.residual), self._floored(fit.residual)
         ratios = (before.rotation_rad / after.rotation_rad, before.translation_m / after.translation_m)
-        # Another unit of angles changes the variation of B.
-        signal = signal_of(self.sampled.by(reading)) if reading.mistake is Mistake.ANGLE_UNIT else self.signal
+        # Another unit of angles, or another convention, changes the variation of B.
+        is_other = reading.mistake in (Mistake.ANGLE_UNIT, Mistake.EULER_AXES)
+        signal = signal_of(self.sampled.by(reading)) if is_other else self.signal
         for ratio, share in zip(ratios, shares_of(after, signal), strict=True):
             if ratio < 1.0 / NOT_WORSE or (ratio > NOT_WORSE and share > EXPLAINED_SHARE):
                 return 0.0
@@ -367,7 +399,10 @@ class _Trial:
             return 0.0
         # Vuong's test of two models that do not contain each other, over blocks of neighbouring measurements.
         remains = self.sampled.remains(reading)
-        sums = _sums(fit.log_likelihoods - self.base.log_likelihoods[remains], self.sampled.blocks()[remains])
+        # A wrong measurement is one in either reading, however far it is from the better one.
+        wrong = likelihood_of_a_wrong_one(self.signal)
+        gains = np.maximum(fit.log_likelihoods, wrong) - np.maximum(self.base.log_likelihoods[remains], wrong)
+        sums = _sums(gains, self.sampled.blocks()[remains])
         is_significant = float(sums.mean()) > BEYOND_CHANCE * float(sums.std(ddof=1)) / math.sqrt(len(sums))
         return gain if is_significant else 0.0
 
@@ -389,7 +424,11 @@ class _Trial:
             unit = wrong_unit(fit.one_scale, *self.sampled.median_lengths, from_corners=from_corners)
             if unit is None:
                 return None
-        return Misreading.of(reading, self.base.residual, fit.residual, unit)
+        found = Misreading.of(reading, self.base.residual, fit.residual, unit)
+        if not reading.shift:
+            return found
+        counts = {pair: self.problem.moments(*pair).count for pair in self.problem.pairs if not pair.is_motion}
+        return replace(found, shifts={pair: np.full(count, -reading.shift) for pair, count in counts.items()})
 
 
 def _sums(values: Array, blocks: np.ndarray) -> Array:

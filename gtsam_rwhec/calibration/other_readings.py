@@ -24,6 +24,10 @@ Rows = tuple[Array, Array]
 Change = Callable[[Array], Array]
 
 
+#: How to have rows shifted.
+REPAIR = "CalibrateOptions(repair=True) or --repair"
+
+
 class Mistake(StrEnum):
     """What was likely misread."""
 
@@ -43,8 +47,12 @@ class Mistake(StrEnum):
     SCALE = "scale"
     #: Rows of A and B are shifted against each other.
     ROWS_SHIFTED = "rows_shifted"
+    #: From some row on, B belongs to the A of another row.
+    ROWS_SLIPPED = "rows_slipped"
     #: Angles in radians were read as degrees, or the reverse.
     ANGLE_UNIT = "angle_unit"
+    #: Rotations of A or of B are Euler angles of another order or about other axes, or rotation vectors.
+    EULER_AXES = "euler_axes"
 
     @property
     def may_be_sizes_or_clocks(self) -> bool:
@@ -54,7 +62,7 @@ class Mistake(StrEnum):
     @property
     def is_of_rotations(self) -> bool:
         """Whether angles of another convention look like it."""
-        return self in (Mistake.QUATERNION_ORDER, Mistake.TRANSPOSED, Mistake.HANDEDNESS)
+        return self in (Mistake.QUATERNION_ORDER, Mistake.TRANSPOSED, Mistake.HANDEDNESS, Mistake.EULER_AXES)
 
 
 @dataclass(frozen=True)
@@ -100,7 +108,7 @@ def _reordered(columns: list[int]) -> Change:
     return reordered
 
 
-def _of(sides: str, change: Change) -> Callable[[Array, Array], Rows]:
+def of_sides(sides: str, change: Change) -> Callable[[Array, Array], Rows]:
     """The change of "A", of "B" or of "A and B"."""
     return lambda A, B: (change(A) if "A" in sides else A, change(B) if "B" in sides else B)
 
@@ -113,14 +121,14 @@ _QUATERNIONS = [
         Mistake.QUATERNION_ORDER,
         f"the quaternions of {sides} are {given}, and were read as {read}",
         f"read {sides} with order={given!r} (CSV files have w first)",
-        _of(sides, _reordered(columns)),
+        of_sides(sides, _reordered(columns)),
         of_B="B" in sides,
     )
     for given, read, columns in _REORDERED
     for sides in ("A", "B", "A and B")
 ]
 A_INVERTED, _B_INVERTED, _BOTH_INVERTED = (
-    OtherReading(Mistake.INVERTED, likely, cure, _of(sides, inverse), of_B="B" in sides, inverts_A=sides == "A")
+    OtherReading(Mistake.INVERTED, likely, cure, of_sides(sides, inverse), of_B="B" in sides, inverts_A=sides == "A")
     for sides, likely, cure in (
         (
             "A",
@@ -149,7 +157,7 @@ _TRANSPOSED = [
         Mistake.TRANSPOSED,
         f"the rotations of {side} are transposed (rows for columns, or quaternions of the JPL convention)",
         f"transpose the rotation matrices of {side}, and keep its translations",
-        _of(side, _transposed),
+        of_sides(side, _transposed),
         of_B=side == "B",
     )
     for side in "AB"
@@ -158,7 +166,7 @@ HANDEDNESS = OtherReading(
     Mistake.HANDEDNESS,
     "one of A and B is from a left-handed frame",
     "mirror the poses of the one that is left-handed: M T M with M = diag(1, -1, 1, 1)",
-    _of("A", mirrored),
+    of_sides("A", mirrored),
 )
 
 
@@ -169,8 +177,8 @@ def shifted(shift: int) -> OtherReading:
     return OtherReading(
         Mistake.ROWS_SHIFTED,
         f"the rows of {first} come {n} {rows} later than those of {second}, or the clocks differ by as much",
-        f"leave out the first {n} {rows} of {first} and the last {n} of {second}, in each pair; or give stamps and "
-        "estimate the time offsets",
+        f"leave out the first {n} {rows} of {first} and the last {n} of {second}, in each pair, or let the rows be "
+        f"shifted: {REPAIR}; or give stamps and estimate the time offsets",
         lambda A, B: (A, B),
         shift=shift,
     )
@@ -274,7 +282,7 @@ def readings_of_angles(A: Array, B: Array) -> Iterator[OtherReading]:
         likely = f"the angles of {side} are in radians, and were read as degrees"
         for cure, change in small:
             yield OtherReading(
-                Mistake.ANGLE_UNIT, likely, cure, _of(side, change), of_B=side == "B", of_small_angles=True
+                Mistake.ANGLE_UNIT, likely, cure, of_sides(side, change), of_B=side == "B", of_small_angles=True
             )
         if not small:
             yield OtherReading(

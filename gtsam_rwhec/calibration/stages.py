@@ -14,7 +14,7 @@ import numpy as np
 from rwhec_factors.se3 import inverse
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Recording, Run, agreeing
+from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Record, Recording, Run, agreeing
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.clock_offsets import Answer, answer, check_offsets, late_in_place_of_shifted
 from gtsam_rwhec.calibration.from_corners import (
@@ -29,6 +29,7 @@ from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, views_of
 from gtsam_rwhec.calibration.settled_measurements import settled_measurements
 from gtsam_rwhec.calibration.sizes import TargetSize, doubted_lengths, undetectable
+from gtsam_rwhec.calibration.slipped_rows import with_rows_shifted
 from gtsam_rwhec.calibration.stated_knowledge import (
     doubt_one_pose,
     doubt_stated_poses,
@@ -213,6 +214,9 @@ def _calibrated(run: Run) -> Calibration:
             run, found_sizes, by_corners = settled_measurements(run)
             first, why = _solved(run)
             reading, found = _read_and_answered(run, first)
+        repaired = _repaired(run, reading)
+        if repaired is not None:
+            return _calibrated(repaired)
         better, thin = with_better_poses(run, found)
         if better is not None:
             run.tell("once more, with the poses of targets that the answer says")
@@ -282,6 +286,21 @@ def _calibrated(run: Run) -> Calibration:
         options=run.options,
         problem=problem,
     )
+
+
+def _repaired(run: Run, reading: Reading) -> Run | None:
+    """A new run with rows of A and B where they belong; None where no option says so, or rows belong together."""
+    one = reading.misreadings[0] if reading.misreadings else None
+    if one is None or not one.shifts or not run.options.repair or run.is_repaired or run.recording is not None:
+        return None
+    again = replace(run, problem=with_rows_shifted(run.problem, one.shifts), record=Record(), is_repaired=True)
+    left_out = run.problem.number_of_measurements - again.problem.number_of_measurements
+    moved = sum(int((of != 0).sum()) for of in one.shifts.values()) - left_out
+    number = "1 row was" if moved == 1 else f"{moved} rows were"
+    words = f"{number} shifted and {left_out} left out, because {one.likely}"
+    again.record.find(Ground.ROWS_REPAIRED, words)
+    again.record.choose("rows of A and B", f"{number} shifted", "an option says so")
+    return again
 
 
 def _doubt_untested_corners(run: Run, found: Answer) -> None:

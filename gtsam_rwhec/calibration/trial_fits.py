@@ -87,6 +87,12 @@ class TrialFit:
         return float(np.median(list(self.scale.values()))) if isinstance(self.scale, dict) else self.scale
 
 
+def likelihood_of_a_wrong_one(signal: Spread) -> float:
+    """The log likelihood of a measurement that is anywhere in the variation of B, as `TrialFit.log_likelihoods`."""
+    S_R, S_t = max(signal.rotation_rad, 1e-12), max(signal.translation_m, 1e-12)
+    return -3.0 * math.log(S_R * S_t) - 0.5 * (DEGREES_OF_T + 6.0) * math.log1p(6.0 / DEGREES_OF_T)
+
+
 def fitted(
     problem: Problem, sample: Sample, scale: ScaleMode | None = None, *, rounds: int = ROUNDS
 ) -> TrialFit | None:

@@ -99,6 +99,8 @@ class Ground(StrEnum):
     LITTLE_ROTATION = "little_rotation"
     #: A frame rests on so few measurements that a wrong one would not show.
     FEW_MEASUREMENTS = "few_measurements"
+    #: Rows of A and B did not belong together; they were shifted, as an option says.
+    ROWS_REPAIRED = "rows_repaired"
     #: The stated size of a target does not fit the motion, as other targets' do; it was estimated instead.
     SIZE_ESTIMATED = "size_estimated"
     #: The stated intrinsics of a sensor do not fit its corners; they were estimated in their place.
@@ -235,6 +237,10 @@ _ADVICE = {
     ),
     Ground.LITTLE_ROTATION: "turn the carriers by 30 degrees and more, about two different axes, and measure again",
     Ground.FEW_MEASUREMENTS: "measure each named frame at three poses or more, or do not use its pose",
+    Ground.ROWS_REPAIRED: (
+        "correct the script that pairs A and B, and look whether the named rows are where an image has no detection, "
+        "before you rely on the poses"
+    ),
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.INTRINSICS_ESTIMATED: (
         "check which calibration the stated intrinsics of the named sensor are from (its resolution, its lens), and "

@@ -50,7 +50,7 @@ OF_FOLDER = frozenset(
     {"source", "verbose", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"}
 )
 #: Parameters that overrule a choice of ``rw.calibrate``.
-OF_CHOICES = frozenset({"noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "as_read"})
+OF_CHOICES = frozenset({"noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "as_read", "repair"})
 #: Parameters of the certified solution alone.
 OF_SOLVE = frozenset({"method", "initial"})
 # The options that each input refuses, by the reason and what to do.
@@ -125,6 +125,15 @@ def calibrate(
             "--as-read",
             rich_help_panel=CHOICES_PANEL,
             help="Do not try other readings of A and B. Residuals that no sensor has are still refused.",
+        ),
+    ] = False,
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair",
+            rich_help_panel=CHOICES_PANEL,
+            help="Where rows of A and B are shifted, all or from some row on (an image without a detection), shift "
+            "them back; the verdict names them.",
         ),
     ] = False,
     certified_only: Annotated[
@@ -207,6 +216,8 @@ def calibrate(
         raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
     if (carrier_noise_deg is None) != (carrier_noise_mm is None):
         raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both, or neither")
+    if repair and as_read:
+        raise typer.BadParameter("--repair shifts rows that were misread, which --as-read does not look for: give one")
     if noise == "given" and (sigma is None or kappa is None):
         raise typer.BadParameter("--noise given needs --sigma and --kappa: give both, or use --noise estimate")
     check_output(output, source)
@@ -235,7 +246,9 @@ def calibrate(
             report = partial(rw.report.print_solution, solution, findings=findings)
             judgement = rw.judge(solution, findings=findings)
         else:
-            options = rw.CalibrateOptions(noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read)
+            options = rw.CalibrateOptions(
+                noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read, repair=repair
+            )
             calibration = rw.calibrate(problem, options, progress=stage)
             write = partial(rw.write_calibration, calibration)
             evidence = None if output is None else partial(_evidence, source, problem, calibration, command_of(context))

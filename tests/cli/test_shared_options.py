@@ -33,6 +33,7 @@ VALUES = {
     "initial": "earlier.json",
     "certified_only": None,
     "as_read": None,
+    "repair": None,
     "carrier_noise_deg": "0.1",
     "carrier_noise_mm": "1",
     "images": None,

@@ -1,0 +1,158 @@
+"""Shifts between the rows of A and B of one pair: the cost of each row at each shift, and the shifts that cost least.
+
+Many parts of the rows are fitted in closed form, at each shift: a part in which all rows have one shift gives X and Y,
+and these tell the shifts of all other rows. Rotations are of Shah (2013), "Solving the robot-world/hand-eye calibration
+problem using the Kronecker product": the leading singular vectors of the sum of R_A (x) R_B are R_Y and R_X.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from rwhec_factors.se3 import inverse, pose
+
+from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Spread, angles
+from gtsam_rwhec.geometry.poses import Array
+
+#: B's row i may belong to the rows of A from i - 3 to i + 3.
+SHIFTS = np.arange(-3, 4)
+AS_GIVEN = int(np.flatnonzero(SHIFTS == 0)[0])
+#: No sensor is better than this (rad, and as a share of the variation of B).
+SMALLEST = 2e-4
+#: Degrees of freedom of Student's t.
+DEGREES_OF_T = 6.0
+#: A row whose A would be before the first row or after the last one costs as much more (nats) than at its best shift.
+UNSAID = 1.0
+#: Parts of this share of all rows are fitted, and of so many rows at least; each begins half of its length later.
+SHARES, FEWEST_OF_A_PART = (1.0, 0.5, 0.25, 0.125), 5
+#: Parts have at most so many rows, from all over them.
+MOST_OF_A_PART = 60
+
+
+def errors_at_shifts(A: Array, B: Array, rows: np.ndarray, Y: Array, X: Array, scale: Array | float) -> Array:
+    """Angles (rad) and distances (..., 2, S, n) of B's rows from their predictions at each shift.
+
+    Y and X (..., 4, 4) are poses of the sensor and of the target, A and B (N, 4, 4) all measurements of the pair.
+    Infinite where a row has no A at that shift.
+    """
+    predicted = inverse(Y)[..., None, :, :] @ A @ X[..., None, :, :]
+    scale = np.asarray(scale)[..., None, None]
+    found = np.full((*Y.shape[:-2], 2, len(SHIFTS), len(rows)), np.inf)
+    for k, shift in enumerate(SHIFTS):
+        there = (rows + shift >= 0) & (rows + shift < len(A))
+        T, S = predicted[..., rows[there] + shift, :, :], B[rows[there]]
+        found[..., 0, k, there] = angles(S[:, :3, :3], T[..., :3, :3])
+        away = np.linalg.norm(S[:, :3, 3] - scale * T[..., :3, 3], axis=-1)
+        found[..., 1, k, there] = away
+    return found
+
+
+def costs_of(errors: Array, spread: Array, signal: Spread) -> Array:
+    """The cost (..., S, n) of each row at each shift: minus its log likelihood, and at most that of a wrong row.
+
+    ``spread`` (..., 2) has the median errors of right rows; ``signal`` what B varies by. Right rows have Student's t
+    noise, wrong ones are anywhere in the variation of B.
+    """
+    least = [SMALLEST, max(SMALLEST * signal.translation_m, 1e-12)]
+    s = np.maximum(spread, least) / MEDIAN_OF_CHI
+    S = np.maximum(np.array([signal.rotation_rad, signal.translation_m]) / MEDIAN_OF_CHI, s)
+    squared = ((errors / s[..., None, None]) ** 2).sum(axis=-3)
+    tail = 0.5 * (DEGREES_OF_T + 6.0)
+    right = 3.0 * np.log(s.prod(axis=-1))[..., None, None] + tail * np.log1p(squared / DEGREES_OF_T)
+    wrong = 3.0 * np.log(S.prod(axis=-1))[..., None, None] + tail * math.log1p(6.0 / DEGREES_OF_T)
+    costs = np.minimum(right, wrong)
+    # a row whose A is not there speaks for no shift
+    return np.where(np.isinf(errors[..., 0, :, :]), costs.min(axis=-2, keepdims=True) + UNSAID, costs)
+
+
+def cheapest(costs: Array, price: float) -> tuple[np.ndarray, Array]:
+    """Each row's shift with the least sum of costs (..., S, n) and of prices of changes (Viterbi), and this sum.
+
+    The shifts (..., n) are numbers into `SHIFTS`. Rows that are not as given from the first on are a change too. The
+    time is linear in the rows.
+    """
+    number, n = costs.shape[-2:]
+    total = costs[..., 0] + np.where(np.arange(number) == AS_GIVEN, 0.0, price)
+    came, own = np.empty((n, *total.shape), dtype=np.int8), np.arange(number)
+    for i in range(1, n):
+        jump = total.min(axis=-1, keepdims=True) + price
+        came[i] = np.where(total <= jump, own, total.argmin(axis=-1)[..., None])
+        total = np.minimum(total, jump) + costs[..., i]
+    states = np.empty((*total.shape[:-1], n), dtype=np.int64)
+    states[..., -1] = total.argmin(axis=-1)
+    for i in range(n - 1, 0, -1):
+        states[..., i - 1] = np.take_along_axis(came[i], states[..., i, None], axis=-1)[..., 0]
+    return states, total.min(axis=-1)
+
+
+def likely_shifts(
+    A: Array, B: Array, rows: np.ndarray, signal: Spread, price: float, most: int, *, is_scaled: bool
+) -> list[np.ndarray]:
+    """The shifts (n,) of a pair's rows, as numbers into `SHIFTS`, that cost least under fits of parts of the rows.
+
+    ``is_scaled``: lengths in B are true lengths times a factor. At most ``most`` are returned, the best first.
+    """
+    n = len(rows)
+    found: dict[bytes, tuple[float, np.ndarray]] = {}
+    for length in sorted({max(round(share * n), FEWEST_OF_A_PART) for share in SHARES}):
+        if length > n:
+            continue
+        begins = np.unique(np.append(np.arange(0, n - length + 1, max(length // 2, 1)), n - length))
+        inside = np.unique(np.linspace(0, length - 1, min(length, MOST_OF_A_PART)).astype(int))
+        parts = rows[begins[:, None] + inside]
+        # every part at every shift, where more than half of it has an A
+        own = parts[:, None] + SHIFTS[:, None]
+        there = (own >= 0) & (own < len(A))
+        part, shift = np.nonzero(there.sum(axis=-1) >= min(FEWEST_OF_A_PART, length))
+        of_A, of_B, weight = np.clip(own[part, shift], 0, len(A) - 1), parts[part], there[part, shift].astype(float)
+        Y, X, scale, spread = closed_forms(A[of_A], B[of_B], weight, is_scaled=is_scaled)
+        costs = costs_of(errors_at_shifts(A, B, rows, Y, X, scale), spread, signal)
+        for states, total in zip(*cheapest(costs, price), strict=True):
+            key = states.tobytes()
+            if key not in found or total < found[key][0]:
+                found[key] = (float(total), states)
+    return [states for _, states in sorted(found.values(), key=lambda one: one[0])[:most]]
+
+
+def closed_forms(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tuple[Array, Array, Array, Array]:
+    """Y and X (W, 4, 4), the scales (W,) and the median errors (W, 2) of W parts A, B (W, w, 4, 4); weights (W, w)."""
+    parts, w = weight.shape
+    R_A, R_B, t_A, t_B = A[..., :3, :3], B[..., :3, :3], A[..., :3, 3], B[..., :3, 3]
+    flat = (R_A * weight[..., None, None]).reshape(parts, w, 9)
+    # sum of R_A (x) R_B, which takes R_X, by rows, to R_A R_X R_B'
+    T = np.swapaxes(flat, 1, 2) @ R_B.reshape(parts, w, 9)
+    T = T.reshape(parts, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4).reshape(parts, 9, 9)
+    left, _, right = np.linalg.svd(T)
+    M_Y, M_X = left[:, :, 0].reshape(-1, 3, 3), right[:, 0].reshape(-1, 3, 3)
+    sign = np.where(np.linalg.det(M_X) < 0.0, -1.0, 1.0)[:, None, None]
+    R_Y, R_X = _nearest_rotations(sign * M_Y), _nearest_rotations(sign * M_X)
+    # R_A t_X - t_Y - u R_Y t_B = -t_A, with u = 1 / scale
+    turned = np.einsum("wij,wnj->wni", R_Y, t_B)
+    eye = np.broadcast_to(-np.eye(3), (parts, w, 3, 3))
+    columns = np.concatenate([R_A, eye] + ([-turned[..., None]] if is_scaled else []), axis=3)
+    right_side = -t_A if is_scaled else turned - t_A
+    root = np.sqrt(weight)[..., None, None]
+    system = (columns * root).reshape(parts, 3 * w, -1)
+    solved = np.linalg.pinv(system) @ (right_side[..., None] * root).reshape(parts, 3 * w, 1)
+    t_X, t_Y = solved[:, :3, 0], solved[:, 3:6, 0]
+    u = solved[:, 6, 0] if is_scaled else np.ones(parts)
+    scale = 1.0 / np.where(np.abs(u) < 1e-9, 1e-9, u)
+    Y, X = pose(R_Y, t_Y), pose(R_X, t_X)
+    predicted = inverse(Y)[:, None] @ A @ X[:, None]
+    of_parts = np.stack(
+        [
+            angles(R_B, predicted[..., :3, :3]),
+            np.linalg.norm(t_B - scale[:, None, None] * predicted[..., :3, 3], axis=-1),
+        ],
+        axis=1,
+    )
+    # of the 6 w equations, 12 or 13 were spent
+    spent = math.sqrt(6 * w / max(6 * w - 12 - is_scaled, 1))
+    return Y, X, scale, spent * np.median(of_parts, axis=-1)
+
+
+def _nearest_rotations(M: Array) -> Array:
+    left, _, right = np.linalg.svd(M)
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    return np.asarray(left @ right)
