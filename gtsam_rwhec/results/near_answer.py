@@ -80,7 +80,7 @@ def near(
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     finite = basis @ mixture.covariance @ basis.T
     if is_drift_untried(task, found):
-        wider = widening(task, found)
+        wider = widening(task, found, finite)
         finite = finite * wider[:, None] * wider
     frames = [
         rows
