@@ -37,9 +37,7 @@ class OfStack:
     def first(self, number: int) -> OfStack:
         """The products of the first patterns."""
         of_unknowns, of_A, of_residual = (each[:, :number] for each in (self.of_unknowns, self.of_A, self.of_residual))
-        return replace(
-            self, of_unknowns=of_unknowns, of_A=of_A, of_residual=of_residual, P=self.P[:, :number, :number]
-        )
+        return replace(self, of_unknowns=of_unknowns, of_A=of_A, of_residual=of_residual, P=self.P[:, :number, :number])
 
     def add(self, sums: Array, values: Array) -> None:
         """Add values of the images (V, ...) to sums by instant (I, ...)."""

@@ -11,7 +11,7 @@ Variables
 
 An instant's factor has of each of its images the six linear rows in which A is; what the other rows say has no A, and
 is summed over all images of a target by a sensor (`row_sums`). GTSAM asks each factor by itself, in any order: all rows
-are computed when the first factor is asked at new values. A factor in Python costs much to be asked, so images share one.
+are computed when the first factor is asked at new values. It costs much to ask a factor in Python: images share one.
 """
 
 from __future__ import annotations

@@ -227,9 +227,7 @@ def _placed(data: list[PairData], variables: Variables, state: State) -> list[Pl
         scale = variables.scale_of_pair.get(item.pair)
         offset_s = state.offsets_s.get(item.pair.sensor, 0.0)
         alpha = 1.0 if scale is None else state.scales[scale]
-        found.append(
-            Placed(item.at(offset_s), frames[item.pair.target], frames[item.pair.sensor], alpha, offset_s)
-        )
+        found.append(Placed(item.at(offset_s), frames[item.pair.target], frames[item.pair.sensor], alpha, offset_s))
     return found
 
 
