@@ -56,9 +56,7 @@ class BatchResiduals:
     #: (N, 6): velocities of the carriers: A(t + d) = A Expmap(d twist), [omega rad/s, v m/s]
     twists: Array | None = None
 
-    def linearize(
-        self, X: Array, Y: Array, scale: float | Array = 1.0, offset_s: float | Array = 0.0
-    ) -> Linearization:
+    def linearize(self, X: Array, Y: Array, scale: float | Array = 1.0, offset_s: float | Array = 0.0) -> Linearization:
         """Residuals and Jacobians at X, Y (4, 4), a scale and a time offset in seconds; or at N of each."""
         predicted = self._predicted(X, Y, offset_s)
         value = self._compared(predicted, scale)
@@ -143,9 +141,7 @@ def _groups(pairs: Sequence[Placed]) -> Iterator[Sequence[Placed]]:
         first, before = last, int(ends[last - 1])
 
 
-def _joined(
-    group: Sequence[Placed],
-) -> tuple[BatchResiduals, tuple[Array, Array, Array, Array], np.ndarray]:
+def _joined(group: Sequence[Placed]) -> tuple[BatchResiduals, tuple[Array, Array, Array, Array], np.ndarray]:
     """The measurements of some pairs in one; X, Y, the scale and the offset of each; and where the pairs are cut."""
     batches = [one.batch for one in group]
     counts = [len(batch.A) for batch in batches]
@@ -373,7 +369,7 @@ def robot_world_hand_eye_effects_factor(
     """
     (factor,) = robot_world_hand_eye_effects_factors(
         target_key, sensor_key, A, B, sqrt_information, [(slice(None), effects)], scale_key=scale_key,
-        time_offset_key=time_offset_key, twists=twists,
+        time_offset_key=time_offset_key, twists=twists, together=together,
     )  # fmt: skip
     return factor
 

@@ -150,7 +150,7 @@ def bound_axes(figure: Figure) -> None:
             if not (np.isfinite([low, high]).all()):
                 continue
             if axis.get_scale() == "log":
-                if 0.0 < high and low < high * 10.0**-DECADES:
+                if high > 0.0 and low < high * 10.0**-DECADES:
                     ends = (high * 10.0**-DECADES, high)
                     limit(*(ends if axis.get_view_interval()[0] <= axis.get_view_interval()[1] else ends[::-1]))
             elif len(axis.get_majorticklocs()) > MOST_TICKS:
