@@ -1,9 +1,12 @@
-"""All measurements of a pair at once: vectorised geodesic residuals and Jacobians, and one factor that holds them."""
+"""All measurements of a pair at once: vectorised geodesic residuals and Jacobians, and one factor that holds them.
+
+A call of numpy costs as much for fifty measurements as for five hundred: pairs of few are computed together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import gtsam
@@ -25,6 +28,8 @@ from rwhec_factors.se3 import Array
 
 #: Some measurements, and their effects by key.
 Part = tuple[slice, Mapping[int, ArrayLike]]
+#: Pairs are computed together up to so many measurements: beyond, memory costs more than calls do.
+AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
@@ -51,16 +56,17 @@ class BatchResiduals:
     #: (N, 6): velocities of the carriers: A(t + d) = A Expmap(d twist), [omega rad/s, v m/s]
     twists: Array | None = None
 
-    def linearize(self, X: Array, Y: Array, scale: float = 1.0, offset_s: float = 0.0) -> Linearization:
-        """Residuals and Jacobians at X, Y (4, 4), a scale and a time offset in seconds."""
+    def linearize(self, X: Array, Y: Array, scale: float | Array = 1.0, offset_s: float | Array = 0.0) -> Linearization:
+        """Residuals and Jacobians at X, Y (4, 4), a scale and a time offset in seconds; or at N of each."""
         predicted = self._predicted(X, Y, offset_s)
         value = self._compared(predicted, scale)
         # Log(E Expmap(d)) = e + Jr^-1(e) d; S(P Expmap([w, v])) = S(P) Expmap([w, scale v]); dS/dscale is v = R' t.
         inverse_jacobian = se3.right_jacobian_inverse(value)
-        target = inverse_jacobian * np.r_[1.0, 1.0, 1.0, scale, scale, scale]
+        target = inverse_jacobian.copy()
+        target[:, :, 3:] *= np.reshape(scale, (-1, 1, 1))
         direction = np.einsum("nji,nj->ni", predicted[:, :3, :3], predicted[:, :3, 3])
         # X Expmap(d) moves the prediction P by d, Y Expmap(d) by -Ad(P^-1) d, A Expmap(d) by Ad(X^-1) d.
-        carrier = target @ se3.adjoint(np.linalg.inv(X)[None])[0]
+        carrier = target @ se3.adjoint(se3.inverse(X).reshape(-1, 4, 4))
         return Linearization(
             residual=value,
             target=target,
@@ -70,18 +76,83 @@ class BatchResiduals:
             carrier=carrier,
         )
 
-    def residuals(self, X: Array, Y: Array, scale: float = 1.0, offset_s: float = 0.0) -> Array:
+    def residuals(self, X: Array, Y: Array, scale: float | Array = 1.0, offset_s: float | Array = 0.0) -> Array:
         """Residuals (N, 6) alone."""
         return self._compared(self._predicted(X, Y, offset_s), scale)
 
-    def _predicted(self, X: Array, Y: Array, offset_s: float) -> Array:
-        A = self.A if self.twists is None or offset_s == 0.0 else self.A @ se3.expmap(offset_s * self.twists)
-        return np.linalg.inv(Y) @ A @ X
+    def _predicted(self, X: Array, Y: Array, offset_s: float | Array) -> Array:
+        offsets = np.reshape(offset_s, (-1, 1))
+        A = self.A if self.twists is None or not offsets.any() else self.A @ se3.expmap(offsets * self.twists)
+        return np.asarray(se3.inverse(Y) @ A @ X)
 
-    def _compared(self, predicted: Array, scale: float) -> Array:
+    def _compared(self, predicted: Array, scale: float | Array) -> Array:
         scaled = predicted.copy()
-        scaled[:, :3, 3] *= scale
+        scaled[:, :3, 3] *= np.reshape(scale, (-1, 1))
         return se3.logmap(se3.inverse(self.B) @ scaled)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """One pair's measurements, and where their residuals are computed."""
+
+    batch: BatchResiduals
+    #: (4, 4)
+    X: Array
+    Y: Array
+    scale: float = 1.0
+    offset_s: float = 0.0
+
+
+def linearized_together(pairs: Sequence[Placed]) -> list[Linearization]:
+    """``BatchResiduals.linearize`` of many pairs, in their order."""
+    found: list[Linearization] = []
+    for group in _groups(pairs):
+        if len(group) == 1:
+            one = group[0]
+            found.append(one.batch.linearize(one.X, one.Y, one.scale, one.offset_s))
+        else:
+            batch, at, ends = _joined(group)
+            every = batch.linearize(*at)
+            parts = (np.split(getattr(every, each.name), ends) for each in fields(every))
+            found += [Linearization(*part) for part in zip(*parts, strict=True)]
+    return found
+
+
+def residuals_together(pairs: Sequence[Placed]) -> list[Array]:
+    """``BatchResiduals.residuals`` (N, 6) of many pairs, in their order."""
+    found: list[Array] = []
+    for group in _groups(pairs):
+        if len(group) == 1:
+            one = group[0]
+            found.append(one.batch.residuals(one.X, one.Y, one.scale, one.offset_s))
+        else:
+            batch, at, ends = _joined(group)
+            found += np.split(batch.residuals(*at), ends)
+    return found
+
+
+def _groups(pairs: Sequence[Placed]) -> Iterator[Sequence[Placed]]:
+    """Neighbouring pairs that are computed together."""
+    ends = np.cumsum([len(one.batch.A) for one in pairs])
+    first, before = 0, 0
+    while first < len(pairs):
+        last = max(int(np.searchsorted(ends, before + AT_ONCE, side="right")), first + 1)
+        yield pairs[first:last]
+        first, before = last, int(ends[last - 1])
+
+
+def _joined(group: Sequence[Placed]) -> tuple[BatchResiduals, tuple[Array, Array, Array, Array], np.ndarray]:
+    """The measurements of some pairs in one; X, Y, the scale and the offset of each; and where the pairs are cut."""
+    batches = [one.batch for one in group]
+    counts = [len(batch.A) for batch in batches]
+    twists = None
+    if any(batch.twists is not None for batch in batches):
+        twists = np.concatenate([np.zeros((len(b.A), 6)) if b.twists is None else b.twists for b in batches])
+    whole = BatchResiduals(np.concatenate([b.A for b in batches]), np.concatenate([b.B for b in batches]), twists)
+    of = np.repeat(np.arange(len(group)), counts)
+    X, Y = np.array([one.X for one in group])[of], np.array([one.Y for one in group])[of]
+    scale, offset_s = np.array([one.scale for one in group])[of], np.array([one.offset_s for one in group])[of]
+    return whole, (X, Y, scale, offset_s), np.cumsum(counts)[:-1]
 
 
 def robot_world_hand_eye_batch_factor(
@@ -94,6 +165,7 @@ def robot_world_hand_eye_batch_factor(
     scale_key: int | None = None,
     time_offset_key: int | None = None,
     twists: Array | None = None,
+    together: Together | None = None,
 ) -> gtsam.CustomFactor:
     """All measurements of one pair in one factor: the cost of N single geodesic factors, evaluated at once.
 
@@ -114,6 +186,9 @@ def robot_world_hand_eye_batch_factor(
         Key of a 1-vector, in seconds: B's stamp t is the carriers' t + offset. Needs ``twists``.
     twists : (N, 6) array, optional
         The carriers' velocity at each stamp: A(t + d) = A Expmap(d twist), [omega rad/s, v m/s].
+    together : Together, optional
+        One for all factors of a graph: they are then computed in few calls, which is faster where pairs have few
+        measurements.
 
     Returns
     -------
@@ -127,11 +202,18 @@ def robot_world_hand_eye_batch_factor(
     """
     return robot_world_hand_eye_effects_factor(
         target_key, sensor_key, A, B, sqrt_information, {}, scale_key=scale_key, time_offset_key=time_offset_key,
-        twists=twists,
+        twists=twists, together=together,
     )  # fmt: skip
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Give one of these to several factors: when one of them is asked at new values, all are computed in few calls."""
+
+    members: list[_Whitened] = field(default_factory=list)
+
+
+@dataclass(eq=False)
 class _Whitened:
     """All measurements of a pair, whitened; the last evaluation is kept for the other factors of the same pair."""
 
@@ -141,6 +223,8 @@ class _Whitened:
     sensor_key: int
     scale_key: int | None
     time_offset_key: int | None
+    #: The pairs that are computed when this one is.
+    together: Together
     _at: bytes = b""
     _residual: Array = field(default_factory=lambda: np.zeros(0))
     _jacobians: tuple[Array, ...] = ()
@@ -152,28 +236,47 @@ class _Whitened:
 
     def at(self, values: gtsam.Values, *, linearized: bool) -> tuple[Array, tuple[Array, ...]]:
         """Residuals (6 N,) and, if asked for, the Jacobians (6 N, m) by ``keys``."""
+        placed = self._placed(values)
+        if self._at != _point(placed) or (linearized and not self._jacobians):
+            others = [one for one in self.together.members if one is not self and one.is_in(values)]
+            pairs, places = [self, *others], [placed, *(one._placed(values) for one in others)]
+            if linearized:
+                for one, where, found in zip(pairs, places, linearized_together(places), strict=True):
+                    one._take(where, found.residual, one._blocks(found))
+            else:
+                for one, where, residual in zip(pairs, places, residuals_together(places), strict=True):
+                    one._take(where, residual, [])
+        return self._residual, self._jacobians
+
+    def is_in(self, values: gtsam.Values) -> bool:
+        """Whether all variables have a value."""
+        return all(values.exists(key) for key in self.keys)
+
+    def _placed(self, values: gtsam.Values) -> Placed:
         X = pose_of(values, self.target_key, "X = T_targetcarrier_target").matrix()
         Y = pose_of(values, self.sensor_key, "Y = T_sensorcarrier_sensor").matrix()
         scale = 1.0 if self.scale_key is None else number_of(values, self.scale_key, "the scale")
         offset = 0.0
         if self.time_offset_key is not None:
             offset = number_of(values, self.time_offset_key, "the time offset in seconds")
-        here = np.concatenate([X.ravel(), Y.ravel(), [scale, offset]]).tobytes()
-        is_known = self._at == here
-        self._at = here
-        if linearized and not (is_known and self._jacobians):
-            at = self.batch.linearize(X, Y, scale, offset)
-            blocks = [at.target + at.sensor] if self.target_key == self.sensor_key else [at.target, at.sensor]
-            if self.time_offset_key is not None:
-                blocks.append(at.offset[:, :, None])
-            if self.scale_key is not None:
-                blocks.append(at.scale[:, :, None])
-            self._jacobians = tuple(_rows(self.whitening @ block) for block in blocks)
-            self._residual = _rows(self.whitening @ at.residual[:, :, None])[:, 0]
-        elif not is_known:
-            self._jacobians = ()
-            self._residual = _rows(self.whitening @ self.batch.residuals(X, Y, scale, offset)[:, :, None])[:, 0]
-        return self._residual, self._jacobians
+        return Placed(self.batch, X, Y, scale, offset)
+
+    def _blocks(self, at: Linearization) -> list[Array]:
+        blocks = [at.target + at.sensor] if self.target_key == self.sensor_key else [at.target, at.sensor]
+        if self.time_offset_key is not None:
+            blocks.append(at.offset[:, :, None])
+        if self.scale_key is not None:
+            blocks.append(at.scale[:, :, None])
+        return blocks
+
+    def _take(self, where: Placed, residual: Array, blocks: list[Array]) -> None:
+        self._at = _point(where)
+        self._residual = _rows(self.whitening @ residual[:, :, None])[:, 0]
+        self._jacobians = tuple(_rows(self.whitening @ block) for block in blocks)
+
+
+def _point(placed: Placed) -> bytes:
+    return placed.X.tobytes() + placed.Y.tobytes() + np.array([placed.scale, placed.offset_s]).tobytes()
 
 
 def _factor_of_part(whole: _Whitened, rows: slice, effects: Mapping[int, ArrayLike]) -> gtsam.CustomFactor:
@@ -234,6 +337,7 @@ def robot_world_hand_eye_effects_factor(
     scale_key: int | None = None,
     time_offset_key: int | None = None,
     twists: Array | None = None,
+    together: Together | None = None,
 ) -> gtsam.CustomFactor:
     """All measurements of one pair in one factor, with errors that are linear in further variables.
 
@@ -265,7 +369,7 @@ def robot_world_hand_eye_effects_factor(
     """
     (factor,) = robot_world_hand_eye_effects_factors(
         target_key, sensor_key, A, B, sqrt_information, [(slice(None), effects)], scale_key=scale_key,
-        time_offset_key=time_offset_key, twists=twists,
+        time_offset_key=time_offset_key, twists=twists, together=together,
     )  # fmt: skip
     return factor
 
@@ -281,6 +385,7 @@ def robot_world_hand_eye_effects_factors(
     scale_key: int | None = None,
     time_offset_key: int | None = None,
     twists: Array | None = None,
+    together: Together | None = None,
 ) -> list[gtsam.CustomFactor]:
     """The measurements of one pair in several factors, each with effects of its own, evaluated at once.
 
@@ -302,6 +407,10 @@ def robot_world_hand_eye_effects_factors(
     A, B = checked_pairs(A, B)
     check_time_offset(time_offset_key, twists)
     batch = BatchResiduals(A, B, None if twists is None else checked_twists(twists, (len(A), 6)))
-    whole = _Whitened(batch, _whitening(sqrt_information, len(A)), target_key, sensor_key, scale_key, time_offset_key)
+    together = Together() if together is None else together
+    whole = _Whitened(
+        batch, _whitening(sqrt_information, len(A)), target_key, sensor_key, scale_key, time_offset_key, together
+    )
     check_keys(whole.keys)
+    together.members.append(whole)
     return [_factor_of_part(whole, rows, effects) for rows, effects in parts]

@@ -23,6 +23,7 @@ from gtsam_rwhec.calibration.from_corners import (
     check_observations,
     with_better_poses,
 )
+from gtsam_rwhec.calibration.known_frames import of_knowledge
 from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, misread_as_recorded, reading_of
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
@@ -264,6 +265,10 @@ def _calibrated(run: Run) -> Calibration:
         free = solution.identifiability.free_directions if refined is None else refined.free_directions
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
     best = solution if refined is None else refined
+    views = {} if best is None else views_of(problem, inliers, best.scale)
+    carriers = Carriers(problem.sensor_carrier, problem.target_carrier)
+    if refined is not None and reading.finding is None:
+        record.findings += of_knowledge(problem, inliers, refined, views, carriers)
     return Calibration(
         X={} if best is None else best.X,
         Y={} if best is None else best.Y,
@@ -281,8 +286,8 @@ def _calibrated(run: Run) -> Calibration:
         findings=tuple(record.findings),
         choices=tuple(record.choices),
         notes=tuple(record.notes),
-        views={} if best is None else views_of(problem, inliers, best.scale),
-        carriers=Carriers(problem.sensor_carrier, problem.target_carrier),
+        views=views,
+        carriers=carriers,
         options=run.options,
         problem=problem,
     )

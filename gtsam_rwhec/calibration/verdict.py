@@ -63,6 +63,8 @@ class Ground(StrEnum):
     NOT_CERTIFIED = "not_certified"
     #: The measurements leave a direction free.
     NOT_UNIQUE = "not_unique"
+    #: Standard deviations are as large as no pose's: many degrees, or more metres than targets were away.
+    KNOWN_TO_NOTHING = "known_to_nothing"
     #: A pose that was stated, by a prior or fixed, is not the one that the measurements give.
     POSE_DOUBTED = "pose_doubted"
     #: A frame was at two poses: a target was moved, or a sensor's mount gave way.
@@ -95,6 +97,8 @@ class Ground(StrEnum):
     IMAGE_TURNED = "image_turned"
     #: Many images are blurred, and no target is read in them.
     IMAGES_BLURRED = "images_blurred"
+    #: The height of a sensor on a vehicle is hardly told, since it turns about its vertical alone.
+    HEIGHT_WEAK = "height_weak"
     #: The carriers hardly turned, or hardly about a second axis.
     LITTLE_ROTATION = "little_rotation"
     #: A frame rests on so few measurements that a wrong one would not show.
@@ -163,6 +167,7 @@ _MADE_BY = {
     Ground.INTRINSICS_DOUBTED: _MADE_BY_A_MISTAKE | _NOT_DETERMINED | _OF_SIZES,
     # How well poses are known that are not determined is no question.
     Ground.NOT_UNIQUE: _UNASKED,
+    Ground.KNOWN_TO_NOTHING: _UNASKED,
     **dict.fromkeys((Ground.NO_SCALE, Ground.NO_COVARIANCE), frozenset({Ground.NOT_CHECKED})),
 }
 _CALIBRATE_INTRINSICS = (
@@ -185,6 +190,10 @@ _ADVICE = {
     Ground.NO_BOUND: "check the units and the frames of A and B, then calibrate again",
     Ground.NOT_CERTIFIED: "measure with more and larger rotations, then calibrate again",
     Ground.NOT_UNIQUE: "turn the carriers about at least two different axes and measure again, or fix what you know",
+    Ground.KNOWN_TO_NOTHING: (
+        "use nothing of the named frames but what is named as known; turn the carriers by 30 degrees and more about "
+        "two axes, and check what the measurements disagree in (the carriers' poses and their drift, sizes, intrinsics)"
+    ),
     Ground.POSE_DOUBTED: (
         "correct the stated pose of the named frame, or do not state it (leave out its prior, or do not fix it); if "
         "you are sure of it, check that the frame has not moved and has its right name"
@@ -234,6 +243,11 @@ _ADVICE = {
     ),
     Ground.IMAGES_BLURRED: (
         "stand still for each image, or expose for a shorter time with more light, or focus the lens, and measure again"
+    ),
+    Ground.HEIGHT_WEAK: (
+        "measure the height of the named sensor by hand and put it in the place of this one, or state it (with "
+        "Problem.add_prior, or in a rig file of odometries under given: heights_m), or drive over ramps, so that the "
+        "vehicle pitches and rolls"
     ),
     Ground.LITTLE_ROTATION: "turn the carriers by 30 degrees and more, about two different axes, and measure again",
     Ground.FEW_MEASUREMENTS: "measure each named frame at three poses or more, or do not use its pose",

@@ -94,6 +94,24 @@ def convert(
                     f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE; or "
                     "describe the folder in a rig file: --rig FILE"
                 )
-            said = f"{rw.logs.convert_ros_bag(source, output)} messages"
+            said = f"{rw.logs.convert_ros_bag(source, output)} messages{messages_not_read(output)}"
     say(f"Written to {shown_path(output)}: {said}.\nNext: gtsam-rwhec init {shown_path(output)} -o rig.yaml")
     return ExitStatus.DONE
+
+
+#: At most so many types of messages are named.
+MOST_NAMED = 8
+
+
+def messages_not_read(log: Path) -> str:
+    """The types of a log's messages that the next step passes over, as a clause; empty if it reads all."""
+    counts: dict[str, int] = {}
+    with rw.logs.open_log(log) as opened:
+        for topic in opened.topics():
+            if topic.unreadable:
+                counts[topic.schema] = counts.get(topic.schema, 0) + topic.count
+    if not counts:
+        return ""
+    named = ", ".join(f"{schema} ({counts[schema]})" for schema in sorted(counts)[:MOST_NAMED])
+    more = f" and {len(counts) - MOST_NAMED} more types" if len(counts) > MOST_NAMED else ""
+    return f". The next step does not read {named}{more}; they are kept in the log"

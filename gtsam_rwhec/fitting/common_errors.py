@@ -7,7 +7,8 @@ determinant gains log |I + t^2 P'P / s^2|.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,47 +16,94 @@ from gtsam_rwhec.geometry.poses import Array
 
 
 @dataclass(frozen=True, eq=False)
-class CommonErrors:
-    """Products of each image's patterns P with its rows: by the unknowns (V, k, d), A, the residual, and themselves."""
+class OfStack:
+    """Products of the patterns P of V images of a target by a sensor with their rows.
+
+    An image's rows have few of the unknowns: of d columns only ``columns`` (m,) are stored.
+    """
 
     instant: np.ndarray
-    of_unknowns: Array
-    of_A: Array
-    of_residual: Array
-    P: Array
+    columns: np.ndarray
+    of_unknowns: Array  #: (V, k, m)
+    of_A: Array  #: (V, k, 6)
+    of_residual: Array  #: (V, k)
+    P: Array  #: (V, k, k)
+
+    @cached_property
+    def is_once(self) -> bool:
+        """Whether no two of the images are of one instant."""
+        return len(np.unique(self.instant)) == len(self.instant)
+
+    def first(self, number: int) -> OfStack:
+        """The products of the first patterns."""
+        of_unknowns, of_A, of_residual = (each[:, :number] for each in (self.of_unknowns, self.of_A, self.of_residual))
+        return replace(self, of_unknowns=of_unknowns, of_A=of_A, of_residual=of_residual, P=self.P[:, :number, :number])
+
+    def add(self, sums: Array, values: Array) -> None:
+        """Add values of the images (V, ...) to sums by instant (I, ...)."""
+        if self.is_once:
+            sums[self.instant] += values
+        else:
+            np.add.at(sums, self.instant, values)
+
+    def add_columns(self, sums: Array, values: Array) -> None:
+        """Add values of the images by their own unknowns (V, 6, m) to sums by instant and all unknowns (I, 6, d)."""
+        at = self.instant[:, None, None], np.arange(6)[:, None], self.columns
+        if self.is_once:
+            sums[at] += values
+        else:
+            np.add.at(sums, at, values)
+
+
+@dataclass(frozen=True, eq=False)
+class CommonErrors:
+    """The products of all stacks' images."""
+
+    stacks: tuple[OfStack, ...]
 
     def first(self, number: int) -> CommonErrors:
         """Those of the first patterns."""
-        of_unknowns, of_A, of_residual = (each[:, :number] for each in (self.of_unknowns, self.of_A, self.of_residual))
-        return CommonErrors(self.instant, of_unknowns, of_A, of_residual, self.P[:, :number, :number])
+        return CommonErrors(tuple(stack.first(number) for stack in self.stacks))
 
-    def inverse(self, common_px: float, s2: float) -> tuple[Array, float]:
-        """K (V, k, k), and the gain of the logarithm of the determinant."""
-        inner = np.eye(self.P.shape[1]) + self.P * (common_px**2 / s2)
-        return np.linalg.inv(inner) * common_px**2, float(np.linalg.slogdet(inner)[1].sum())
+    def inverse(self, common_px: float, s2: float) -> tuple[list[Array], float]:
+        """K (V, k, k) of each stack, and the gain of the logarithm of the determinant."""
+        P = np.concatenate([stack.P for stack in self.stacks])
+        inner = np.eye(P.shape[1]) + P * (common_px**2 / s2)
+        K, ends = np.linalg.inv(inner) * common_px**2, np.cumsum([len(stack.P) for stack in self.stacks])[:-1]
+        return np.split(K, ends), float(np.linalg.slogdet(inner)[1].sum())
 
     def twice_by_log(self, common_px: float, s2: float, theta: Array, covariance: Array, carriers: Carriers) -> float:
         """The derivative of -2 log L by log t: twice their number less their squares, as estimated and as uncertain.
 
-        ``theta`` (d,) with its covariance (d, d).
+        ``theta`` (d,) with its covariance (d, d). An image's errors are c = -(e + E theta + D a), a = -K b - KC theta.
         """
-        K, _ = self.inverse(common_px, s2)
-        E, D, e = K @ self.of_unknowns / s2, K @ self.of_A / s2, (K @ self.of_residual[..., None])[..., 0] / s2
-        at = self.instant
-        c = -(e + E @ theta + (D @ carriers.a[at][..., None])[..., 0])
-        E = E - D @ carriers.KC[at]
-        variance = np.diagonal(K, axis1=1, axis2=2) + ((D @ carriers.K[at]) * D).sum(axis=2)
-        variance = variance + ((E @ covariance) * E).sum(axis=2)
-        return 2.0 * float(c.size - (c**2 + variance).sum() / common_px**2)
+        squares, number = 0.0, 0
+        of_a = carriers.K + carriers.KC_covariance @ carriers.KC.transpose(0, 2, 1)
+        for stack, K in zip(self.stacks, self.inverse(common_px, s2)[0], strict=True):
+            at, own = stack.instant, stack.columns
+            E, D = K @ stack.of_unknowns / s2, K @ stack.of_A / s2
+            e = (K @ stack.of_residual[..., None])[..., 0] / s2
+            c = -(e + E @ theta[own] + (D @ carriers.a[at][..., None])[..., 0])
+            with_a = carriers.KC_covariance[:, :, own][at].transpose(0, 2, 1)  # (V, m, 6)
+            variance = np.diagonal(K, axis1=1, axis2=2) + ((D @ of_a[at]) * D).sum(axis=2)
+            variance = variance + ((E @ covariance[np.ix_(own, own)]) * E).sum(axis=2)
+            variance = variance - 2.0 * ((E @ with_a) * D).sum(axis=2)
+            squares += float((c**2 + variance).sum())
+            number += c.size
+        return 2.0 * (number - squares / common_px**2)
 
 
 @dataclass(frozen=True, eq=False)
 class Carriers:
-    """The carriers' errors a (I, 6) as they are estimated, a = -K b - KC theta, with K (I, 6, 6) and KC (I, 6, d)."""
+    """The carriers' errors a (I, 6) as they are estimated, a = -K b - KC theta, with K (I, 6, 6) and KC (I, 6, d).
+
+    And KC times theta's covariance.
+    """
 
     a: Array
     K: Array
     KC: Array
+    KC_covariance: Array
 
 
 def whitened(rows: Array, P: Array) -> Array:

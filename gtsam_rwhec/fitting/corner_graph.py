@@ -1,4 +1,4 @@
-"""The GTSAM graph of corners: a factor an image, and one for all images of a pair, computed for all of them at once.
+"""The GTSAM graph of corners: a factor an instant, and one for all images of a pair, computed for all of them at once.
 
 Variables
 
@@ -9,13 +9,14 @@ Variables
     p      how far a board's corners are off their places, held by a prior; absent where they are not free
     t      the offset of a sensor's clock, held by a weak prior; absent where it is not free
 
-An image's factor has the six linear rows in which its A is; what the other rows say has no A, and is summed over all
-images of a target by a sensor (`row_sums`). GTSAM asks each factor by itself, in any order: all rows are computed when
-the first factor is asked at new values.
+An instant's factor has of each of its images the six linear rows in which A is; what the other rows say has no A, and
+is summed over all images of a target by a sensor (`row_sums`). GTSAM asks each factor by itself, in any order: all rows
+are computed when the first factor is asked at new values. It costs much to ask a factor in Python: images share one.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,6 +32,8 @@ from gtsam_rwhec.geometry.poses import Array
 LETTER = 56
 #: Letters of the variables that are vectors; the others are poses.
 _VECTORS = frozenset(map(ord, "kbtp"))
+#: A factor has at most so many images of an instant: most of its derivatives are zeros, and they are stored.
+AT_ONCE = 32
 
 
 def key_of(letter: str, number: int) -> int:
@@ -53,7 +56,8 @@ class CornerGraph:
     keys: dict[tuple[str, str], int] = field(init=False)  #: By a variable's letter and name; without those of A
     _at: dict[int, bytes] = field(init=False, default_factory=dict)
     _point: Point = field(init=False)
-    _errors: list[Array] = field(init=False, default_factory=list)
+    #: (V,) of each stack: the squared length of each image's errors
+    _squares: list[Array] = field(init=False, default_factory=list)
     _rows: list[FewRows] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
@@ -67,10 +71,14 @@ class CornerGraph:
         self._keys = [*self.keys.values(), *(key_of("a", i) for i in carriers)]
         self.graph = gtsam.NonlinearFactorGraph()
         self._add_priors()
+        images: dict[int, list[tuple[int, int]]] = defaultdict(list)
         for s, stack in enumerate(model.stacks):
             self._add_pair(s)
-            for v in range(len(stack.instant) if model.A_noise is not None else 0):
-                self._add_image(s, v)
+            for v, instant in enumerate(stack.instant.tolist() if model.A_noise is not None else ()):
+                images[instant].append((s, v))
+        for instant, of_instant in images.items():
+            for first in range(0, len(of_instant), AT_ONCE):
+                self._add_images(instant, of_instant[first : first + AT_ONCE])
 
     def values(self, point: Point) -> gtsam.Values:
         """A point as GTSAM's values."""
@@ -159,7 +167,7 @@ class CornerGraph:
             self._come_to(self._keys, values)
             if jacobians is None:
                 length = np.zeros(size)
-                length[0] = np.linalg.norm(self._errors[s]) if exact else 0.0
+                length[0] = np.sqrt(self._squares[s].sum()) if exact else 0.0
                 return length
             rows = self._rows_there()[s]
             for i, name in enumerate(variables):
@@ -169,23 +177,32 @@ class CornerGraph:
         keys = [self.keys[at] for at in variables.values()]
         self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
 
-    def _add_image(self, s: int, v: int) -> None:
-        variables = self._variables_of(s)
-        keys = [*(self.keys[at] for at in variables.values()), key_of("a", int(self.model.stacks[s].instant[v]))]
+    def _add_images(self, instant: int, images: list[tuple[int, int]]) -> None:
+        """One factor for images (s, v) of an instant."""
+        variables = [self._variables_of(s) for s, _ in images]
+        names = list(dict.fromkeys(at for of_image in variables for at in of_image.values()))
+        places = [[(names.index(at), name) for name, at in of_image.items()] for of_image in variables]
+        keys, widths = [*(self.keys[at] for at in names), key_of("a", instant)], [self._widths[at] for at in names]
+        size = 6 * len(images)
 
         def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
             self._come_to(keys, values)
+            residual = np.zeros(size)
             if jacobians is None:
-                length = np.zeros(6)
-                length[0] = np.linalg.norm(self._errors[s][v])
-                return length
-            rows = self._rows_there()[s]
-            for i, name in enumerate(variables):
-                jacobians[i] = rows.of_images[v][:, rows.columns[name]]
-            jacobians[len(variables)] = rows.by_A[v]
-            return np.asarray(rows.of_images[v][:, -1])
+                residual[0] = np.sqrt(sum(self._squares[s][v] for s, v in images))
+                return residual
+            blocks, by_A = [np.zeros((size, width)) for width in widths], np.zeros((size, 6))
+            for j, (s, v) in enumerate(images):
+                rows, own = self._rows_there()[s], slice(6 * j, 6 * j + 6)
+                of_image = rows.of_images[v]
+                for i, name in places[j]:
+                    blocks[i][own] = of_image[:, rows.columns[name]]
+                by_A[own], residual[own] = rows.by_A[v], of_image[:, -1]
+            for i, block in enumerate([*blocks, by_A]):
+                jacobians[i] = block
+            return residual
 
-        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error))
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
 
     def _rows_there(self) -> list[FewRows]:
         """The linear rows at the values last visited."""
@@ -200,7 +217,7 @@ class CornerGraph:
             if key not in at or at[key] != _value(values, key):
                 self._point = self.point(values)
                 self._at = {key: _value(values, key) for key in self._keys}
-                self._errors, self._rows = self.model.errors(self._point), []
+                self._squares, self._rows = [(e**2).sum(axis=1) for e in self.model.errors(self._point)], []
                 break
 
 

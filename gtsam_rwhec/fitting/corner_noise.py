@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors
+from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.geometry.poses import Array
@@ -135,22 +135,18 @@ class Reduced:
             g[where] += squares[:-1, -1]
             rr += float(squares[-1, -1])
             number += 2.0 * float(weights[stack.known].sum())
-            of_view = np.zeros((len(stack.instant), 6, size))
-            of_view[:, :, where] = of_A[..., :-1]
-            np.add.at(C, stack.instant, of_view)
-            np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
-            np.add.at(b, stack.instant, of_A[..., -1])
             P = patterns(model, stack, point) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
-            of_theta = np.zeros((*of_P.shape[:2], size))
-            of_theta[:, :, where] = of_P[..., :-1]
-            common.append((stack.instant, of_theta, Pt @ J_A, of_P[..., -1], Pt @ P))
+            shared = OfStack(stack.instant, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P)
+            shared.add_columns(C, of_A[..., :-1])
+            shared.add(M, J_A.transpose(0, 2, 1) @ J_A)
+            shared.add(b, of_A[..., -1])
+            common.append(shared)
         prior, off = np.zeros((size, size)), np.zeros(size)
         for at, of in model.priors(point).items():
             prior[slots[at], slots[at]] = of.precision
             off[slots[at]] = vectors[at] - of.mean
-        shared = CommonErrors(*map(np.concatenate, zip(*common, strict=True)))
-        return Reduced(slots, G, g, C, M, b, rr, number, prior, off, shared)
+        return Reduced(slots, G, g, C, M, b, rr, number, prior, off, CommonErrors(tuple(common)))
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
         """Restricted: theta integrated out; and its derivatives by the logarithms of the deviations.
@@ -163,8 +159,8 @@ class Reduced:
         its variance (Patterson and Thompson's equations).
         """
         s2, S = noise.corner_px**2, noise.carrier
-        sums, _ = self.without_common(noise)
-        at = self.without_carriers(noise)
+        sums, log_det = self.without_common(noise)
+        at = sums.eliminated(noise, log_det)
         H, h, K, KC, Kb = at.H + self.prior, at.h + self.prior @ self.prior_off, at.K, at.KC, at.Kb
         size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
         sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
@@ -177,8 +173,9 @@ class Reduced:
         free = len(H) - float((self.prior * inverse).sum())
         squares = sums.rr + 2.0 * float(sums.g @ theta) + float(theta @ sums.G @ theta)
         gradient, a = np.zeros(4), -(Kb + KC @ theta)
+        KC_inverse = (KC.reshape(-1, len(H)) @ inverse).reshape(KC.shape)
         if S is not None:
-            variances = np.diagonal(K, axis1=1, axis2=2) + np.einsum("nid,de,nie->ni", KC, inverse, KC, optimize=True)
+            variances = np.diagonal(K, axis1=1, axis2=2) + (KC_inverse * KC).sum(axis=2)
             squares += float(np.einsum("ni,nij,nj->", a, sums.M, a)) + 2.0 * float(
                 (a * (sums.b + sums.C @ theta)).sum()
             )
@@ -188,7 +185,7 @@ class Reduced:
         # with t / s as it is, the sums without common errors are those of white noise
         gradient[0] = 2.0 * (self.count - squares / s2 - free)
         if noise.common_px:
-            gradient[3] = self.common.twice_by_log(noise.common_px, s2, theta, inverse, Carriers(a, K, KC))
+            gradient[3] = self.common.twice_by_log(noise.common_px, s2, theta, inverse, Carriers(a, K, KC, KC_inverse))
             gradient[0] -= gradient[3]
         return value, gradient
 
@@ -202,32 +199,38 @@ class Reduced:
         if not noise.common_px:
             return self, 0.0
         of, s2 = self.common, noise.corner_px**2
-        K, log_det = of.inverse(noise.common_px, s2)
-        KJ, KA, Kr = K @ of.of_unknowns / s2, K @ of.of_A / s2, (K @ of.of_residual[..., None])[..., 0] / s2
-        C, M, b, d = self.C.copy(), self.M.copy(), self.b.copy(), len(self.G)
-        to_A = of.of_A.transpose(0, 2, 1)
-        np.subtract.at(C, of.instant, to_A @ KJ)
-        np.subtract.at(M, of.instant, to_A @ KA)
-        np.subtract.at(b, of.instant, (to_A @ Kr[..., None])[..., 0])
-        flat = of.of_unknowns.reshape(-1, d)
-        G, g = self.G - flat.T @ KJ.reshape(-1, d), self.g - flat.T @ Kr.ravel()
-        return replace(self, G=G, g=g, C=C, M=M, b=b, rr=self.rr - float((of.of_residual * Kr).sum())), log_det
+        inverses, log_det = of.inverse(noise.common_px, s2)
+        G, g, C, M, b, rr = self.G.copy(), self.g.copy(), self.C.copy(), self.M.copy(), self.b.copy(), self.rr
+        for stack, K in zip(of.stacks, inverses, strict=True):
+            KJ, KA, Kr = K @ stack.of_unknowns / s2, K @ stack.of_A / s2, K @ stack.of_residual[..., None] / s2
+            to_A, flat = stack.of_A.transpose(0, 2, 1), stack.of_unknowns.reshape(-1, len(stack.columns))
+            stack.add_columns(C, -to_A @ KJ)
+            stack.add(M, -to_A @ KA)
+            stack.add(b, -(to_A @ Kr)[..., 0])
+            G[np.ix_(stack.columns, stack.columns)] -= flat.T @ KJ.reshape(flat.shape)
+            g[stack.columns] -= flat.T @ Kr.ravel()
+            rr -= float((stack.of_residual * Kr[..., 0]).sum())
+        return replace(self, G=G, g=g, C=C, M=M, b=b, rr=rr), log_det
 
     def without_carriers(self, noise: Noise) -> WithoutCarriers:
         """The sums of the measurements under a noise, the carriers' errors eliminated."""
-        s2, S = noise.corner_px**2, noise.carrier
         sums, log_det = self.without_common(noise)
-        H, h, rr, log_det = sums.G / s2, sums.g / s2, sums.rr / s2, log_det + self.count * np.log(s2)
+        return sums.eliminated(noise, log_det)
+
+    def eliminated(self, noise: Noise, log_det: float) -> WithoutCarriers:
+        """``without_carriers`` of sums in which images' corners share nothing, with what these gained."""
+        s2, S = noise.corner_px**2, noise.carrier
+        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, log_det + self.count * np.log(s2)
         K, KC, Kb = np.zeros_like(self.M), np.zeros_like(self.C), np.zeros_like(self.b)
         if S is not None:
             # K = D (I + D M D / s2)^-1 D, D = diag(S)
-            inner = np.eye(6) + sums.M * S[:, None] * S / s2
+            inner = np.eye(6) + self.M * S[:, None] * S / s2
             K = np.linalg.inv(inner) * S[:, None] * S
-            KC, Kb = K @ sums.C / s2, (K @ sums.b[..., None])[..., 0] / s2
-            flat = sums.C.reshape(-1, len(H))
+            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
+            flat = self.C.reshape(-1, len(H))
             H = H - flat.T @ KC.reshape(flat.shape) / s2
             h = h - flat.T @ Kb.ravel() / s2
-            rr -= float((sums.b * Kb).sum()) / s2
+            rr -= float((self.b * Kb).sum()) / s2
             log_det += float(np.linalg.slogdet(inner)[1].sum())
         return WithoutCarriers(H, h, rr, log_det, K, KC, Kb)
 

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gtsam_rwhec.fitting.common_errors import CommonErrors
 from gtsam_rwhec.fitting.corner_model import Model
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
 from gtsam_rwhec.fitting.corner_patterns import PATTERNS
@@ -36,10 +37,12 @@ def covariance_of_bias(refined: CornersRefined) -> Array:
 def gradients_of_bias(model: Model, reduced: Reduced, noise: Noise) -> Array:
     """h (patterns, d) of one standard deviation of each pattern, of all targets together, in place of the residuals."""
     every, found = reduced.patterns, []
-    px = np.concatenate([np.full(len(stack.instant), model.bias_px[stack.target]) for stack in model.stacks])
+    px = [model.bias_px[stack.target] for stack in model.stacks]
     for k in range(len(PATTERNS)):
-        b = np.zeros_like(reduced.b)
-        np.add.at(b, every.instant, px[:, None] * every.of_A[:, k])
-        of_bias = replace(every, of_residual=px[:, None] * every.P[..., k])
-        found.append(replace(reduced, g=px @ every.of_unknowns[:, k], b=b, patterns=of_bias).without_carriers(noise).h)
+        g, b, of_bias = np.zeros_like(reduced.g), np.zeros_like(reduced.b), []
+        for stack, of in zip(every.stacks, px, strict=True):
+            stack.add(b, of * stack.of_A[:, k])
+            g[stack.columns] += of * stack.of_unknowns[:, k].sum(axis=0)
+            of_bias.append(replace(stack, of_residual=of * stack.P[..., k]))
+        found.append(replace(reduced, g=g, b=b, patterns=CommonErrors(tuple(of_bias))).without_carriers(noise).h)
     return np.array(found)

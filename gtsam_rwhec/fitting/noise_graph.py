@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from rwhec_factors.batch import robot_world_hand_eye_effects_factors
+from rwhec_factors.batch import Together, robot_world_hand_eye_effects_factors
 
 from gtsam_rwhec.errors import NotConvergedWarning
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns
@@ -154,6 +154,7 @@ def _add_measurements(
     instants, span = model.rows.instants, effects.span
     first = np.cumsum([0] + [item.count for item in data])
     pair = np.searchsorted(first, instants.order, side="right") - 1
+    together = Together()
     for i, item in enumerate(data):
         residuals = item.at(state.offsets_s.get(item.pair.sensor, 0.0))
         rows = np.flatnonzero(pair == i)
@@ -171,6 +172,7 @@ def _add_measurements(
             scale_key=variables.scale_key(item.pair),
             time_offset_key=variables.offset_key(item.pair),
             twists=None if residuals.twists is None else residuals.twists[place],
+            together=together,
         )
         for factor in factors:
             graph.add(factor)

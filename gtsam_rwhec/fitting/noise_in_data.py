@@ -292,7 +292,7 @@ def mixed(
         shift = _shifts(task, poses)
         finite += (shift * variances) @ shift.T
     if is_drift_untried(task, found):
-        wider = widening(task, found)
+        wider = widening(task, found, finite)
         finite = finite * wider[:, None] * wider
     return replace(task.layout, finite=finite), mixture, constant
 
@@ -366,8 +366,11 @@ def _distance(poses: dict[str, gtsam.Pose3]) -> float:
 BLOCKS = 10
 
 
-def widening(task: Task, found: Settled) -> Array:
-    """By how much (d,) the standard deviations of the unknowns are too small, as blocks of time say; 1 at least."""
+def widening(task: Task, found: Settled, claimed: Array) -> Array:
+    """By how much (d,) the standard deviations of the unknowns are too small, as blocks of time say; 1 at least.
+
+    ``claimed`` (d, d) is their covariance as it is: errors of the configuration may have widened it already.
+    """
     rows, basis, count = found.model.rows, found.model.basis, task.instants.count
     wider = np.ones(len(task.layout.unit))
     if count < 2 * BLOCKS:
@@ -383,11 +386,10 @@ def widening(task: Task, found: Settled) -> Array:
     np.add.at(scores, rows.instants.index * BLOCKS // count, np.einsum("nip,ni->np", J, r))
     scores -= scores.mean(axis=0)
     by_blocks = basis @ (H @ (scores.T @ scores) @ H) @ basis.T * (BLOCKS / (BLOCKS - 1.0))
-    independent = basis @ H @ basis.T
     for place in task.layout.slots.values():
         whole = np.arange(len(wider))[place]
         for part in np.array_split(whole, max(len(whole) // 3, 1)):
-            variance = float(np.trace(independent[np.ix_(part, part)]))
+            variance = float(np.trace(claimed[np.ix_(part, part)]))
             if variance > 0.0:
                 ratio = float(np.trace(by_blocks[np.ix_(part, part)])) / variance
                 wider[part] = np.sqrt(max(ratio, 1.0))

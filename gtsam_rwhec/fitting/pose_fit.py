@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from rwhec_factors.batch import BatchResiduals, Linearization
+from rwhec_factors.batch import Linearization, Placed, linearized_together, residuals_together
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import NoiseError, NotConvergedWarning, WeightsWarning
@@ -225,24 +224,25 @@ class GeodesicModel:
 
 def linearized(data: list[PairData], variables: Variables, state: State) -> dict[Pair, Linearization]:
     """Residuals and Jacobians of pairs at an estimate."""
-    return {item.pair: here.linearize(*at) for item, here, at in _placed(data, variables, state)}
+    found = linearized_together(_placed(data, variables, state))
+    return {item.pair: at for item, at in zip(data, found, strict=True)}
 
 
 def residuals(data: list[PairData], variables: Variables, state: State) -> list[Array]:
     """Residuals (N, 6) of pairs alone."""
-    return [here.residuals(*at) for _, here, at in _placed(data, variables, state)]
+    return residuals_together(_placed(data, variables, state))
 
 
-def _placed(
-    data: list[PairData], variables: Variables, state: State
-) -> Iterator[tuple[PairData, BatchResiduals, tuple[Array, Array, float, float]]]:
+def _placed(data: list[PairData], variables: Variables, state: State) -> list[Placed]:
     """Each pair with its residuals about an estimate, and X, Y, the scale and the offset there."""
     frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
+    found = []
     for item in data:
         scale = variables.scale_of_pair.get(item.pair)
         offset_s = state.offsets_s.get(item.pair.sensor, 0.0)
         alpha = 1.0 if scale is None else state.scales[scale]
-        yield item, item.at(offset_s), (frames[item.pair.target], frames[item.pair.sensor], alpha, offset_s)
+        found.append(Placed(item.at(offset_s), frames[item.pair.target], frames[item.pair.sensor], alpha, offset_s))
+    return found
 
 
 @dataclass(frozen=True)
@@ -311,6 +311,8 @@ Model = GeodesicModel | ChordalModel
 MAX_ROUNDS = 30
 #: A variance factor is settled when a round changes it by no more than this part.
 SETTLED = 1e-4
+#: While weights change, the last step of an optimum lowers the cost by less than this share: they do not feel it.
+ROUGHLY = 1e-2 * SETTLED
 #: A time offset is settled when a round changes it by no more than this, s.
 OFFSET_SETTLED_S = 1e-6
 
@@ -357,6 +359,13 @@ def fit(
         optimum = optimise(graph, values, options.max_iterations)
         iterations += optimum.iterations
         state, values = variables.state(optimum.values), optimum.values
+
+    def information_at(graph: gtsam.NonlinearFactorGraph, state: State, values: gtsam.Values) -> Array:
+        if not model.has_constant_weights:
+            graph = model.graph(state, factors, "none")
+            graphs.add_priors(graph, variables, problem, options.residual)
+        return information_of(graph, values, variables) / model.inefficiency(state, factors)
+
     for round_number in range(MAX_ROUNDS):
         if round_number:
             tell(f"refining: the weights settle, round {round_number + 1} of at most {MAX_ROUNDS}")
@@ -364,13 +373,10 @@ def fit(
         graphs.add_priors(without_loss, variables, problem, options.residual)
         graph = gtsam.NonlinearFactorGraph(without_loss)
         graphs.add_fixed(graph, variables, problem)
-        optimum = optimise(graph, values, options.max_iterations)
+        optimum = optimise(graph, values, options.max_iterations, share=ROUGHLY if estimates else 0.0)
         iterations += optimum.iterations
         before, state, values = state, variables.state(optimum.values), optimum.values
-        if not model.has_constant_weights:
-            without_loss = model.graph(state, factors, "none")
-            graphs.add_priors(without_loss, variables, problem, options.residual)
-        information = information_of(without_loss, values, variables) / model.inefficiency(state, factors)
+        information = information_at(without_loss, state, values)
         settled = not model.reweighs or round_number > 0
         # A time offset is linearised at its value when the round began.
         settled = settled and all(
@@ -399,6 +405,11 @@ def fit(
             NotConvergedWarning,
             stacklevel=5,
         )
+    if estimates:  # the last digits
+        optimum = optimise(graph, values, options.max_iterations)
+        iterations += optimum.iterations
+        state, values = variables.state(optimum.values), optimum.values
+        information = information_at(without_loss, state, values)
     if optimum.iterations >= options.max_iterations:
         warnings.warn(
             f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "

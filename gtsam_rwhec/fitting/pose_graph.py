@@ -8,7 +8,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from rwhec_factors.batch import robot_world_hand_eye_batch_factor
+from rwhec_factors.batch import Together, robot_world_hand_eye_batch_factor
 from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
 from rwhec_factors.measurement import pose_robot_world_hand_eye_factor, robot_world_hand_eye_factor
 from rwhec_factors.priors import position_prior_factor, rotation_prior_factor, shifted_pose_prior_factor
@@ -144,6 +144,7 @@ def add_batches(
     robust: Robust = "none",
 ) -> None:
     """One geodesic factor for each pair, in which every measurement has its own weight; there is no loss."""
+    together = Together()
     for item in data:
         graph.add(
             robot_world_hand_eye_batch_factor(
@@ -154,6 +155,7 @@ def add_batches(
                 scale_key=variables.scale_key(item.pair),
                 time_offset_key=variables.offset_key(item.pair),
                 twists=item.residuals.twists,
+                together=together,
             )
         )
 
@@ -273,9 +275,15 @@ class Optimum:
 
 
 def optimise(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, max_iterations: int, held: Mapping[int, int] | None = None
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    max_iterations: int,
+    held: Mapping[int, int] | None = None,
+    share: float = 0.0,
 ) -> Optimum:
     """The optimum, to the last digits, by Gauss and Newton's steps; by Levenberg and Marquardt's where these fail.
+
+    With a ``share`` the last step is one that lowers the cost by less than this share of it.
 
     The start is nearly optimal, and a call of a factor in Python costs the most: GTSAM's optimisers call more often.
     Variables of ``held``, key and dimension, take no longer steps than ``HELD`` allows: where directions are free.
@@ -296,7 +304,7 @@ def optimise(
         if not after <= cost * (1.0 + 1e-12) + 1e-12:
             break
         values, cost = moved, after
-        if gain < LAST_STEP:
+        if gain < max(LAST_STEP, share * cost):
             return Optimum(values, cost, iteration)
     else:
         return Optimum(values, cost, max_iterations)

@@ -29,6 +29,7 @@ from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, MARK, NO_NOIS
 from gtsam_rwhec.results.derived import scalars_of
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_judgement import contradicted, contradicted_names, judge
+from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.free_directions import FreeDirection
 from gtsam_rwhec.solver.solution import Solution
 
@@ -80,6 +81,7 @@ def print_calibration(
         free = solution.identifiability.free_directions
     report = ShortReport(
         calibration.judgement,
+        "" if solution is None or calibration.judgement.is_of_the_reading else proof_line(solution.certificate),
         advice_of(free, log, calibration.judgement),
         tuple(calibration.points.values()),
         sentences=tuple((note, "yellow") for note in calibration.notes),
@@ -137,8 +139,19 @@ def print_solution(
     advice += advice_of(solution.identifiability.free_directions, judgement=judgement)
     scale = () if solution.scale_mode == "known" else (scale_sentence(solution),)
     sentences = tuple((words, "") for words in (*scale, certificate_sentence(solution.certificate)))
-    report = ShortReport(judgement, tuple(advice), (), (_solved_poses(solution),), sentences)
+    report = ShortReport(judgement, "", tuple(advice), (), (_solved_poses(solution),), sentences)
     report.print(console, lines=lines, page=page, whole=whole)
+
+
+def proof_line(certificate: Certificate) -> str:
+    """What is proven of the certified answer, on one line; empty where nothing is, of which the verdict speaks.
+
+    It says nothing of how well the poses are known: an answer may be the best of bad measurements.
+    """
+    if not certificate.is_optimal:
+        return ""
+    alike = "" if certificate.is_certified else "; others fit as well"
+    return f"Proven: no other answer fits these measurements better (gap {certificate.relative_gap:.0e}){alike}."
 
 
 def _print_everything(console: Console, shown: ShownResult, more: Sequence[Section] = ()) -> None:

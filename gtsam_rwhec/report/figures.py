@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -64,6 +65,8 @@ ON_WHITE = {"figure.facecolor": "white", "axes.facecolor": "white"}
 FILE_DPI = 200
 #: A title or an axis has room for a name of this many characters.
 LONGEST_NAME = 28
+#: A logarithmic axis shows at most so many powers of ten, and any other axis so many ticks.
+DECADES, MOST_TICKS = 15, 200
 #: What drawing may raise on numbers that no axis can show.
 CANNOT_DRAW = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
@@ -115,20 +118,43 @@ def _drawn(
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # axes with too many ticks have fewer, and say nothing
-    with style.context(["default", STYLE, dict(style_too)]):
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of what it draws otherwise no reader needs to hear
+    with warnings.catch_warnings(), style.context(["default", STYLE, dict(style_too)]):
+        warnings.simplefilter("ignore")
         figure = Figure(figsize=size_in, layout="constrained", dpi=72 if form == "svg" else FILE_DPI)
         stream = io.BytesIO()
         # figure.savefig goes over everything twice.
         if form == "svg":
             svg = FigureCanvasSVG(figure)
             draw(figure)
+            bound_axes(figure)
             svg.print_svg(stream, metadata={"Date": None, "Creator": None})  # type: ignore[no-untyped-call]
         else:
             agg = FigureCanvasAgg(figure)
             draw(figure)
+            bound_axes(figure)
             agg.print_png(stream, metadata={"Software": None})  # type: ignore[no-untyped-call]
     return stream.getvalue()
+
+
+def bound_axes(figure: Figure) -> None:
+    """Show of a logarithmic axis the upper ``DECADES`` only, and at most ``MOST_TICKS`` ticks of any other.
+
+    A single value of 1e-200 makes 1601 ticks, each of which is laid out many times.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    for axes in figure.axes:
+        for axis, limit in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
+            low, high = sorted(map(float, axis.get_view_interval()))
+            if not (np.isfinite([low, high]).all()):
+                continue
+            if axis.get_scale() == "log":
+                if high > 0.0 and low < high * 10.0**-DECADES:
+                    ends = (high * 10.0**-DECADES, high)
+                    limit(*(ends if axis.get_view_interval()[0] <= axis.get_view_interval()[1] else ends[::-1]))
+            elif len(axis.get_majorticklocs()) > MOST_TICKS:
+                axis.set_major_locator(MaxNLocator(5))
 
 
 def shortened(text: str, most: int = LONGEST_NAME) -> str:

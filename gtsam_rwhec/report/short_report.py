@@ -77,6 +77,7 @@ class ShortReport:
     """What the short report says."""
 
     judgement: Judgement
+    proof: str = ""  #: What is proven of the answer, on one line beside the verdict
     advice: tuple[Styled, ...] = ()  #: What to do besides
     points: tuple[PointUncertainty, ...] = ()  #: How far off a point is, by sensor
     #: The poses, in the choices of columns that there are, the most telling one first
@@ -92,7 +93,7 @@ class ShortReport:
         room = _Room(console, lines)
         room.take(closing)
         verdict = _cut(room, str(self.judgement), math.floor(VERDICT_SHARE * lines))
-        room.take(verdict)
+        room.take(verdict, *([self.proof] if self.proof else []))
         all_poses = min((_height_of_all(room, poses) for poses in self.poses), default=0)
         poses_need = min(POSE_LINES, all_poses)
         most = max(min(ADVICE_LINES, room.left - poses_need - 2), room.left - all_poses - MOST_POINTS - 2)
@@ -106,6 +107,8 @@ class ShortReport:
         sentences = _first(room, self.sentences, most)
         room.take(*(words for words, _ in sentences))
         print_sentence(console, verdict, STYLES[self.judgement.verdict])
+        if self.proof:
+            print_sentence(console, self.proof)
         if advice:
             print_heading(console, "What to do", tight=True)
             for words, style in advice:

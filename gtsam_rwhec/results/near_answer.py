@@ -82,7 +82,7 @@ def near(
     worst = too_much(scatter_of_blocks(task, found))
     finite = basis @ mixture.covariance @ basis.T * (1.0 if worst is None else worst.ratio)
     if is_drift_untried(task, found):
-        wider = widening(task, found)
+        wider = widening(task, found, finite)
         finite = finite * wider[:, None] * wider
     frames = [
         rows

@@ -114,6 +114,8 @@ def boards_guessed(images: Iterable[ImageTopic]) -> list[Guess]:
     most: dict[tuple[str, tuple[int, int]], list[tuple[ImageTopic, BoardSeen]]] = {}
     for topic in images:
         for seen in topic.boards:
+            if _has_markers(seen, topic.seen):
+                continue  # a ChArUco board, which the tags propose
             most.setdefault((seen.board.family, seen.counts), []).append((topic, seen))
     guesses: dict[str, tuple[int, Guess]] = {}
     for (family, (across, down)), views in most.items():
@@ -140,6 +142,21 @@ def boards_guessed(images: Iterable[ImageTopic]) -> list[Guess]:
         if number > guesses.get(family, (0, None))[0]:
             guesses[family] = number, Guess(name, section, remark)
     return [guess for _, guess in guesses.values()]
+
+
+def _has_markers(board: BoardSeen, tags: Sequence[Sequence[SeenTag]]) -> bool:
+    """Whether tags are between a checkerboard's corners, in most images in which it was found: it is a ChArUco board.
+
+    ``tags`` are those of each image that was searched.
+    """
+    if not isinstance(board.board, Checkerboard):
+        return False
+    inside = 0
+    for image, corners in zip(board.images, board.corners_px, strict=True):
+        hull = cv2.convexHull(np.asarray(corners, dtype=np.float32))
+        middles = (tuple(map(float, tag.middle_px)) for tag in tags[image])
+        inside += sum(cv2.pointPolygonTest(hull, middle, False) > 0.0 for middle in middles) > 1
+    return 2 * inside > len(board.images)
 
 
 def with_size(section: TargetSection, factor: float) -> TargetSection:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import D, E, S, U, W, X, Y
 from numeric_jacobians import check_jacobians, graph_of
 from rwhec_factors import BatchResiduals, robot_world_hand_eye_effects_factor, robot_world_hand_eye_effects_factors, se3
+from rwhec_factors.batch import Together, robot_world_hand_eye_batch_factor
 
 N = 5
 
@@ -110,3 +113,42 @@ def test_wrong_coefficients_are_named() -> None:
         factor.unwhitenedError(short)
     with pytest.raises(KeyError, match="w3 is not in the values"):
         factor.unwhitenedError(without)
+
+
+def test_pairs_that_are_computed_together_are_what_they_are_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Factors of one graph: the same rows, in a single call of the residuals for all pairs and each set of values."""
+    rng = np.random.default_rng(4)
+    together, alone, joint = Together(), gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    values = gtsam.Values()
+    for k, symbol in enumerate((X(0), X(1), X(2), Y(0))):
+        values.insert(symbol, gtsam.Pose3.Expmap(rng.normal(size=6)))
+        if k < 3:
+            values.insert(S(k), np.array([1.0 + 0.1 * k]))
+    for k in range(3):
+        A, B = se3.expmap(rng.normal(size=(4 + k, 6))), se3.expmap(rng.normal(size=(4 + k, 6)))
+        arguments: dict[str, Any] = {"scale_key": S(k)}
+        if k == 1:
+            values.insert(D(0), np.array([0.02]))
+            arguments |= {"time_offset_key": D(0), "twists": rng.normal(size=(4 + k, 6))}
+        alone.add(robot_world_hand_eye_batch_factor(X(k), Y(0), A, B, np.eye(6), **arguments))
+        joint.add(robot_world_hand_eye_batch_factor(X(k), Y(0), A, B, np.eye(6), together=together, **arguments))
+    sizes: list[int] = []
+    linearize = BatchResiduals.linearize
+
+    def counted(batch: BatchResiduals, *at: Any) -> Any:
+        sizes.append(len(batch.A))
+        return linearize(batch, *at)
+
+    monkeypatch.setattr(BatchResiduals, "linearize", counted)
+    assert joint.error(values) == pytest.approx(alone.error(values), rel=1e-12)
+    whole = joint.linearize(values)
+    assert sizes == [4 + 5 + 6]
+    for i in range(3):
+        np.testing.assert_allclose(
+            whole.at(i).augmentedJacobian(), alone.linearize(values).at(i).augmentedJacobian(), atol=1e-12
+        )
+    # without the values of one pair the others are computed all the same
+    values.erase(X(2))
+    some = gtsam.NonlinearFactorGraph()
+    some.add(joint.at(0))
+    assert np.isfinite(some.error(values))

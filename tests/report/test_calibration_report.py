@@ -16,7 +16,7 @@ from rich.console import Console
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.report import certificate_sentence, print_calibration, print_refined, print_solution
-from gtsam_rwhec.report.calibration_report import deviation_cells, scales_and_clocks
+from gtsam_rwhec.report.calibration_report import deviation_cells, proof_line, scales_and_clocks
 from gtsam_rwhec.report.choices_section import log_blocks
 from gtsam_rwhec.report.report_blocks import Paragraph, Table, plain_text
 from gtsam_rwhec.report.terminal_report import TerminalTable
@@ -24,7 +24,7 @@ from gtsam_rwhec.results.log_history import TrackCount
 from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.residual_evidence import pooled_residual
 from gtsam_rwhec.simulate import Motion, Noise, general
-from gtsam_rwhec.solver.certificate import Basis, Cause
+from gtsam_rwhec.solver.certificate import Basis, Cause, Status
 from gtsam_rwhec.solver.region import Region
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
@@ -252,3 +252,11 @@ def test_a_count_of_a_log_has_no_unit() -> None:
     blocks = log_blocks(log.model_copy(update={"cleaning": cleaning}))
     said = [plain_text(block.words) for block in blocks if isinstance(block, Paragraph)]
     assert "Removed in cleaning: rotation off the pair's consensus: 2 (2 of tag-cam)." in said
+
+
+def test_the_proof_is_one_line_beside_the_verdict(solution: rw.Solution) -> None:
+    proven = solution.certificate
+    words = proof_line(proven)
+    assert re.fullmatch(r"Proven: no other answer fits these measurements better \(gap \de-\d+\)\.", words)
+    assert "others fit as well" in proof_line(dataclasses.replace(proven, status=Status.CERTIFIED_NOT_UNIQUE))
+    assert not proof_line(dataclasses.replace(proven, status=Status.GAP))

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 import gtsam_rwhec as rw
@@ -93,3 +94,48 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(rw.errors.FileFormatError, match="cannot be made a folder"):
         write_figures(page(), tmp_path / "file")
+
+
+@pytest.mark.parametrize("is_along_x", [True, False])
+def test_ticks_do_not_come_from_the_extent(is_along_x: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """One value of 1e-200 made 1601 ticks, laid out again and again, with a warning each time."""
+    figures: list[Figure] = []
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        small, one = (1e-200, 1.0), (0.0, 1.0)
+        axes.plot(*((small, one) if is_along_x else (one, small)), "o")
+        axes.set(xscale="log" if is_along_x else "linear", yscale="linear" if is_along_x else "log")
+        figures.append(figure)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "cannot be drawn" not in svg_figure(draw).in_page
+    (axes,) = figures[0].axes
+    axis = axes.xaxis if is_along_x else axes.yaxis
+    assert len(axis.get_majorticklocs()) + len(axis.get_minorticklocs()) < 300
+    assert not caplog.records
+
+
+def test_an_axis_with_a_tick_a_unit_has_few_where_its_values_are_large() -> None:
+    figures: list[Figure] = []
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot([0.0, 900.0], [0.0, 1.0])
+        axes.xaxis.set_major_locator(MultipleLocator(1.0))
+        figures.append(figure)
+
+    assert svg_figure(draw).in_page
+    assert len(figures[0].axes[0].get_xticks()) < 20
+
+
+def test_what_matplotlib_warns_of_reaches_nobody() -> None:
+    def draw(figure: Figure) -> None:
+        warnings.warn("constrained_layout not applied", UserWarning, stacklevel=2)
+        points(figure)
+
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        assert "cannot be drawn" not in svg_figure(draw).in_page
+    assert not heard

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from gtsam_rwhec.cameras import AprilGrid
-from gtsam_rwhec.cameras.targets import TagGrid
+from gtsam_rwhec.cameras.targets import Checkerboard, TagGrid
 from gtsam_rwhec.detect.tags import SeenTag
-from gtsam_rwhec.rig.guessed_targets import Kind, layout_of
+from gtsam_rwhec.rig.guessed_boards import BoardSeen
+from gtsam_rwhec.rig.guessed_targets import Kind, boards_guessed, layout_of
+from gtsam_rwhec.rig.log_contents import ImageTopic
 
 KINDS: tuple[Kind, ...] = ("charuco", "tag_grid")
 SQUARE = 0.5 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
@@ -68,3 +70,23 @@ def test_tags_in_the_room_are_no_board() -> None:
     assert layout_of(KINDS, range(12), views(corners)) is None
     assert layout_of(KINDS, range(35 // 2), views(charuco(7, 5, 0.75), number=1)) is None  # one image
     assert layout_of(KINDS, range(35 // 2), views(charuco(7, 5, 0.75), lost=12)) is None  # too few tags in each
+
+
+def test_a_charuco_board_is_no_checkerboard_too() -> None:
+    """Its inner corners are a checkerboard's, with markers between them."""
+    board = Checkerboard("board", 6, 4, 1.0)
+    lattice = 100.0 + 50.0 * np.stack(np.meshgrid(np.arange(6.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+    corners = [lattice + 10.0 * k for k in range(4)]
+    images = BoardSeen(board, tuple(range(4)), tuple(corners), (np.arange(24),) * 4)
+
+    def tags(beside_px: float) -> list[list[SeenTag]]:
+        middles = [np.array([125.0 + 100.0 * i + beside_px, 125.0 + 10.0 * k]) for k in range(4) for i in range(2)]
+        every = [SeenTag("aruco_5x5_1000", i, False, at, 30.0, at + 30.0 * SQUARE) for i, at in enumerate(middles)]
+        return [every[2 * k : 2 * k + 2] for k in range(4)]
+
+    topic = ImageTopic("/image", "sensor_msgs/msg/Image", 4, looked_at=4, seen=tags(0.0))
+    topic.boards = [images]
+    assert boards_guessed([topic]) == []
+    topic.seen = tags(1000.0)  # tags beside a checkerboard
+    (guess,) = boards_guessed([topic])
+    assert guess.section.type == "checkerboard"
