@@ -20,13 +20,14 @@ ROOT = Path(__file__).resolve().parent.parent
 #: What the sources may weigh. Lower a number when they become lighter; raise it only with a reason in the commit.
 BUDGET = {
     # the simplest camera, bent boards, biases of detectors, errors that images share: 950 lines; checks that
-    # could not run: 160
-    "lines": 83_350,
-    "code": 51_750,
-    "files": 368,
+    # could not run: 160; issue 27: the acceptance test 1,210, rows that slip and conventions of angles 650, known
+    # frames and quick corners of many detections 490, blocks as the last judge 420, mixed cameras 70
+    "lines": 86_400,
+    "code": 53_800,
+    "files": 378,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 64_450,
+    "lines of tests and benchmarks": 67_050,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

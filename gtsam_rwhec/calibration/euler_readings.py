@@ -72,7 +72,7 @@ def _numbers(R: Array, convention: str) -> Array:
         return np.asarray(rotations.as_rotvec())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of gimbal lock: two of the numbers are one then
-        return np.asarray(rotations.as_euler(convention))
+        return np.asarray(rotations.as_euler(convention))  # type: ignore[call-overload]  # it is one of its words
 
 
 def _rotations(numbers: Array, convention: str) -> Array:

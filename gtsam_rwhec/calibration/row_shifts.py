@@ -63,7 +63,7 @@ def costs_of(errors: Array, spread: Array, signal: Spread) -> Array:
     wrong = 3.0 * np.log(S.prod(axis=-1))[..., None, None] + tail * math.log1p(6.0 / DEGREES_OF_T)
     costs = np.minimum(right, wrong)
     # a row whose A is not there speaks for no shift
-    return np.where(np.isinf(errors[..., 0, :, :]), costs.min(axis=-2, keepdims=True) + UNSAID, costs)
+    return np.asarray(np.where(np.isinf(errors[..., 0, :, :]), costs.min(axis=-2, keepdims=True) + UNSAID, costs))
 
 
 def cheapest(costs: Array, price: float) -> tuple[np.ndarray, Array]:
