@@ -5,8 +5,8 @@
 Slipped: simulated logs of 15 to 300 images, at stations or on a smooth path, of one or two sensors, with noise of 0.05
 to 1.5 degrees and up to 10 % of wrong measurements. Of the images one to three have no detection, and a script leaves
 those out of B and not out of A; in some logs poses are left out of A. A log counts as found if the first row is the
-true one, or among the rows that are said to fit as well. Good: the 16 kinds of benchmarks/misreadings.py, and the same logs
-without a slip, some with a clock that is late by part of a row. Exits with 1 if a bar is missed.
+true one, or among the rows that are said to fit as well. Good: the 16 kinds of benchmarks/misreadings.py, and the same
+logs without a slip, some with a clock that is late by part of a row. Exits with 1 if a bar is missed.
 """
 
 from __future__ import annotations

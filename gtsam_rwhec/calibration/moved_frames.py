@@ -367,7 +367,8 @@ def mixed_sensors(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPos
             for of in (away[agree], of_target)
         ]
         angle, distance = size = _sizes(middle[None])[0]
-        if spreads[0] * OUTLIERS_BETTER < spreads[1] and (size > OUTLIERS_APART * near / NEAR).any():
+        # no two mounts are parallel to within the noise: lengths alone are off where a reading is wrong
+        if spreads[0] * OUTLIERS_BETTER < spreads[1] and (size > OUTLIERS_APART * near / NEAR).all():
             return TwoPoses(sensor, int(kept.sum()), int(agree.sum()), float(angle), float(distance), None, True, True)
     return None
 
