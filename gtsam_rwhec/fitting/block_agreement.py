@@ -38,6 +38,8 @@ HELD = 1e-4
 BY_CHANCE = 1e-3
 #: Standard deviations that are too small by more than this factor are those of errors that nobody knows.
 LARGELY = 2.0
+#: Blocks are not independent where they should move a frame by less than this share of its variance.
+ALL_OF_IT = 1e-6
 #: Degrees of freedom of the noise beside which the scatter is judged, and those of the widened covariance, at least.
 LEAST_FREEDOM = 3.0
 
@@ -165,8 +167,8 @@ def block_of(
 
 def scatter_about(
     frame: str, rows: Array, by: str, parts: list[tuple[Array, Array]], answer: Array, covariance: Array
-) -> Scatter:
-    """The scatter of what blocks say of a frame.
+) -> Scatter | None:
+    """The scatter of what blocks say of a frame; None where one block knows as much of it as the whole.
 
     ``rows`` (6, p) make its twist of the unknowns; ``parts`` are the blocks' information (p, p) and gradient (p,);
     ``answer`` (p,) and ``covariance`` (p, p) are those of the whole.
@@ -179,6 +181,8 @@ def scatter_about(
     both[np.arange(len(parts)), np.arange(len(parts))] += own
     expected = np.einsum("iiab->ab", both)
     values, vectors = np.linalg.eigh(0.5 * (expected + expected.T))
+    if not values[0] > ALL_OF_IT * float(np.diagonal(rows @ covariance @ rows.T).min()):
+        return None
     root = vectors / np.sqrt(np.maximum(values, 1e-9 * values[-1]))
     squares = float(((moves @ root) ** 2).sum())
     unit = root.T @ both @ root

@@ -9,7 +9,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.fitting.block_agreement import Scatter, scatter_about, too_much
+from gtsam_rwhec.fitting.block_agreement import Scatter, most_beyond_chance, scatter_about, too_much
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
@@ -93,7 +93,8 @@ BLOCKS, FEWEST_IN_BLOCK = (2, 4, 8), 8
 
 def _scatter_of_blocks(answer: Answer, task: Task, change: Array, order: tuple[str, ...]) -> list[Scatter]:
     """How much blocks of time scatter, for each number of them and for the sensor for which it is most by chance."""
-    linear, count, found = answer.fit.linear, len(answer.windows), []
+    linear, count = answer.fit.linear, len(answer.windows)
+    found: list[Scatter] = []
     inverse, still = answer.freedom.inverse(), np.zeros(task.layout.size)
     for blocks in BLOCKS if not answer.freedom.left.shape[1] else ():
         if count < blocks * FEWEST_IN_BLOCK:
@@ -103,11 +104,10 @@ def _scatter_of_blocks(answer: Answer, task: Task, change: Array, order: tuple[s
             there = Linear(linear.r[:, rows], linear.J[:, rows], linear.B[:, rows])
             normal = eliminated(there, answer.W[:, rows], task.layout)
             parts.append((normal.H, normal.g))
-        each = (
+        found += most_beyond_chance(
             scatter_about(name, change[6 * k : 6 * k + 6], "time", parts, still, inverse)
             for k, name in enumerate(order)
         )
-        found.append(min(each, key=lambda one: one.chance))
     return found
 
 
