@@ -95,7 +95,7 @@ def scatter_of_blocks(task: Task, found: Settled) -> tuple[Scatter, ...]:
         return ()
     whole = model.evaluate(sigma)
     spread = carried_on(model, sigma)
-    result = []
+    result: list[Scatter] = []
     # A random walk goes on between the visits of a configuration: such blocks share it, and are not independent.
     cuts = [("time", OF_TIME)] + [("configuration", OF_CONFIGURATION)] * (spread is None)
     for by, counts in cuts:
@@ -105,16 +105,15 @@ def scatter_of_blocks(task: Task, found: Settled) -> tuple[Scatter, ...]:
                 continue
             block = place * count // len(place)
             parts = [block_of(model, sigma, block == j, whole.covariance, spread) for j in range(count)]
-            result.append(
-                min(
-                    (
-                        scatter_about(name, rows, by, parts, whole.step, whole.covariance)
-                        for name, rows in frames.items()
-                    ),
-                    key=lambda one: one.chance,
-                )
+            result += most_beyond_chance(
+                scatter_about(name, rows, by, parts, whole.step, whole.covariance) for name, rows in frames.items()
             )
     return tuple(result)
+
+
+def most_beyond_chance(scatter: Iterable[Scatter | None]) -> list[Scatter]:
+    """The scatter that is most beyond chance; none of none."""
+    return sorted((one for one in scatter if one is not None), key=lambda one: one.chance)[:1]
 
 
 def place_of_instants(task: Task, model: NoiseModel, by: str) -> np.ndarray:
