@@ -33,6 +33,8 @@ from gtsam_rwhec.problem.problem import Problem
 #: Nodes of the quadrature over directions, in cos(polar angle) and in azimuth. With these the probability of a ball is
 #: right to 1e-6 for axes of any ratio that changes the radius.
 NODES = (48, 24)
+#: No camera measures a target's place to a smaller share of its distance.
+LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,14 @@ def point_sentence(
     said = f"{what} is within {rounded(radius_mm)} mm of its true place with {100 * level:g} % probability"
     if measurement_mm is None:
         return f"{said}."
+    if is_of_no_sensor(measurement_mm, distance_m):
+        return f"{said}; the noise of one new measurement is not told: the residuals are smaller than a sensor's."
     return f"{said}; the noise of one new measurement adds up to {rounded(measurement_mm)} mm."
+
+
+def is_of_no_sensor(measurement_mm: float, distance_m: float) -> bool:
+    """Whether the noise of a measurement is below what sensors have: residuals can be smaller, and tell nothing then."""
+    return measurement_mm < 1e3 * LEAST_SHARE * distance_m
 
 
 def checked_point(point: ArrayLike) -> Array:

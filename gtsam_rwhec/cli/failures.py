@@ -148,5 +148,6 @@ def exit_status(judgement: rw.Judgement, *, of_rig: bool = False) -> ExitStatus:
         ground.NOT_CERTIFIED: ExitStatus.NOT_CERTIFIED,
         ground.NOT_UNIQUE: ExitStatus.NOT_UNIQUE,
         ground.NO_COVARIANCE: ExitStatus.NOT_UNIQUE,
+        ground.KNOWN_TO_NOTHING: ExitStatus.NOT_UNIQUE,
     }
     return status.get(judgement.grounds[0], ExitStatus.CONTRADICTED)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.calibration.known_frames import MOST_M, MOST_RAD, VERTICAL_RAD, deviations_of
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fitting.block_agreement import Scatter, most_beyond_chance, scatter_about, too_much
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
@@ -211,8 +212,34 @@ CLOCK_KNOWN_S = 0.01
 FAR = 10.0
 #: A pose with a larger standard deviation along or about an axis is reported as poorly known.
 LOOSE_M, LOOSE_RAD = 0.2, float(np.radians(2.0))
+#: A height is what is poorly known where its deviation is this share of the largest.
+MOSTLY = 0.9
 #: A sensor is reported if more than this share of the windows is left out of its track.
 MANY = 0.1
+
+
+def _upright(answer: Answer) -> Array | None:
+    """The vertical (3,) in the axes of the first sensor, where its z axis is what the vehicle turned about most."""
+    axis = axes_turned(answer.windows, answer.fit.state.motion, 1.0)[2][0]
+    return axis * np.sign(axis[2]) if abs(axis[2]) > np.cos(VERTICAL_RAD) else None
+
+
+def poorly_known(name: str, T: Array, covariance: Array, upright: Array | None, first: str) -> Finding:
+    """The finding about a poorly known pose T (4, 4), by its covariance (6, 6): of its height, if that is why."""
+    rad, m = deviations_of(covariance)
+    is_nothing = rad > MOST_RAD or m > MOST_M
+    more = "drive longer, with more turns about the axes that it lacks, or give what is known"
+    if upright is not None:
+        along = upright @ T[:3, :3]
+        deviation = float(np.sqrt(max(along @ covariance[3:, 3:] @ along, 0.0)))
+        if deviation > max(LOOSE_M, MOSTLY * m):
+            words = (
+                f"the height of {name} over {first} (along the z axis of {first}) is {upright @ T[:3, 3]:.3g} +- "
+                f"{deviation:.2g} m (one standard deviation): the vehicle hardly turns about other axes"
+            )
+            return Finding(Ground.KNOWN_TO_NOTHING if is_nothing else Ground.HEIGHT_WEAK, words)
+    words = f"{name} is known only to {m:.2g} m and {np.degrees(rad):.2g} degrees (one standard deviation): {more}"
+    return Finding(Ground.KNOWN_TO_NOTHING if is_nothing else Ground.COVARIANCE_DOUBTED, words)
 
 
 def _residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
@@ -286,10 +313,8 @@ def _findings(
         elif apart:
             yield doubted(f"the exact likelihood moved {name} by {apart}: the proof is of another answer")
         if sigma[3:].max() > LOOSE_M or sigma[:3].max() > LOOSE_RAD:
-            yield doubted(
-                f"{name} is known only to {sigma[3:].max():.2g} m and {np.degrees(sigma[:3].max()):.2g} degrees (one "
-                "standard deviation): drive longer, with more turns about the axes that it lacks, or give what is known"
-            )
+            at = task.layout.at[k, :6]
+            yield poorly_known(name, answer.fit.state.T[k], C[np.ix_(at, at)], _upright(answer), task.names[0])
     if not answer.fit.converged:
         yield doubted("the refinement stopped before it converged; the poses may be off by more than they say")
     if task.given.has_ground and task.given.given.ground is None:

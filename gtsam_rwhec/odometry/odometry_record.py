@@ -26,6 +26,10 @@ NEAR_AXIS = float(np.cos(np.radians(8.0)))
 ADVICE = {
     Ground.NOT_UNIQUE: "state the missing heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that "
     "of the reference), or the ground, directions or distances; or drive other turns and a ramp, and calibrate again",
+    Ground.HEIGHT_WEAK: "state the named heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that of "
+    "the reference), or drive ramps and kerbs, so that the vehicle pitches and rolls",
+    Ground.KNOWN_TO_NOTHING: "use nothing of the named poses; drive longer, with turns about two axes, or state what "
+    "is known (given: heights_m, directions, distances) in the rig file",
     Ground.CONTRADICTED: "check the named tracks (poses T_start_sensor, quaternions x y z w, lengths in metres or "
     "scale: estimate, one vehicle and one drive) and what is given, and calibrate again",
     Ground.POSE_DOUBTED: "measure again what is given, in metres and in the axes of the reference, and correct the rig "

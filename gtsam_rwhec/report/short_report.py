@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, is_of_no_sensor
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.files.terminal_text import LONGEST_LINE, rounded, shown, shown_path
 from gtsam_rwhec.report.advice import Styled
@@ -211,6 +211,8 @@ def _point(point: PointUncertainty) -> str:
     said = f"{shown(point.frame)}: within {rounded(point.radius_mm)} mm, {distance_m:.2f} m away"
     if point.measurement_mm is None:
         return said
+    if is_of_no_sensor(point.measurement_mm, distance_m):
+        return f"{said}; noise of one new measurement: not told (the residuals are smaller than a sensor's)"
     return f"{said}; noise of one new measurement: {rounded(point.measurement_mm)} mm"
 
 

@@ -228,3 +228,11 @@ def test_a_sentence_has_no_exponents() -> None:
         "A point 2.50 m from cam, expressed in hand, is within 100 mm of its true place with 95 % probability; the "
         "noise of one new measurement adds up to 4500 mm."
     )
+
+
+def test_noise_that_no_sensor_has_is_no_fact() -> None:
+    """0.057 mm at 0.8 m was printed as the noise of a camera."""
+    said = point_sentence("cam", "hand", 0.8, 0.95, 1.2, 0.057)
+    assert "0.057" not in said
+    assert "not told: the residuals are smaller than a sensor's" in said
+    assert "adds up to 0.57 mm" in point_sentence("cam", "hand", 0.8, 0.95, 1.2, 0.57)

@@ -8,6 +8,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.odometry import JointCertificate, OdometryCalibration, OdometryNoise, OtherAnswer, Windows
+from gtsam_rwhec.odometry.odometry_outcome import poorly_known
 from gtsam_rwhec.solver.certificate import Status
 
 
@@ -55,3 +56,27 @@ def test_poses_between_any_two_sensors() -> None:
     assert found.is_unique
     assert not found.covariance_of("lidar").any()
     np.testing.assert_array_equal(found.covariance_of("camera"), 1e-4 * np.eye(6))
+
+
+@pytest.mark.parametrize(
+    ("deviation_m", "upright", "ground", "words"),
+    [
+        (0.5, True, Ground.HEIGHT_WEAK, "the height of rear over lidar (along the z axis of lidar) is 1.3 +- 0.5 m"),
+        (6.3, True, Ground.KNOWN_TO_NOTHING, "the height of rear over lidar (along the z axis of lidar) is 1.3 +- 6.3"),
+        (0.5, False, Ground.COVARIANCE_DOUBTED, "rear is known only to 0.5 m"),
+        (6.3, False, Ground.KNOWN_TO_NOTHING, "rear is known only to 6.3 m"),
+    ],
+)
+def test_a_poorly_known_height_is_named_as_height(
+    deviation_m: float, upright: bool, ground: Ground, words: str
+) -> None:
+    """A height of 33.0 +- 6.3 m had the verdict "care", and no word of height."""
+    T = se3.expmap(np.array([[0.3, -0.4, 0.5, 0.0, 0.0, 0.0]]))[0]
+    T[:3, 3] = [2.0, 0.1, 1.3]
+    up = np.array([0.0, 0.0, 1.0])
+    along = up @ T[:3, :3]
+    covariance = 1e-6 * np.eye(6)
+    covariance[3:, 3:] += deviation_m**2 * np.outer(along, along)
+    found = poorly_known("rear", T, covariance, up if upright else None, "lidar")
+    assert found.ground is ground
+    assert found.words.startswith(words)
