@@ -79,7 +79,7 @@ def point_sentence(
 
 
 def is_of_no_sensor(measurement_mm: float, distance_m: float) -> bool:
-    """Whether the noise of a measurement is below what sensors have: residuals can be smaller, and tell nothing then."""
+    """Whether the noise of a measurement is below what sensors have: smaller residuals tell nothing."""
     return measurement_mm < 1e3 * LEAST_SHARE * distance_m
 
 

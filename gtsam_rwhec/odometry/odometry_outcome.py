@@ -231,7 +231,7 @@ def poorly_known(name: str, T: Array, covariance: Array, upright: Array | None, 
     more = "drive longer, with more turns about the axes that it lacks, or give what is known"
     if upright is not None:
         along = upright @ T[:3, :3]
-        deviation = float(np.sqrt(max(along @ covariance[3:, 3:] @ along, 0.0)))
+        deviation = float(np.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)))
         if deviation > max(LOOSE_M, MOSTLY * m):
             words = (
                 f"the height of {name} over {first} (along the z axis of {first}) is {upright @ T[:3, 3]:.3g} +- "
