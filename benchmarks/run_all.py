@@ -31,6 +31,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "few_measurements": ("", "--quick"),
     "outliers": ("", "--seeds 1"),
     "misreadings": ("", None),
+    "slipped_rows": ("", "--logs 6 --good 8"),
     "coverage": ("--runs 1000", "--runs 4"),
     "wrong_assumptions": ("--runs 1000", "--runs 1"),
     "split_halves": ("--runs 300", "--runs 1"),

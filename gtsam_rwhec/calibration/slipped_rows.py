@@ -31,6 +31,8 @@ from gtsam_rwhec.solver.solution import Solution
 FEWEST_ROWS = 8
 #: At least so many rows slipped. Fewer are as well wrong measurements.
 FEWEST_SLIPPED = 3
+#: And at least so many agree at each of two shifts; else all rows are shifted alike.
+FEWEST_AT_A_SHIFT = 2
 #: Rows on trial of one pair at most, from all over it; the row where a slip begins is then looked for among all.
 MOST_ON_TRIAL = 600
 #: A change of the shift costs this and the logarithm of the number of places and shifts that it may have (nats).
@@ -319,7 +321,7 @@ class _Trial:
 
     def is_sure(self, best: _Fit, given: float) -> bool:
         """Whether the shifts change, and explain more than chance."""
-        if not any(np.diff(of).any() for of in best.shifts.values()):
+        if not self.changes_among_right_rows(best):
             return False  # a constant shift is another mistake
         moved = np.concatenate([of != AS_GIVEN for of in best.shifts.values()])
         gains = best.gains()[moved]
@@ -334,6 +336,17 @@ class _Trial:
         if (given - best.sum) / alike < best.changes * best.price + SURELY:
             return False
         return bool(gains.mean() > SIGMAS * gains.std(ddof=1) / math.sqrt(len(gains) / alike))
+
+    def changes_among_right_rows(self, best: _Fit) -> bool:
+        """Whether in some pair rows agree with the fit at two shifts, some rows at each."""
+        for pair, costs in best.costs.items():
+            one, states = self.rows[pair], best.shifts[pair]
+            own = one.rows + SHIFTS[states]
+            chosen = np.take_along_axis(costs, states[None], 0)[0]
+            right = (own >= 0) & (own < len(one.raw.A)) & (chosen < costs.max() - AS_WELL)
+            if (np.bincount(states[right], minlength=len(SHIFTS)) >= FEWEST_AT_A_SHIFT).sum() > 1:
+                return True
+        return False
 
     def rows_of_one_error(self, best: _Fit) -> float:
         """How many rows in a row have one error: (1 + r) / (1 - r), with r the correlation of neighbours' residuals."""

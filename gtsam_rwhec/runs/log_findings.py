@@ -94,6 +94,11 @@ def _cure(misreading: Misreading, rig: Rig) -> str:
         topics = ", ".join(sensor.detections for sensor in rig.sensors.values() if sensor.detections is not None)
         if topics:
             return f"let the driver publish the target's pose in the sensor's frame (topics {topics})"
+    if misreading.mistake is Mistake.ROWS_SLIPPED:
+        return (
+            "compare the stamps, or the numbers, of images and poses from there on (rows count the detections that are "
+            "used), and pair them again"
+        )
     if misreading.mistake is Mistake.ROWS_SHIFTED:
         lines = place(*(("sensors", name, "time_offset") for name in rig.sensors))
         return f"write time_offset: estimate ({lines})"

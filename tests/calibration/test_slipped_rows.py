@@ -154,6 +154,18 @@ def test_the_option_changes_nothing_of_good_rows() -> None:
     assert repaired.judgement == rw.calibrate(problem).judgement
 
 
+@pytest.mark.parametrize("late", [0.0, 0.05])
+def test_a_late_clock_is_no_size_and_a_size_no_late_clock(late: float) -> None:
+    """Ten rows a second, with a clock that is said to be right: each of the two is named, and not the other one."""
+    problem = rw.Problem()
+    B = measured(path(150, 1, 10.0 * late), 1)
+    B[:, :3, 3] *= 1.0 if late else 1.03
+    problem.add("tag", "cam", path(150, 1), B, stamps_ns=np.arange(150) * 10**8)
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(time_offsets=False))
+    ground = rw.Ground.LATE_CLOCK if late else rw.Ground.SIZE_DOUBTED
+    assert calibration.judgement.grounds == (ground,)
+
+
 def test_stamps_stay_with_B() -> None:
     A = stations(12, 11)
     problem = rw.Problem()

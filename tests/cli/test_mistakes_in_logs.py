@@ -121,6 +121,25 @@ def test_of_csv_files(name: str, tmp_path: Path) -> None:
         assert part in said
 
 
+def test_rows_that_slipped_are_repaired_on_request(tmp_path: Path) -> None:
+    """One of eleven pairs: its B lacks the row of an image without a detection, and its A the last row."""
+    folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
+    lost = 6
+    for path in folder.glob("tag_0_cam_0_?.csv"):
+        rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        del rows[lost if path.stem.endswith("B") else -1]
+        path.write_text("".join(rows), encoding="utf-8")
+    status, said = command("calibrate", folder)
+    assert status == 6, said
+    said = " ".join(said.split())
+    assert f"from row {lost + 1} of tag_0-cam_0 on, B belongs to the A that is 1 row later (11 rows)" in said
+    status, said = command("calibrate", folder, "--repair")
+    assert status == 0, said
+    assert "Use these poses with care: 10 rows were shifted and 1 left out" in " ".join(said.split())
+    status, said = command("calibrate", folder, "--repair", "--as-read")
+    assert (status, "give one" in said) == (2, True)
+
+
 def test_joint_states_are_no_samples(tmp_path: Path) -> None:
     """MoveIt's panel saves both, side by side."""
     (tmp_path / "joints.yaml").write_text("joint_names: [a, b]\njoint_values:\n  - [0.1, 0.2]\n  - [0.3, 0.4]\n")
