@@ -66,7 +66,7 @@ def test_the_verdict_says_that_blocks_disagree_and_deviations_are_as_much_larger
     assert worst is not None
     assert worst.is_by_far
     assert rw.Ground.CORRELATED in bent.judgement.grounds
-    assert "times what the noise allows" in bent.verdict_reason
+    assert "times what the noise model expects" in bent.verdict_reason
     assert bent.refined is not None
     assert bent.refined.degrees_of_freedom <= worst.freedom
 
