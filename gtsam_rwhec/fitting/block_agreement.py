@@ -76,8 +76,8 @@ class Scatter:
         where = "in time" if self.by == "time" else "by the carriers' configuration"
         return (
             f"{cut} of the log ({where}) move {self.frame} by {rounded(np.degrees(self.rotation_rad))} degrees and "
-            f"{rounded(1e3 * self.translation_m)} mm each, which is {rounded(np.sqrt(self.ratio))} times what the noise "
-            "model expects"
+            f"{rounded(1e3 * self.translation_m)} mm each, which is {rounded(np.sqrt(self.ratio))} times what the "
+            "noise model expects"
         )
 
 
