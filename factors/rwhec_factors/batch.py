@@ -321,7 +321,7 @@ def _whitening(sqrt_information: object, count: int) -> Array:
         raise ValueError(f"sqrt_information has shape {root.shape}; give (6, 6) or ({count}, 6, 6)")
     if not np.isfinite(root).all():
         raise ValueError("sqrt_information has entries that are NaN or infinite; is a covariance singular?")
-    if not (np.linalg.svd(root, compute_uv=False)[..., -1] > 0.0).all():
+    if not np.linalg.slogdet(root)[0].all():
         raise ValueError("sqrt_information is singular: along some direction it holds no information; give full rank")
     return np.broadcast_to(root, (count, 6, 6))
 

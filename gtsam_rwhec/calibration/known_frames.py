@@ -43,19 +43,27 @@ def of_knowledge(
     carriers: Carriers,
 ) -> list[Finding]:
     """The findings: frames that are known to nothing, and free or weak heights; what is known all the same."""
-    seen_m = [float(np.linalg.norm(view.point_m)) for view in views.values()]
-    most_m = float(np.median(seen_m)) if seen_m else MOST_M
-    findings = list(_known_to_nothing(refined, most_m, carriers, is_seen=bool(seen_m)))
-    if not (findings or refined.free_directions):
-        return [*_heights(problem, inliers, refined, carriers)]
-    known = list(_known(refined, most_m))
-    if known:
-        said = Finding(
-            Ground.NOT_UNIQUE if not findings else Ground.KNOWN_TO_NOTHING,
-            f"known all the same {'is' if len(known) == 1 else 'are'} {_listed(known)} (standard deviations)",
-        )
-        findings.append(said)
+    most_m, is_seen = _most_m(views)
+    findings = list(_known_to_nothing(refined, most_m, carriers, is_seen=is_seen))
+    if findings or refined.free_directions:
+        ground = Ground.KNOWN_TO_NOTHING if findings else Ground.NOT_UNIQUE
+        findings += known_all_the_same(refined, views, ground)
     return [*findings, *_heights(problem, inliers, refined, carriers)]
+
+
+def known_all_the_same(refined: Refined, views: Mapping[str, SensorView], ground: Ground) -> list[Finding]:
+    """The finding that names what is known beside what is not, under the ground of that; empty if nothing is."""
+    known = list(_known(refined, _most_m(views)[0]))
+    if not known:
+        return []
+    are = "is" if len(known) == 1 else "are"
+    return [Finding(ground, f"known all the same {are} {_listed(known)} (standard deviations)")]
+
+
+def _most_m(views: Mapping[str, SensorView]) -> tuple[float, bool]:
+    """The largest deviation that a position may have, metres, and whether it is the distance of what was seen."""
+    seen_m = [float(np.linalg.norm(view.point_m)) for view in views.values()]
+    return (float(np.median(seen_m)), True) if seen_m else (MOST_M, False)
 
 
 def deviations_of(covariance: Array) -> tuple[float, float]:

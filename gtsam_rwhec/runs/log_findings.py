@@ -164,7 +164,8 @@ def known_to_nothing(points: Iterable[PointUncertainty], rig: Rig) -> list[Findi
             place = rig.source.place(("sensors", point.frame, "intrinsics"))
             words = (
                 f"a point {1e-3 * distance_mm:.2f} m from {point.frame} is known to {point.radius_mm:.0f} mm only, and "
-                f"that is no noise of a camera: intrinsics ({place}), sizes and the carriers' poses do not fit together"
+                "that is no noise of a camera: the carriers' poses (a path that drifts), intrinsics "
+                f"({place}) and sizes do not fit together"
             )
             findings.append(Finding(Ground.KNOWN_TO_NOTHING, words))
     return findings

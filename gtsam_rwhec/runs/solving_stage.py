@@ -12,6 +12,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Recording, SizesChoice
 from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.known_frames import known_all_the_same
 from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, exchange_of
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.stages import calibrate
@@ -330,7 +331,9 @@ def _findings(
     if found.judgement.verdict is not Verdict.DO_NOT_USE:
         if are_too_few_to_tell(found.problem) and exchange_of(found.problem).is_open:
             yield may_be_exchanged(rig, sum(count.used for count in fields.outliers))
-        yield from known_to_nothing(found.points.values(), rig)
+        yield from (unknown := known_to_nothing(found.points.values(), rig))
+        if unknown:
+            yield from known_all_the_same(refined, found.views, Ground.KNOWN_TO_NOTHING)
 
 
 def _fields(

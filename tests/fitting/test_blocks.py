@@ -85,7 +85,9 @@ def test_the_verdict_says_that_no_model_holds_the_drift(monkeypatch: pytest.Monk
     assert calibration.verdict is rw.Verdict.CARE
     assert rw.Ground.CORRELATED in calibration.judgement.grounds
     assert "widened as blocks of time show" in calibration.verdict_reason
+    # Whichever of the two judges sees the blocks first, the other finds them in the covariance.
     monkeypatch.setattr("gtsam_rwhec.fitting.noise_in_data.widening", lambda task, *_: np.ones(len(task.layout.unit)))
+    monkeypatch.setattr("gtsam_rwhec.fitting.noise_in_data.too_much", lambda scatter: None)
     before = rw.calibrate(problem, options)
     for name in ("camera", "tag_0"):
         assert (np.diagonal(calibration.covariance(name)) >= np.diagonal(before.covariance(name))).all()
