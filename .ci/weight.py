@@ -27,7 +27,7 @@ BUDGET = {
     "files": 378,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 67_050,
+    "lines of tests and benchmarks": 67_080,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

@@ -239,7 +239,8 @@ def is_of_old_log(result: Path, source: Path) -> bool:
     """Whether all files of the new log are files that the old calibration was made from, by their checksums."""
     if not (old := old_checksums(result)):
         return False
-    files = [path for path in source.glob("*") if path.suffix in LOG_SUFFIXES] if source.is_dir() else [source]
+    files = [path for path in source.glob("*") if path.suffix in LOG_SUFFIXES] if source.is_dir() else []
+    files = [source] if source.is_file() else files  # what is not there, its reader says
     return bool(files) and {file.sha256 for file in rw.results.input_files(files)} <= old
 
 

@@ -107,7 +107,8 @@ def read_csv(
         if len(rows_a) != len(rows_b):
             raise FileFormatError(
                 f"{path_a} has {len(rows_a)} lines and {path_b} has {len(rows_b)}: give both the same number of lines; "
-                "line i of both is one measurement."
+                "line i of both is one measurement. Take out the line without a partner (of an image without a "
+                "detection?), and not the last one: later lines would belong to others."
             )
         source = f"{path_a} and {path_b.name}"
         problem.add_batch(

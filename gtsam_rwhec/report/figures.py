@@ -66,7 +66,7 @@ FILE_DPI = 200
 #: A title or an axis has room for a name of this many characters.
 LONGEST_NAME = 28
 #: A logarithmic axis shows at most so many powers of ten, and any other axis so many ticks.
-DECADES, MOST_TICKS = 15, 200
+DECADES, MOST_TICKS = 40, 200
 #: What drawing may raise on numbers that no axis can show.
 CANNOT_DRAW = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 

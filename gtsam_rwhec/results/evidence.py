@@ -14,6 +14,7 @@ from pydantic import Field, ValidationError
 
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions
 from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import read_whole, write_atomically
@@ -197,6 +198,8 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
         The problem was made with ``keep_measurements=False``.
     """
     inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
+    if any(finding.ground is Ground.ROWS_REPAIRED for finding in calibration.findings):
+        problem = calibration.problem  # whose rows are where they belong
     rows = measured_rows(problem, calibration)
     model = LinearModel.of(rows, calibration)
     carriers = problem.sensor_carrier, problem.target_carrier

@@ -60,8 +60,8 @@ def _checked_poses(A: PosesLike, where: str) -> Array:
 
 
 def is_touches_file(path: str | Path) -> bool:
-    """Whether a path is a CSV file, as touches are, and no folder."""
-    return Path(path).suffix.lower() == ".csv" and Path(path).is_file()
+    """Whether a path names a CSV file, as touches are, and no folder; it may not be there."""
+    return Path(path).suffix.lower() == ".csv" and not Path(path).is_dir()
 
 
 def read_touches(path: str | Path) -> Touches:
@@ -78,6 +78,8 @@ def read_touches(path: str | Path) -> Touches:
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path} is not a text file in UTF-8 (byte {error.start}).") from error
     lines = text.splitlines()
+    if not text.strip():
+        raise FileFormatError(f"{path} is empty: give a header with {', '.join(POINTS)} (metres), and touches below.")
     names = [name.strip() for name in lines[0].split(",")] if lines else []
     wanted = (*POINTS, *POSES) if any(name in POSES for name in names) else POINTS
     if sorted(names) != sorted(wanted):

@@ -230,7 +230,10 @@ def _sensors(rig: RigFile) -> Iterator[Fault]:
             there = [each for each, of in rig.sensors.items() if of.intrinsics is not None and of.shared is None]
             if other is None or other.intrinsics is None or other.shared is not None:
                 known = f"these sensors do: {', '.join(there)}" if there else "no sensor does"
-                words = f"{sensor.shared} states no intrinsics of its own; {known}"
+                what = (
+                    "states no intrinsics of its own" if sensor.shared in rig.sensors else "is no sensor of this file"
+                )
+                words = f"{sensor.shared} {what}; {known}"
                 yield ("sensors", name, "intrinsics", "shared"), words
         if sensor.poses is not None and rig.carriers.poses.frames is None:
             yield (

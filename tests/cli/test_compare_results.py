@@ -155,6 +155,12 @@ def test_touches_accept_a_calibration_or_not(folder: Path, tmp_path: Path) -> No
     refused = given("accept", str(result), str(good), "--limit-mm", "1")
     assert refused.exit_code == ExitStatus.BAD_INPUT  # of two sensors none is named
     assert "say which one is tested" in refused.output
+    for name in ("typo.csv", "nofile.mcap"):  # no traceback, and no status that says "rejected"
+        done = given("accept", str(result), str(tmp_path / name), "--limit-mm", "1", "--sensor", "right")
+        assert done.exit_code == ExitStatus.BAD_INPUT
+    (tmp_path / "empty.csv").write_text("")
+    done = given("accept", str(result), str(tmp_path / "empty.csv"), "--limit-mm", "1", "--sensor", "right")
+    assert "empty.csv is empty: give a header with" in done.output
     both = ["--box", *"000111", "--ball", *"0001"]
     assert given("accept", str(result), *calls[0][0], *both).exit_code == ExitStatus.BAD_INPUT
 

@@ -133,8 +133,9 @@ def test_rows_that_slipped_are_repaired_on_request(tmp_path: Path) -> None:
     assert status == 6, said
     said = " ".join(said.split())
     assert f"from row {lost + 1} of tag_0-cam_0 on, B belongs to the A that is 1 row later (11 rows)" in said
-    status, said = command("calibrate", folder, "--repair")
+    status, said = command("calibrate", folder, "--repair", "-o", tmp_path / "result.json")
     assert status == 0, said
+    assert (tmp_path / "report.html").is_file()  # of the rows where they belong, one fewer than were read
     assert "Use these poses with care: 10 rows were shifted and 1 left out" in " ".join(said.split())
     status, said = command("calibrate", folder, "--repair", "--as-read")
     assert (status, "give one" in said) == (2, True)

@@ -343,7 +343,7 @@ def test_a_file_of_touches_is_read_by_its_header(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "line 1: the columns are"),
+        ("", "is empty: give a header"),
         ("1,2,3,4,5,6\n", "line 1: the columns are"),
         (f"{POINTS}\n", "has no touches"),
         (f"{POINTS}\n1,2,3\n", "line 2: 3 fields in place of 6"),

@@ -320,11 +320,7 @@ def test_a_camera_that_is_shared_is_stated_as_the_other_one() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            "shared: left",
-            "shared: middle",
-            "line 4: sensors.right.intrinsics.shared: middle states no intrinsics of its own",
-        ),
+        ("shared: left", "shared: middle", "line 4: sensors.right.intrinsics.shared: middle is no sensor of this file"),
         ("shared: left", "shared: right", "right states no intrinsics of its own; these sensors do: left"),
         ("shared: left", "shared: left, stated: nominal", "stated: nominal, and left has the intrinsics; say it there"),
         ("shared: left", "shared: left, file: a.yaml", "give one of"),
