@@ -31,8 +31,6 @@ from gtsam_rwhec.solver.solution import Solution
 FEWEST_ROWS = 8
 #: At least so many rows slipped. Fewer are as well wrong measurements.
 FEWEST_SLIPPED = 3
-#: And at least so many agree at each of two shifts; else all rows are shifted alike.
-FEWEST_AT_A_SHIFT = 2
 #: Rows on trial of one pair at most, from all over it; the row where a slip begins is then looked for among all.
 MOST_ON_TRIAL = 600
 #: A change of the shift costs this and the logarithm of the number of places and shifts that it may have (nats).
@@ -197,6 +195,11 @@ class _Fit:
         return float(sum(costs[AS_GIVEN].sum() for costs in self.costs.values()))
 
     @property
+    def of_one_shift(self) -> float:
+        """The least sum of costs with one shift of all rows, as given or not: all alike are another mistake."""
+        return float(np.sum([costs.sum(axis=1) for costs in self.costs.values()], axis=0).min())
+
+    @property
     def total(self) -> float:
         return self.sum + self.price * self.changes
 
@@ -303,7 +306,7 @@ class _Trial:
         if base is None:
             return None
         fits = [self.fit_of(base), *map(self.fit_of, self.starts())]
-        given = min(one.as_given for one in fits)
+        simple = min(one.of_one_shift for one in fits)
         fits = [self.settled(one) for one in sorted(fits, key=lambda one: one.total)[:MOST_SETTLED]]
         best = min(fits, key=lambda one: one.total)
         # on a short smooth path other poses explain one shift more of all rows
@@ -311,18 +314,16 @@ class _Trial:
         if any(of[0] != AS_GIVEN for of in best.shifts.values()) and (fit := self.fitted(first)) is not None:
             fits.append(self.settled(self.fit_of(fit)))
             best = min(fits, key=lambda one: one.total)
-        given = min(given, *(one.as_given for one in fits))
-        if not self.is_sure(best, given):
+        simple = min(simple, *(one.of_one_shift for one in fits))
+        if not self.is_sure(best, simple):
             return None
         sample = {pair: one.at(0) for pair, one in self.rows.items()} | dict(self.others)
         if explains_more(self.problem, sample, best.fit.residual) or self.is_late(best):
             return None
         return self.slips(best, base.residual)
 
-    def is_sure(self, best: _Fit, given: float) -> bool:
-        """Whether the shifts change, and explain more than chance."""
-        if not self.changes_among_right_rows(best):
-            return False  # a constant shift is another mistake
+    def is_sure(self, best: _Fit, simple: float) -> bool:
+        """Whether the shifts explain more than chance does beside one shift of all rows, whose cost is ``simple``."""
         moved = np.concatenate([of != AS_GIVEN for of in best.shifts.values()])
         gains = best.gains()[moved]
         wrong = max(float(costs.max()) for costs in best.costs.values())
@@ -333,20 +334,9 @@ class _Trial:
         if number < FEWEST_SLIPPED or number < AGREE * len(chosen):
             return False
         alike = self.rows_of_one_error(best)
-        if (given - best.sum) / alike < best.changes * best.price + SURELY:
+        if (simple - best.sum) / alike < best.changes * best.price + SURELY:
             return False
         return bool(gains.mean() > SIGMAS * gains.std(ddof=1) / math.sqrt(len(gains) / alike))
-
-    def changes_among_right_rows(self, best: _Fit) -> bool:
-        """Whether in some pair rows agree with the fit at two shifts, some rows at each."""
-        for pair, costs in best.costs.items():
-            one, states = self.rows[pair], best.shifts[pair]
-            own = one.rows + SHIFTS[states]
-            chosen = np.take_along_axis(costs, states[None], 0)[0]
-            right = (own >= 0) & (own < len(one.raw.A)) & (chosen < costs.max() - AS_WELL)
-            if (np.bincount(states[right], minlength=len(SHIFTS)) >= FEWEST_AT_A_SHIFT).sum() > 1:
-                return True
-        return False
 
     def rows_of_one_error(self, best: _Fit) -> float:
         """How many rows in a row have one error: (1 + r) / (1 - r), with r the correlation of neighbours' residuals."""

@@ -148,6 +148,15 @@ def test_rows_that_are_all_shifted_are_repaired_too() -> None:
     np.testing.assert_allclose(repaired.Y["cam"].matrix(), Y, atol=0.01)
 
 
+def test_rows_that_are_all_shifted_do_not_slip_where_the_carriers_stand_first() -> None:
+    """Rows of a standstill agree with either shift: a real log's rows, all shifted by three, were said to slip."""
+    A = path(60, 4)[np.maximum(np.arange(68) - 8, 0)]
+    problem = rw.Problem()
+    problem.add("tag", "cam", A[3:], measured(A, 4)[:-3])
+    assert found_in(problem) is None
+    assert [one.mistake for one in rw.calibrate(problem).misreadings] == [Mistake.ROWS_SHIFTED]
+
+
 def test_the_option_changes_nothing_of_good_rows() -> None:
     problem = slipped(stations(20, 3), ())
     repaired = rw.calibrate(problem, rw.CalibrateOptions(repair=True))
