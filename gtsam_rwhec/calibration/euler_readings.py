@@ -17,7 +17,7 @@ from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.calibration.other_readings import Mistake, OtherReading, of_sides
-from gtsam_rwhec.calibration.row_shifts import closed_forms
+from gtsam_rwhec.calibration.row_shifts import fits_of_parts
 from gtsam_rwhec.calibration.trial_fits import Sample
 from gtsam_rwhec.geometry.poses import Array
 
@@ -47,7 +47,7 @@ def readings_of_euler_angles(sample: Sample) -> list[OtherReading]:
         np.stack([T, *(pose(R, T[:, :3, 3]) if at == side else T for (at, *_), R in tried.items())])
         for side, T in (("A", A), ("B", B))
     )
-    errors = closed_forms(of_A, of_B, np.ones(of_A.shape[:2]), is_scaled=True)[3]
+    errors = fits_of_parts(of_A, of_B, np.ones(of_A.shape[:2]), is_scaled=True)[3]
     remains = np.log(np.maximum(errors, [1e-6, 1e-9])).sum(axis=1)
     # some conventions differ by names of axes only, and fit alike: the most common one is named
     best: dict[tuple[str, float], tuple[str, str, str]] = {}

@@ -1,8 +1,7 @@
 """Shifts between the rows of A and B of one pair: the cost of each row at each shift, and the shifts that cost least.
 
 Many parts of the rows are fitted in closed form, at each shift: a part in which all rows have one shift gives X and Y,
-and these tell the shifts of all other rows. Rotations are of Shah (2013), "Solving the robot-world/hand-eye calibration
-problem using the Kronecker product": the leading singular vectors of the sum of R_A (x) R_B are R_Y and R_X.
+and these tell the shifts of all other rows.
 """
 
 from __future__ import annotations
@@ -10,10 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from rwhec_factors.se3 import inverse, pose
+from rwhec_factors.se3 import inverse
 
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Spread, angles
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.sample_poses import poses_of_samples
 
 #: B's row i may belong to the rows of A from i - 3 to i + 3.
 SHIFTS = np.arange(-3, 4)
@@ -106,7 +106,7 @@ def likely_shifts(
         there = (own >= 0) & (own < len(A))
         part, shift = np.nonzero(there.sum(axis=-1) >= min(FEWEST_OF_A_PART, length))
         of_A, of_B, weight = np.clip(own[part, shift], 0, len(A) - 1), parts[part], there[part, shift].astype(float)
-        Y, X, scale, spread = closed_forms(A[of_A], B[of_B], weight, is_scaled=is_scaled)
+        Y, X, scale, spread = fits_of_parts(A[of_A], B[of_B], weight, is_scaled=is_scaled)
         costs = costs_of(errors_at_shifts(A, B, rows, Y, X, scale), spread, signal)
         for states, total in zip(*cheapest(costs, price), strict=True):
             key = states.tobytes()
@@ -115,44 +115,13 @@ def likely_shifts(
     return [states for _, states in sorted(found.values(), key=lambda one: one[0])[:most]]
 
 
-def closed_forms(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tuple[Array, Array, Array, Array]:
+def fits_of_parts(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tuple[Array, Array, Array, Array]:
     """Y and X (W, 4, 4), the scales (W,) and the median errors (W, 2) of W parts A, B (W, w, 4, 4); weights (W, w)."""
-    parts, w = weight.shape
-    R_A, R_B, t_A, t_B = A[..., :3, :3], B[..., :3, :3], A[..., :3, 3], B[..., :3, 3]
-    flat = (R_A * weight[..., None, None]).reshape(parts, w, 9)
-    # sum of R_A (x) R_B, which takes R_X, by rows, to R_A R_X R_B'
-    T = np.swapaxes(flat, 1, 2) @ R_B.reshape(parts, w, 9)
-    T = T.reshape(parts, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4).reshape(parts, 9, 9)
-    left, _, right = np.linalg.svd(T)
-    M_Y, M_X = left[:, :, 0].reshape(-1, 3, 3), right[:, 0].reshape(-1, 3, 3)
-    sign = np.where(np.linalg.det(M_X) < 0.0, -1.0, 1.0)[:, None, None]
-    R_Y, R_X = _nearest_rotations(sign * M_Y), _nearest_rotations(sign * M_X)
-    # R_A t_X - t_Y - u R_Y t_B = -t_A, with u = 1 / scale
-    turned = np.einsum("wij,wnj->wni", R_Y, t_B)
-    eye = np.broadcast_to(-np.eye(3), (parts, w, 3, 3))
-    columns = np.concatenate([R_A, eye] + ([-turned[..., None]] if is_scaled else []), axis=3)
-    right_side = -t_A if is_scaled else turned - t_A
-    root = np.sqrt(weight)[..., None, None]
-    system = (columns * root).reshape(parts, 3 * w, -1)
-    solved = np.linalg.pinv(system) @ (right_side[..., None] * root).reshape(parts, 3 * w, 1)
-    t_X, t_Y = solved[:, :3, 0], solved[:, 3:6, 0]
-    u = solved[:, 6, 0] if is_scaled else np.ones(parts)
-    scale = 1.0 / np.where(np.abs(u) < 1e-9, 1e-9, u)
-    Y, X = pose(R_Y, t_Y), pose(R_X, t_X)
+    X, Y, scale = poses_of_samples(A, B, weight, is_scaled=is_scaled)
     predicted = inverse(Y)[:, None] @ A @ X[:, None]
-    of_parts = np.stack(
-        [
-            angles(R_B, predicted[..., :3, :3]),
-            np.linalg.norm(t_B - scale[:, None, None] * predicted[..., :3, 3], axis=-1),
-        ],
-        axis=1,
-    )
+    away = np.linalg.norm(B[..., :3, 3] - scale[:, None, None] * predicted[..., :3, 3], axis=-1)
+    errors = np.stack([angles(B[..., :3, :3], predicted[..., :3, :3]), away], axis=1)
     # of the 6 w equations, 12 or 13 were spent
+    w = weight.shape[1]
     spent = math.sqrt(6 * w / max(6 * w - 12 - is_scaled, 1))
-    return Y, X, scale, spent * np.median(of_parts, axis=-1)
-
-
-def _nearest_rotations(M: Array) -> Array:
-    left, _, right = np.linalg.svd(M)
-    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    return np.asarray(left @ right)
+    return Y, X, scale, spent * np.median(errors, axis=-1)

@@ -31,6 +31,8 @@ from gtsam_rwhec.solver.solution import Solution
 FEWEST_ROWS = 8
 #: At least so many rows slipped. Fewer are as well wrong measurements.
 FEWEST_SLIPPED = 3
+#: And at least so many agree at each of two shifts of some pair; else all rows of a pair are shifted alike.
+FEWEST_AT_A_SHIFT = 2
 #: Rows on trial of one pair at most, from all over it; the row where a slip begins is then looked for among all.
 MOST_ON_TRIAL = 600
 #: A change of the shift costs this and the logarithm of the number of places and shifts that it may have (nats).
@@ -78,7 +80,7 @@ class Slip:
 
 @dataclass(frozen=True)
 class Slips:
-    """All slips of a problem, and the median residuals as given and with each row at its place."""
+    """All slips of a problem, and the median residuals of the rows that slipped, as given and at their places."""
 
     slips: tuple[Slip, ...]
     shifts: Mapping[Pair, np.ndarray]  #: By pair with slips, the shift (N,) of each row
@@ -320,10 +322,12 @@ class _Trial:
         sample = {pair: one.at(0) for pair, one in self.rows.items()} | dict(self.others)
         if explains_more(self.problem, sample, best.fit.residual) or self.is_late(best):
             return None
-        return self.slips(best, base.residual)
+        return self.slips(best)
 
     def is_sure(self, best: _Fit, simple: float) -> bool:
         """Whether the shifts explain more than chance does beside one shift of all rows, whose cost is ``simple``."""
+        if not self.changes_among_right_rows(best):
+            return False  # a late clock, or rows of a pair that are all shifted, are other mistakes
         moved = np.concatenate([of != AS_GIVEN for of in best.shifts.values()])
         gains = best.gains()[moved]
         wrong = max(float(costs.max()) for costs in best.costs.values())
@@ -337,6 +341,17 @@ class _Trial:
         if (simple - best.sum) / alike < best.changes * best.price + SURELY:
             return False
         return bool(gains.mean() > SIGMAS * gains.std(ddof=1) / math.sqrt(len(gains) / alike))
+
+    def changes_among_right_rows(self, best: _Fit) -> bool:
+        """Whether in some pair rows agree with the fit at two shifts, some rows at each."""
+        for pair, costs in best.costs.items():
+            one, states = self.rows[pair], best.shifts[pair]
+            own = one.rows + SHIFTS[states]
+            chosen = np.take_along_axis(costs, states[None], 0)[0]
+            right = (own >= 0) & (own < len(one.raw.A)) & (chosen < costs.max() - AS_WELL)
+            if (np.bincount(states[right], minlength=len(SHIFTS)) >= FEWEST_AT_A_SHIFT).sum() > 1:
+                return True
+        return False
 
     def rows_of_one_error(self, best: _Fit) -> float:
         """How many rows in a row have one error: (1 + r) / (1 - r), with r the correlation of neighbours' residuals."""
@@ -370,9 +385,9 @@ class _Trial:
                 return True
         return False
 
-    def slips(self, best: _Fit, before: Spread) -> Slips | None:
+    def slips(self, best: _Fit) -> Slips | None:
         """The record of all slips, with the row of each among all rows of its pair."""
-        found, shifts = [], {}
+        found, shifts, sizes = [], {}, []
         for pair, one in self.rows.items():
             whole = replace(one, rows=np.arange(len(one.raw.B)))
             errors = replace(self, rows={pair: whole})._errors(best.fit)
@@ -381,8 +396,14 @@ class _Trial:
             if (states == AS_GIVEN).all():
                 continue
             shifts[pair] = SHIFTS[states]
+            rows = np.flatnonzero(states != AS_GIVEN)
+            of_rows = errors[pair][:, [np.full(len(rows), AS_GIVEN), states[rows]], rows]  # (2, given or own, rows)
+            sizes.append(of_rows[:, :, np.isfinite(of_rows).all(axis=(0, 1))])
             found += list(_slips_of_pair(pair, one.raw, costs, states))
-        return Slips(tuple(found), shifts, before, best.fit.residual) if found else None
+        if not found:
+            return None
+        before, after = np.median(np.concatenate(sizes, axis=2), axis=2).T
+        return Slips(tuple(found), shifts, Spread(*before.tolist()), Spread(*after.tolist()))
 
 
 def _slips_of_pair(pair: Pair, raw: Measurements, costs: Array, states: np.ndarray) -> Iterator[Slip]:

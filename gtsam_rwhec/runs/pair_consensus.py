@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from rwhec_factors.se3 import so3_nearest
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
+from gtsam_rwhec.solver.sample_poses import poses_of_samples
 
 #: A hypothesis is fitted at most this often to the measurements that agree with it. Most need two or three fits.
 MOST_FITS = 10
@@ -73,12 +73,12 @@ def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: Consensus
     # Each row is a sample without repetition: the beginning of a random order.
     order = np.argsort(generator.random((options.hypotheses, N)), axis=1)
     samples = order[:, : min(options.sample_size, N)]
-    best = _best(A, B, closed_form(A[samples], B[samples], options), options)
+    best = _best(A, B, hypotheses_of(A[samples], B[samples], options), options)
     for _ in range(MOST_FITS):
         mask = best.agrees
         if mask.sum() < 2:
             break
-        again = _best(A, B, closed_form(A[mask][None], B[mask][None], options), options)
+        again = _best(A, B, hypotheses_of(A[mask][None], B[mask][None], options), options)
         if again.agrees.sum() < mask.sum():
             break
         best = again
@@ -97,56 +97,10 @@ def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: Consensus
     return Consensus(kept, share, best.X, best.Y, best.scale)
 
 
-def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, Array, Array]:
-    """X, Y (H, 4, 4) and scale (H,) of H samples of n measurements, A and B (H, n, 4, 4).
-
-    First the rotations (Shah 2013): sum R_A (x) R_B maps vec R_X to n vec R_Y. The first singular vectors of the sum,
-    projected to SO(3), are R_Y and R_X. Then least squares gives translations and scale: the solution of minimum norm
-    if a sample leaves a direction free.
-    """
-    H, n = A.shape[:2]
-    R_A, R_B = A[..., :3, :3], B[..., :3, :3]
-    # R_Y = R_A R_X R_B': vec over rows, K[(i, j), (k, l)] = sum R_A[i, k] R_B[j, l]
-    K = np.einsum("hnik,hnjl->hijkl", R_A, R_B).reshape(H, 9, 9) / n
-    U, _, Vt = np.linalg.svd(K)
-    R_X, R_Y = _rotation(Vt[:, 0].reshape(H, 3, 3)), _rotation(U[:, :, 0].reshape(H, 3, 3))
-    rows = np.zeros((H, n, 3, 6 + (not options.scale_known)))
-    rows[..., 0:3], rows[..., 3:6] = R_A, -np.eye(3)
-    seen = np.einsum("hij,hnj->hni", R_Y, B[..., :3, 3])
-    right = seen - A[..., :3, 3]
-    if not options.scale_known:  # R_A t_X + t_A - t_Y = (1 / s) R_Y t_B
-        rows[..., 6] = -seen
-        right = -A[..., :3, 3]
-    solution = _least_squares(rows, right)
-    scale: Array = np.ones(H)
-    if not options.scale_known:
-        low, high = 1.0 / (1.0 + options.max_scale_error), 1.0 / (1.0 - options.max_scale_error)
-        inverse = np.clip(solution[:, 6], low, high)
-        # At a limit the translations are solved again. The scale is at a limit where the motion does not determine it:
-        # the carrier turns in place.
-        at_limit = inverse != solution[:, 6]
-        if at_limit.any():
-            right = inverse[at_limit, None, None] * seen[at_limit] - A[at_limit, ..., :3, 3]
-            solution[at_limit, :6] = _least_squares(rows[at_limit, ..., :6], right)
-        scale = 1.0 / inverse
-    X, Y = np.zeros((H, 4, 4)), np.zeros((H, 4, 4))
-    X[:, 3, 3] = Y[:, 3, 3] = 1.0
-    X[:, :3, :3], Y[:, :3, :3] = R_X, R_Y
-    X[:, :3, 3], Y[:, :3, 3] = solution[:, :3], solution[:, 3:6]
-    return X, Y, scale
-
-
-def _least_squares(rows: Array, right: Array) -> Array:
-    """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right-hand sides (H, n, 3)."""
-    H, n, _, k = rows.shape
-    inverse = np.linalg.pinv(rows.reshape(H, 3 * n, k), rcond=1e-6)
-    solution: Array = np.einsum("hij,hj->hi", inverse, right.reshape(H, 3 * n))
-    return solution
-
-
-def _rotation(M: Array) -> Array:
-    """The rotations nearest to matrices (H, 3, 3) of unknown sign; the sign is chosen so that det M > 0."""
-    return so3_nearest(M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None])
+def hypotheses_of(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, Array, Array]:
+    """X, Y (H, 4, 4) and scale (H,) of H samples of n measurements, A and B (H, n, 4, 4)."""
+    limits = (1.0 - options.max_scale_error, 1.0 + options.max_scale_error)
+    return poses_of_samples(A, B, is_scaled=not options.scale_known, scales=limits)
 
 
 def distances(A: Array, B: Array, X: Array, Y: Array, scale: Array) -> tuple[Array, Array]:

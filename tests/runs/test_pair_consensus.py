@@ -7,7 +7,7 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.runs import ConsensusOptions, find_consensus
-from gtsam_rwhec.runs.pair_consensus import closed_form, distances
+from gtsam_rwhec.runs.pair_consensus import distances, hypotheses_of
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
@@ -23,12 +23,12 @@ def pair(count: int, seed: int = 0, scale: float = 1.0) -> tuple[np.ndarray, np.
 
 def test_closed_form_is_exact_without_noise() -> None:
     A, B, _ = pair(12)
-    X, Y, scale = closed_form(A[None], B[None], ConsensusOptions())
+    X, Y, scale = hypotheses_of(A[None], B[None], ConsensusOptions())
     metres, radians = distances(A, B, X, Y, scale)
     assert metres.max() < 1e-9
     assert radians.max() < 1e-6
     A, B, _ = pair(12, scale=1.07)
-    X, Y, scale = closed_form(A[None], B[None], ConsensusOptions(scale_known=False))
+    X, Y, scale = hypotheses_of(A[None], B[None], ConsensusOptions(scale_known=False))
     assert scale[0] == pytest.approx(1.07, rel=1e-9)
 
 
