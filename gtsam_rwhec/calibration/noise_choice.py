@@ -13,7 +13,6 @@ from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.block_agreement import too_much
 from gtsam_rwhec.fitting.fit_options import Component, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio_words
 from gtsam_rwhec.fitting.noise_refinement import under_noise
@@ -263,12 +262,12 @@ def _say_blocks(run: Run, model: NoiseInData) -> None:
     """Record whether blocks of the log agree as well as the noise allows; if they do not by far, add a finding."""
     if not model.scatter:
         return
-    worst = too_much(model.scatter)
+    worst = model.worst
     if worst is None:
         run.record.choose("blocks of the log", "agree as well as the noise allows", str(model.scatter[0]))
         return
     run.record.choose("blocks of the log", "do not agree; the standard deviations are larger for it", str(worst))
-    if worst.is_by_far:
+    if worst.is_by_far and not model.is_drift_untried:  # which is said
         words = f"{worst}: errors are of another kind than any model of the noise that was tried, and last for long"
         run.record.find(Ground.CORRELATED, words)
 

@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.block_agreement import Scatter, too_much
+from gtsam_rwhec.fitting.block_agreement import Scatter
 from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -92,6 +92,8 @@ class NoiseInData:
     constant_deviations: tuple[tuple[float, ...], ...] = ((0.0,) * 6,) * 2
     #: How much blocks of the log scatter, for each way to cut it; empty of few instants.
     scatter: tuple[Scatter, ...] = ()
+    #: The one by which the covariance is larger; None where blocks agree.
+    worst: Scatter | None = None
     #: How often the errors of a track jump: it was cut there.
     jumps: int = 0
 
@@ -161,13 +163,11 @@ class NoiseInData:
             )
         if self.jumps:
             said.append(f"The errors jump {self.jumps} times, as where loops are closed; the track is cut there.")
-        worst = too_much(self.scatter)
-        if worst is not None:
-            said.append(
-                f"{worst}: the standard deviations are {rounded(math.sqrt(worst.ratio))} times as large for it."
-            )
+        if self.worst is not None:
+            times = rounded(math.sqrt(self.worst.ratio))
+            said.append(f"Blocks disagree: {self.worst}; so all standard deviations are {times} times as large.")
         elif self.scatter:
-            said.append(f"{self.scatter[0]}.")
+            said.append(f"Blocks agree: {self.scatter[0]}.")
         return tuple(said)
 
     def __str__(self) -> str:
@@ -236,7 +236,12 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
 
 
 def noise_in(
-    task: Task, found: Settled, mixture: Mixture, constant: tuple[Array, Array], scatter: tuple[Scatter, ...]
+    task: Task,
+    found: Settled,
+    mixture: Mixture,
+    constant: tuple[Array, Array],
+    scatter: tuple[Scatter, ...],
+    worst: Scatter | None,
 ) -> NoiseInData:
     """What the data say of their noise; `constant` are the variances of `constant_variances`."""
     white = found.white or found
@@ -270,30 +275,25 @@ def noise_in(
         systematic_probability=_probability(task, found),
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
         scatter=scatter,
+        worst=worst,
         jumps=len(task.jumps),
     )
 
 
-def mixed(
-    task: Task, found: Settled, scatter: tuple[Scatter, ...]
-) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
+def mixed(task: Task, found: Settled, worst: Scatter | None) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
     """The covariance, with the components' uncertainty mixed in, and the arm's constant error added; and its parts.
 
-    Where blocks of the log scatter more than the noise allows, it is as much larger.
+    Where blocks of the log scatter more than the noise allows (``worst``), it is as much larger.
     """
     is_dense = task.instants.count > INSTANTS
     mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     constant = constant_variances(task, found, state, mixture)
-    worst = too_much(scatter)
     finite = basis @ mixture.covariance @ basis.T * (1.0 if worst is None else worst.ratio)
     for poses, variances in zip((state.X, state.Y), constant, strict=True):
         shift = _shifts(task, poses)
         finite += (shift * variances) @ shift.T
-    if is_drift_untried(task, found):
-        wider = widening(task, found, finite)
-        finite = finite * wider[:, None] * wider
     return replace(task.layout, finite=finite), mixture, constant
 
 
@@ -360,37 +360,3 @@ def _probability(task: Task, found: Settled) -> float:
 def _distance(poses: dict[str, gtsam.Pose3]) -> float:
     """The typical distance of frames from their carrier, m; without frames, the smallest."""
     return max(float(np.median([float(np.linalg.norm(pose.translation())) for pose in poses.values()] or [0.0])), 1e-6)
-
-
-#: So many blocks, and one instant in each at least.
-BLOCKS = 10
-
-
-def widening(task: Task, found: Settled, claimed: Array) -> Array:
-    """By how much (d,) the standard deviations of the unknowns are too small, as blocks of time say; 1 at least.
-
-    ``claimed`` (d, d) is their covariance as it is: errors of the configuration may have widened it already.
-    """
-    rows, basis, count = found.model.rows, found.model.basis, task.instants.count
-    wider = np.ones(len(task.layout.unit))
-    if count < 2 * BLOCKS:
-        return wider
-    sigma = found.fit.sizes.values(found.fit.logs)
-    E = found.model.carrier(sigma)
-    root = np.linalg.cholesky(found.model.white(sigma) + E @ E.transpose(0, 2, 1))
-    J = np.linalg.solve(root, rows.by_unknowns.by(basis).whole)
-    r = np.linalg.solve(root, rows.residual[:, :, None])[:, :, 0]
-    p = J.shape[2]
-    H = np.linalg.inv(np.einsum("nip,niq->pq", J, J, optimize=True) + found.model.prior_information)
-    scores = np.zeros((BLOCKS, p))
-    np.add.at(scores, rows.instants.index * BLOCKS // count, np.einsum("nip,ni->np", J, r))
-    scores -= scores.mean(axis=0)
-    by_blocks = basis @ (H @ (scores.T @ scores) @ H) @ basis.T * (BLOCKS / (BLOCKS - 1.0))
-    for place in task.layout.slots.values():
-        whole = np.arange(len(wider))[place]
-        for part in np.array_split(whole, max(len(whole) // 3, 1)):
-            variance = float(np.trace(claimed[np.ix_(part, part)]))
-            if variance > 0.0:
-                ratio = float(np.trace(by_blocks[np.ix_(part, part)])) / variance
-                wider[part] = np.sqrt(max(ratio, 1.0))
-    return wider

@@ -15,7 +15,7 @@ from gtsam_rwhec.fitting.drift import drift_columns
 from gtsam_rwhec.fitting.fit_options import C, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
 from gtsam_rwhec.fitting.noise_graph import refined_of
-from gtsam_rwhec.fitting.noise_in_data import NoiseInData, mixed, noise_in, settled
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData, is_drift_untried, mixed, noise_in, settled
 from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
 from gtsam_rwhec.fitting.refined import Refined
@@ -57,7 +57,8 @@ class UnderNoise:
         task, found = self.task, self.settled
         task.tell("covariances: with the uncertainty of the noise itself")
         scatter = scatter_of_blocks(task, found)
-        joint, mixture, constant = mixed(task, found, scatter)
+        worst = too_much(scatter, is_drift_untried=is_drift_untried(task, found))
+        joint, mixture, constant = mixed(task, found, worst)
         layout = task.layout
         frames = [
             layout.slots[unknown]
@@ -68,11 +69,10 @@ class UnderNoise:
         # Two kinds of noise at least share what equations there are to spare.
         spare = 6 * task.problem.number_of_measurements - len(layout.unit)
         freedom = min(freedom, max(0.5 * spare, FEWEST))
-        worst = too_much(scatter)
         freedom = freedom if worst is None else min(freedom, worst.freedom)
         task.tell("covariances: the graph of the answer")
         refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
-        noise = noise_in(task, found, mixture, constant, scatter)
+        noise = noise_in(task, found, mixture, constant, scatter, worst)
         return replace(refined, noise_sentences=noise.sentences), noise
 
 

@@ -43,8 +43,9 @@ def poses_of_samples(
     R_X, R_Y = _rotations(Vt[:, 0].reshape(H, 3, 3)), _rotations(U[:, :, 0].reshape(H, 3, 3))
     seen = np.einsum("hij,hnj->hni", R_Y, B[..., :3, 3])
     columns = [R_A, np.broadcast_to(-np.eye(3), (H, n, 3, 3))]
+    scale: Array = np.ones(H)
     if not is_scaled:
-        solution, scale = _least_squares(np.concatenate(columns, axis=3), seen - t_A, root), np.ones(H)
+        solution = _least_squares(np.concatenate(columns, axis=3), seen - t_A, root)
     else:  # R_A t_X + t_A - t_Y = (1 / s) R_Y t_B
         rows = np.concatenate([*columns, -seen[..., None]], axis=3)
         solution = _least_squares(rows, -t_A, root)
