@@ -24,7 +24,8 @@ BUDGET = {
     # frames and quick corners of many detections 490, blocks as the last judge 420, mixed cameras 70
     "lines": 86_450,
     "code": 53_800,
-    "files": 378,
+    # three modules of more than 500 lines were cut in two: three files
+    "files": 382,
     "packages": 18,
     "names that occur twice": 0,
     "lines of tests and benchmarks": 67_080,

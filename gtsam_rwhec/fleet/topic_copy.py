@@ -21,7 +21,7 @@ from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
 from gtsam_rwhec.files.budgets import Spending
 from gtsam_rwhec.files.whole_files import atomic_stream
 from gtsam_rwhec.fleet.stores import count_bytes, local_path, read_ranges, shown, size_of
-from gtsam_rwhec.logs.mcap_file import FAULTS, MAGIC, RECORD, read_index
+from gtsam_rwhec.logs.mcap_index import FAULTS, MAGIC, RECORD, read_index
 from gtsam_rwhec.logs.records import TF_TOPICS, Topic
 
 #: Bytes. A smaller file on disk is never copied.

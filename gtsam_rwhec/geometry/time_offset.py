@@ -10,93 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.ndimage import median_filter
 from scipy.special import stdtrit
 
 from gtsam_rwhec.errors import StampError
+from gtsam_rwhec.geometry.correlated_noise import CorrelatedNoise, likeliest
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import SmoothPath, Trajectory
-
-#: Shares s of the correlated noise in the variance, with time constants (s); likelihood compares them. The last ones
-#: are random walks over seconds to minutes.
-CHOICES = (
-    *product((0.2, 0.5, 0.8, 0.95), (0.15, 0.5, 1.5, 5.0, 20.0)),
-    *product((0.9, 0.99, 0.999, 0.9999, 0.99999, 0.9999999), (200.0,)),
-)
-#: Correlated noise replaces white noise if -2 log likelihood falls by this much: 99 % of chi-square with two degrees of
-#: freedom.
-CLEARLY_LIKELIER = 9.2
-
-
-@dataclass(frozen=True)
-class CorrelatedNoise:
-    """The weights Sigma^-1 of n measurements in order of time: white noise, and noise with decaying correlation.
-
-    A detection's error depends on the view, and visual odometry drifts; neighbouring errors are alike. Sigma is
-    w I + s K with w + s = 1 and K_ij = exp(-|t_i - t_j| / tau) (Ornstein-Uhlenbeck). K^-1 is tridiagonal (Rue and Held,
-    Gaussian Markov Random Fields, Section 1.1): all below takes time proportional to n, by Sigma^-1 =
-    K^-1 (s I + w K^-1)^-1 and log|Sigma| = log|s I + w K^-1| + log|K|.
-    """
-
-    share: float  #: Part of the variance that fades, s
-    time_constant_s: float  #: tau
-
-    @staticmethod
-    def white() -> CorrelatedNoise:
-        """Noise without correlation."""
-        return CorrelatedNoise(0.0, 1.0)
-
-    def weighted(self, seconds: Array, columns: Array) -> tuple[Array, float]:
-        """Sigma^-1 times columns (n, m), and log|Sigma|; ``seconds`` (n,) do not decrease."""
-        if self.share == 0.0:
-            return columns, 0.0
-        rho = np.minimum(np.exp(-np.diff(seconds) / self.time_constant_s), 1.0 - 1e-9)
-        rest = 1.0 - rho**2
-        diagonal = np.ones(len(seconds))
-        diagonal[1:] += rho**2 / rest
-        diagonal[:-1] += rho**2 / rest
-        beside = -rho / rest
-        banded = np.zeros((2, len(seconds)))
-        banded[0, 1:] = (1.0 - self.share) * beside
-        banded[1] = self.share + (1.0 - self.share) * diagonal
-        factor = cholesky_banded(banded)
-        U = cho_solve_banded((factor, False), columns)
-        result: Array = diagonal[:, None] * U
-        result[1:] += beside[:, None] * U[:-1]
-        result[:-1] += beside[:, None] * U[1:]
-        return result, float(2.0 * np.log(factor[1]).sum() + np.log(rest).sum())
-
-
-def likeliest(tracks: list[tuple[Array, Array]]) -> tuple[CorrelatedNoise, float]:
-    """The noise that makes residuals likeliest, and -2 log of this likelihood, up to a constant.
-
-    White noise is the answer unless another one is clearly likelier.
-
-    Parameters
-    ----------
-    tracks : list of (seconds (n,), residuals (n, m))
-        Columns of residuals have one variance; tracks are independent of one another.
-    """
-    count = sum(r.size for _, r in tracks)
-    square = sum(float((r**2).sum()) for _, r in tracks)
-    best, lowest = CorrelatedNoise.white(), count * np.log(square + 1e-300) - CLEARLY_LIKELIER
-    for share, constant in CHOICES:
-        noise = CorrelatedNoise(share, constant)
-        square, determinants = 0.0, 0.0
-        for seconds, r in tracks:
-            weighted, determinant = noise.weighted(seconds, r)
-            square += float((r * weighted).sum())
-            determinants += r.shape[1] * determinant
-        value = count * np.log(square + 1e-300) + determinants
-        if value < lowest:
-            best, lowest = noise, value
-    return best, lowest
-
 
 #: A detection whose rotation is off by more than this many standard deviations is wrong.
 GROSS = 4.5

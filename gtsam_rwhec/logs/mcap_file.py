@@ -1,4 +1,4 @@
-"""One MCAP file: its index, and its blocks of messages, opened one at a time. Nothing in the file is trusted.
+"""One MCAP file: its blocks of messages, opened one at a time. Nothing in the file is trusted.
 
 The `mcap` package reads single records, and its `Summary` holds the index. Its readers are not used, with mcap 1.6.0
 measured: 14 of the 40 hostile files in tests/logs take more memory or time of them than `files/budgets.py` allows, they
@@ -7,68 +7,45 @@ lose all messages of a file with one damaged chunk or one that breaks off, and a
 
 from __future__ import annotations
 
-import io
-import itertools
 import os
-import struct
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
 import lz4.frame
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
-from mcap.summary import Summary
+from mcap.records import Attachment, AttachmentIndex, Chunk, Metadata, MetadataIndex
 from numpy.lib.stride_tricks import sliding_window_view
 
 from gtsam_rwhec.errors import BudgetError, FileFormatError, LogError
-from gtsam_rwhec.files.budgets import CHANNELS, MIB, SCHEMAS, Spending
+from gtsam_rwhec.files.budgets import MIB, Spending
 from gtsam_rwhec.files.whole_files import opened
+from gtsam_rwhec.logs.mcap_index import (
+    CHUNK_HEAD,
+    FAULTS,
+    FOOTER,
+    MAGIC,
+    RECORD,
+    ChannelSpan,
+    Descriptions,
+    Parsed,
+    parsed,
+    read_index,
+    records_in,
+)
 
-MAGIC = b"\x89MCAP0\r\n"
-#: Every record begins with its opcode and its length.
-RECORD = struct.Struct("<BQ")
-#: Reading a record raises these errors if the bytes are no record.
-FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError)
-_FOOTER = struct.Struct("<BQQQI")
-#: A chunk's record begins with opcode, length, first and last log time, and the size that it states for its data.
-_CHUNK_HEAD = struct.Struct("<BQQQQ")
-#: The shortest record of a chunk has this number of bytes.
-_SHORTEST_CHUNK = _CHUNK_HEAD.size + 4 + 4 + 8
 #: A message record begins with these fields.
 _MESSAGE_HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
 #: A block of messages outside chunks has about this many bytes.
 LOOSE_BLOCK = 4 * MIB
 #: Bytes. zstd's decoder may need a window of this size for any content, and else one of the content's size.
 _WINDOW = 8 * MIB
-
-#: Bytes of a file, by offset and length; fewer where the file ends.
-Read = Callable[[int, int], bytes]
-_Parsed = TypeVar("_Parsed")
-
-
-def parsed(read: Callable[[ReadDataStream], _Parsed], content: bytes, begins: int = 0) -> _Parsed:
-    """A record from its content; one of `FAULTS` if it is not one. No length in it leads beyond the content."""
-    stream = io.BytesIO(content)
-    stream.seek(begins)
-    return read(ReadDataStream(stream))
 
 
 @dataclass(frozen=True)
@@ -98,148 +75,6 @@ class Messages:
     heads: np.ndarray
     start: array[int]
     end: array[int]
-
-
-@dataclass
-class ChannelSpan:
-    """How many messages a channel has, and their first and last log time."""
-
-    count: int = 0
-    first_ns: int | None = None
-    last_ns: int | None = None
-
-    def widen(self, first_ns: int, last_ns: int) -> None:
-        """Take a span of times."""
-        self.first_ns = first_ns if self.first_ns is None else min(self.first_ns, first_ns)
-        self.last_ns = last_ns if self.last_ns is None else max(self.last_ns, last_ns)
-
-
-@dataclass
-class Descriptions:
-    """The schemas and channels of a file. An identifier that is described twice, differently, is refused."""
-
-    path: Path
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    #: Each record that was noted, by opcode and identifier, and the bytes of all of an opcode.
-    _noted: dict[tuple[int, int], bytes] = field(default_factory=dict)
-    _bytes: dict[int, int] = field(default_factory=dict)
-
-    def note(self, opcode: int, content: bytes) -> None:
-        """Take a schema or a channel; a BudgetError if there are too many, a LogError if it is none."""
-        key = opcode, int.from_bytes(content[:2], "little")
-        before = self._noted.get(key)
-        if before == content:
-            return
-        what, most = ("schema", SCHEMAS) if opcode == Opcode.SCHEMA else ("channel", CHANNELS)
-        size = self._bytes.get(opcode, 0) + len(content)
-        if size > most:
-            raise BudgetError(
-                f"{self.path}: its {what}s have more than {most} bytes. It is damaged, or made to exhaust who reads it."
-            )
-        try:
-            made: Schema | Channel = parsed(Schema.read if opcode == Opcode.SCHEMA else Channel.read, content)
-        except FAULTS as error:
-            raise LogError(f"a {what} cannot be read: {error}") from error
-        known: dict[int, Schema] | dict[int, Channel] = self.schemas if opcode == Opcode.SCHEMA else self.channels
-        if before is None:
-            self._noted[key], self._bytes[opcode] = content, size
-            known[made.id] = made  # type: ignore[assignment]
-        elif known[made.id] != made:  # entries of a channel may come in another order
-            raise LogError(f"{what} {made.id} is described twice, and differently")
-
-
-@dataclass(frozen=True)
-class Index:
-    """What the index at the end of a file says: mcap's `Summary`, and each channel's count and span of times."""
-
-    summary: Summary
-    descriptions: Descriptions
-    spans: dict[int, ChannelSpan]
-
-
-def read_index(read: Read, path: Path, size: int, spending: Spending, *, with_channels: bool = False) -> Index | None:
-    """The index of a file of `size` bytes; None if there is none, or if the file does not bear it out.
-
-    Only the footer and the index are read. Which channels a chunk has is kept with `with_channels` alone: they may take
-    twelve times the bytes of the index.
-
-    Raises
-    ------
-    BudgetError
-        It lists bytes of the file more than once, or its chunks yield more than a file of this size may.
-    LogError, or one of `FAULTS`
-        It is damaged.
-    """
-    footer_at = size - len(MAGIC) - _FOOTER.size
-    if footer_at < len(MAGIC):
-        return None
-    opcode, length, start, _, _ = _FOOTER.unpack(read(footer_at, _FOOTER.size))
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - RECORD.size or not len(MAGIC) <= start < footer_at:
-        return None
-    data = read(start, footer_at - start)
-    summary, descriptions, spans = Summary(), Descriptions(path), dict[int, ChannelSpan]()
-    for opcode, begins, ends in _records_in(data):
-        spending.take_parts(1)
-        content = data[begins:ends]
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            descriptions.note(opcode, content)
-        elif opcode == Opcode.STATISTICS:
-            summary.statistics = parsed(Statistics.read, content)
-        elif opcode == Opcode.CHUNK_INDEX:
-            chunk = parsed(ChunkIndex.read, content)
-            if chunk.chunk_length < _SHORTEST_CHUNK or chunk.message_start_time > chunk.message_end_time:
-                return None
-            # A channel's span is the span of its chunks: the indexes of single messages are not read.
-            for channel in chunk.message_index_offsets:
-                spans.setdefault(channel, ChannelSpan()).widen(chunk.message_start_time, chunk.message_end_time)
-            summary.chunk_indexes.append(chunk if with_channels else replace(chunk, message_index_offsets={}))
-        elif opcode == Opcode.METADATA_INDEX:
-            summary.metadata_indexes.append(parsed(MetadataIndex.read, content))
-        elif opcode == Opcode.ATTACHMENT_INDEX:
-            summary.attachment_indexes.append(parsed(AttachmentIndex.read, content))
-    summary.schemas, summary.channels = descriptions.schemas, descriptions.channels
-    places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in summary.chunk_indexes]
-    places += [(metadata.offset, metadata.length) for metadata in summary.metadata_indexes]
-    places += [(attachment.offset, attachment.length) for attachment in summary.attachment_indexes]
-    are_inside = all(len(MAGIC) <= at <= start - length and length >= RECORD.size for at, length in places)
-    if not are_inside or not _has_right_counts(summary, spending):
-        return None
-    for (at, length), (next_at, _) in itertools.pairwise(sorted(places)):
-        if at + length > next_at:  # reading them each time would have no end
-            raise BudgetError(
-                f"{path}: its index lists bytes more than once: {length} bytes at byte {at}, and again at byte "
-                f"{next_at}. It is damaged, or made to exhaust who reads it. mcap recover makes a new index."
-            )
-    spending.check_opened(sum(chunk.uncompressed_size for chunk in summary.chunk_indexes))
-    assert summary.statistics is not None
-    for channel, count in summary.statistics.channel_message_counts.items():
-        spans.setdefault(channel, ChannelSpan()).count = count
-    return Index(summary, descriptions, spans)
-
-
-def _has_right_counts(summary: Summary, spending: Spending) -> bool:
-    statistics = summary.statistics
-    counts = {} if statistics is None else statistics.channel_message_counts
-    return (
-        statistics is not None
-        and statistics.chunk_count == len(summary.chunk_indexes)
-        and set(counts) <= set(summary.channels)
-        and bool(summary.chunk_indexes or not statistics.message_count)
-        and sum(counts.values()) <= spending.budget.parts
-    )
-
-
-def _records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """The opcode, and where the content begins and ends, of each record that is whole."""
-    at = 0
-    while at + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, at)
-        start = at + RECORD.size
-        at = start + length
-        if at > len(data):
-            return
-        yield opcode, start, at
 
 
 class McapFile:
@@ -295,10 +130,10 @@ class McapFile:
 
     def _found(
         self,
-        read: Callable[[ReadDataStream], _Parsed],
+        read: Callable[[ReadDataStream], Parsed],
         opcode: int,
         places: Sequence[MetadataIndex] | Sequence[AttachmentIndex],
-    ) -> Iterator[_Parsed]:
+    ) -> Iterator[Parsed]:
         """The records at some places; damaged ones are left out, as who needs what is not there says so."""
         with self._opened() as stream:  # opened anew: they may be asked for after the log is closed
             for place in places:
@@ -365,15 +200,15 @@ class McapFile:
 
     def _stated_size(self, at: int) -> int:
         """The size that a chunk states for its decompressed data; 0 if no chunk can be read there."""
-        head = self._read(at, _CHUNK_HEAD.size)
-        return int(_CHUNK_HEAD.unpack(head)[4]) if len(head) == _CHUNK_HEAD.size else 0
+        head = self._read(at, CHUNK_HEAD.size)
+        return int(CHUNK_HEAD.unpack(head)[4]) if len(head) == CHUNK_HEAD.size else 0
 
     def _read_through(self) -> None:
         """Find the blocks of a file without an index, and the place where it ends or is damaged."""
         at, loose_at, is_cut = len(MAGIC), 0, False
         for opcode, begins, length in self._records():
             at = begins
-            if opcode == Opcode.DATA_END or (opcode == Opcode.FOOTER and length == _FOOTER.size):
+            if opcode == Opcode.DATA_END or (opcode == Opcode.FOOTER and length == FOOTER.size):
                 self._count_loose(loose_at, at)
                 return
             if at + length > self.size:
@@ -470,7 +305,7 @@ class McapFile:
     def _split(self, data: bytes, offset: int) -> Messages:
         starts, ends = array("Q"), array("Q")
         count, most, head_bytes = 0, self.spending.budget.parts, _MESSAGE_HEAD.itemsize
-        for opcode, start, end in _records_in(data):
+        for opcode, start, end in records_in(data):
             count += 1
             if count > most:
                 break

@@ -20,7 +20,8 @@ from gtsam_rwhec.cameras.targets import CORNERS, Checkerboard, CircleGrid
 from gtsam_rwhec.cameras.unknown_intrinsics import estimated_intrinsics
 from gtsam_rwhec.detect.board_evidence import FoundBoard
 from gtsam_rwhec.detect.checkerboards import find_checkerboard
-from gtsam_rwhec.detect.circle_grids import MOST_BLOBS, Ellipses, blobs_in, find_circle_grid, grown_lattices
+from gtsam_rwhec.detect.circle_grids import find_circle_grid
+from gtsam_rwhec.detect.circle_lattices import MOST_BLOBS, Ellipses, blobs_in, grown_lattices
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.detect.saddle_lattices import lattice_sizes
 from gtsam_rwhec.errors import CameraError

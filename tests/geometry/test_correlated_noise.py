@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.geometry.time_offset import CorrelatedNoise, likeliest
+from gtsam_rwhec.geometry.correlated_noise import CorrelatedNoise, likeliest
 
 SECONDS = np.sort(np.random.default_rng(0).uniform(0.0, 20.0, 300))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.detect.circle_grids import NONE, Ellipses
+from gtsam_rwhec.detect.circle_lattices import NONE, Ellipses
 from gtsam_rwhec.rig.guessed_boards import lattice_size, rectangle, shifted_rows
 
 
