@@ -1,8 +1,9 @@
 """Grids of circles: lattices of ellipses, tested against the board, turned by its larger dot; and their centres.
 
 A lattice (`circle_lattices`) with a wrong circle, one circle off, or of another size must not count: every circle must
-be there and have its size, and all but a few lie on one plane's grid. The image of a circle's centre is not the centre of its image (Heikkila 2000, section 3.1):
-by how much the projected outline's centroid is off the projected centre is subtracted from the measured centroid.
+be there and have its size, and all but a few lie on one plane's grid. The image of a circle's centre is not the centre
+of its image (Heikkila 2000, section 3.1): by how much the projected outline's centroid is off the projected centre is
+subtracted from the measured centroid.
 """
 
 from __future__ import annotations

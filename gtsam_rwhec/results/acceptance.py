@@ -44,6 +44,10 @@ FLAT = 0.02
 PLACES = 3
 #: Of more boards, those that were seen most often count.
 MOST_BOARDS = 50
+#: No touch is better than this.
+EXACT_M = 1e-9
+#: Noise of more than so many limits is none: points that do not belong together.
+UNLIKE = 20.0
 #: A touch is named that is this rarely so far from the others.
 RARE = 0.01
 
@@ -156,7 +160,7 @@ def accept(
         more=test.needed(limit_m - known_m) if said is Answer.NOT_YET else None,
         places_m=tuple(triple(corners_m[index]) for index in dict.fromkeys(places)),
         lacking=lacking if said is Answer.NOT_DETERMINED else "",
-        remarks=tuple(_remarks(found, fit, points, given=given, stated=stated, of_boards=of_boards)),
+        remarks=tuple(_remarks(found, fit, points, limit_m, given=given, stated=stated, of_boards=of_boards)),
     )
 
 
@@ -249,12 +253,14 @@ def _lacking(test: VolumeTest, points: Array, *, is_stated: bool, of_boards: boo
             "the touches lie on a line, and nothing tells how far off points beside it are; touch points away from the"
         )
         return f"{words} line", not is_stated
+    if not far and test.fit.is_estimated and test.fit.freedoms.min() > 0.0 and test.fit.mean_variance_m2 < EXACT_M**2:
+        return "the points agree to the last digit, so they were computed and not measured; measure them", True
     near = "the touches are too near to one another for this volume; touch points near its corners"
     return near if far else "", False
 
 
 def _remarks(
-    result: Result, fit: ErrorFit, points: Array, *, given: Volume | None,
+    result: Result, fit: ErrorFit, points: Array, limit_m: float, *, given: Volume | None,
     stated: tuple[float, float] | None, of_boards: bool,
 ) -> list[str]:  # fmt: skip
     remarks = []
@@ -264,6 +270,11 @@ def _remarks(
         remarks.append(
             f"the residuals are larger than the stated noise allows; the estimated one counts: "
             f"{rounded(1e3 * fit.noise_m[0])} mm across the line of sight and {rounded(1e3 * fit.noise_m[1])} mm along"
+        )
+    if fit.is_estimated and max(fit.noise_m) > UNLIKE * limit_m:
+        remarks.append(
+            f"the {'views' if of_boards else 'touches'} disagree with one another by {1e3 * max(fit.noise_m):.3g} mm, "
+            "which is no noise: do both points of each line belong together (order, frames), and are all in metres?"
         )
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if given is None and not of_boards and len(spread) == 3 and FLAT * spread[0] >= spread[2]:

@@ -22,6 +22,10 @@ POSES = ("A_qw", "A_qx", "A_qy", "A_qz", "A_x_m", "A_y_m", "A_z_m")
 MOST_OF_TOUCHES = 50_000_000
 
 
+#: No sensor's touched points are farther away, metres.
+FARTHEST_M = 100.0
+
+
 @dataclass(frozen=True, eq=False)
 class Touches:
     """Known points that a sensor measured."""
@@ -46,6 +50,9 @@ class Touches:
             if array.ndim != 2 or array.shape[1:] != (3,) or not (np.abs(array) <= LARGEST_M).all():
                 raise PoseError(f"{name} has the shape {array.shape}; give (n, 3) finite numbers, metres")
             points.append(array)
+        away_m = float(np.median(np.linalg.norm(points[0], axis=1))) if len(points[0]) else 0.0
+        if away_m > FARTHEST_M:
+            raise PoseError(f"the points of the sensor are {away_m:.4g} m away (median): give metres, not millimetres")
         poses = None if A is None else _checked_poses(A, f"A of {source or 'the touches'}")
         counts = [len(each) for each in (*points, *([] if poses is None else [poses]))]
         if len(set(counts)) > 1 or not counts[0]:

@@ -147,14 +147,19 @@ class Intrinsics(Section):
             raise ValueError("size has the width and the height already; leave width and height out")
         width, height = self.size or (self.width, self.height)
         if width is None or height is None or self.K is None:
-            given = {"size: [width, height]": width is not None and height is not None, "K": self.K is not None}
-            raise ValueError(f"{' and '.join(name for name, there in given.items() if not there)} missing")
+            given = {
+                "size: [width, height]": width is not None and height is not None,
+                "K: [fx, fy, cx, cy]": self.K is not None,
+            }
+            missing = " and ".join(name for name, there in given.items() if not there)
+            raise ValueError(f"{missing} missing; give all of a calibration, or write intrinsics: estimate")
         if self.model is None and self.D and any(self.D):
             raise ValueError("D without model; say which coefficients these are: model: radtan, equidistant or unified")
         least = COEFFICIENTS[MODELS.get((self.model or "").strip().lower(), "pinhole")][0]
         if len(self.D or ()) < least:
             words = f"model: {self.model}, and D has {len(self.D or ())} numbers; give all in OpenCV's order"
-            raise ValueError(f"{words}, {least} at least (0 where one is zero), or leave both out where nothing bends")
+            without = "leave model and D out if the lens has no distortion"
+            raise ValueError(f"{words}, {least} at least (0 where one is zero); or {without}")
         fx, fy, cx, cy = self.K
         K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
         return Camera.of(width, height, self.model or "pinhole", K, self.D or (), where)

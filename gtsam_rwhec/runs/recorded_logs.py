@@ -62,10 +62,11 @@ class _Stamped:
 
 
 def is_folder_of_images(path: object, rig: Rig | None) -> bool:
-    """Whether a path is a folder, without a log in it, for a rig file with poses in files."""
-    if rig is None or not isinstance(path, str | Path) or not Path(path).is_dir():
+    """Whether a path is a folder for a rig file with poses in files: with its images, or at least without a log."""
+    if rig is None or rig.carriers.poses.frames is None or not isinstance(path, str | Path) or not Path(path).is_dir():
         return False
-    return rig.carriers.poses.frames is not None and not any(Path(path).glob("*.mcap"))
+    has_images = any(of.images is not None and (Path(path) / of.images).is_dir() for of in rig.sensors.values())
+    return has_images or not any(Path(path).glob("*.mcap"))
 
 
 def check_is_no_other_folder(path: object, rig: Rig | None) -> None:

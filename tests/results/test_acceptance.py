@@ -340,6 +340,22 @@ def test_a_file_of_touches_is_read_by_its_header(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.A[0], [[-1, 0, 0, 0.5], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-15)
 
 
+def test_points_that_were_not_measured_or_do_not_belong_together_are_no_fault_of_the_calibration(
+    result: Result,
+) -> None:
+    seen = seen_points(8)
+    exact = accepted(result, touched(result, seen, noise_m=0.0))
+    assert exact.answer is Answer.NOT_DETERMINED
+    assert "they were computed and not measured" in str(exact)
+    good = touched(result, seen)
+    rows_off = accepted(result, Touches.of(good.sensor_m, np.roll(good.known_m, 1, axis=0)))
+    assert rows_off.answer is not Answer.ACCEPTED
+    assert any("do both points of each line belong together" in remark for remark in rows_off.remarks)
+    assert not any("belong together" in remark for remark in accepted(result, good).remarks)
+    with pytest.raises(PoseError, match="give metres, not millimetres"):
+        Touches.of(1e3 * good.sensor_m, 1e3 * good.known_m)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -156,6 +156,16 @@ def test_the_rig_file_of_a_folder() -> None:
         )
 
 
+def test_images_are_read_where_a_log_lies_beside_them(tmp_path: Path) -> None:
+    """A log that this library had written into the folder was taken in place of the images, without a word."""
+    (tmp_path / "log.mcap").write_bytes(b"")
+    assert not is_folder_of_images(tmp_path, rig("a"))
+    images = rig("a").sensors["a"].images
+    assert images is not None
+    (tmp_path / images).mkdir(parents=True)
+    assert is_folder_of_images(tmp_path, rig("a"))
+
+
 def test_the_two_folders_of_other_people(workcell_camera2: Path, circle_grid_10x10: Path, tmp_path: Path) -> None:
     workcell, circles = parse_rig(WORKCELL, "rig.yaml", workcell_camera2), parse_rig(CIRCLES, "rig.yaml")
     assert is_folder_of_images(workcell_camera2, workcell)
