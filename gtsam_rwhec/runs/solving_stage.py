@@ -314,7 +314,7 @@ def _findings(
     rig, is_misread, late = log.rig, bool(found.misreadings), Ground.LATE_CLOCK
     is_late = any(finding.ground is late for finding in found.findings) and found.refined is None
     for sensor, one in log.doubted.items():
-        if sensor not in refined.intrinsics:
+        if sensor not in refined.intrinsics or rig.sensors[sensor].shared is not None:  # one for all cannot be mended
             yield finding_against(sensor, one, rig)
         elif one.is_far_off and refined.intrinsics[sensor].stated_as == "unknown":
             yield finding_against(sensor, one, rig, refined.intrinsics[sensor].camera)

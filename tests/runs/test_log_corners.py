@@ -101,6 +101,15 @@ def test_two_sensors_with_one_camera_have_one_set_of_intrinsics(workcell_camera2
     refined = solve_log(tmp_path / "calibration.mcap").refined
     assert refined.intrinsics["left"].shared_with == ("right",)
     assert refined.intrinsics["left"].values == refined.intrinsics["right"].values
+    for path in (tmp_path / "cell" / "right").iterdir():  # another lens, of 1.07 times the focal length
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        longer = cv2.getRotationMatrix2D((image.shape[1] / 2.0, image.shape[0] / 2.0), 0.0, 1.07)
+        cv2.imwrite(str(path), cv2.warpAffine(image, longer, image.shape[::-1]))
+    (tmp_path / "other").mkdir()
+    corners_of(tmp_path / "cell", WORKCELL.replace(one, two), tmp_path / "other")
+    other = solve_log(tmp_path / "other" / "calibration.mcap").judgement
+    assert other.grounds[0] is rw.Ground.INTRINSICS_DOUBTED
+    assert "they are those of left (shared), and right is another camera: give it its own" in other.reason
     for path in (tmp_path / "cell" / "right").iterdir():
         cv2.imwrite(str(path), np.zeros((480, 640), np.uint8))
     (tmp_path / "small").mkdir()
