@@ -21,14 +21,15 @@ ROOT = Path(__file__).resolve().parent.parent
 BUDGET = {
     # the simplest camera, bent boards, biases of detectors, errors that images share: 950 lines; checks that
     # could not run: 160; issue 27: the acceptance test 1,210, rows that slip and conventions of angles 650, known
-    # frames and quick corners of many detections 490, blocks as the last judge 420, mixed cameras 70
-    "lines": 86_450,
+    # frames and quick corners of many detections 490, blocks as the last judge 420, mixed cameras 70,
+    # models with and without an arm's errors averaged, scales that drift 50
+    "lines": 86_550,
     "code": 53_800,
     # three modules of more than 500 lines were cut in two: three files
     "files": 382,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 67_080,
+    "lines of tests and benchmarks": 67_140,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

@@ -2,7 +2,7 @@
 
 T_target_sensor as measured is the true one times Expmap(w) (in the sensor's frame), or T_sensor_target is (in the
 target's). A random walk is w_k = Ad(motion^-1) w_{k-1} + xi_k: what odometry does, whose error of a step is made where
-the frame is. With a correlation time it is w_k = phi w_{k-1} + xi_k, as errors of a detector are that vary slowly.
+the frame is. Its scale walks too, and stretches each step from then on, not the whole way. With a correlation time it is w_k = phi w_{k-1} + xi_k, as errors of a detector are that vary slowly.
 """
 
 from __future__ import annotations
@@ -62,16 +62,17 @@ class DriftPrior:
             variance[np.r_[True, ~linked]] = 1.0
         else:
             transport[:] = np.eye(s)
-        if correlation == 1.0 and walk.frame != "detection":
+        if walk.is_of_a_trajectory:
             for chain in range(instants.chains):
                 own = np.flatnonzero(instants.chain == chain)
                 at, first_of = np.unique(instants.index[own], return_index=True)
                 poses = rows.predicted[own[first_of]]
                 if walk.frame == "target":
                     poses = se3.inverse(poses)
-                motion = se3.adjoint(poses[1:] @ se3.inverse(poses[:-1]))  # Ad(motion^-1), motion = T_before_after
+                back = poses[1:] @ se3.inverse(poses[:-1])  # motion^-1, motion = T_before_after
                 first = TRACK * chain
-                transport[at[1:] - 1, first : first + 6, first : first + 6] = motion
+                transport[at[1:] - 1, first : first + 6, first : first + 6] = se3.adjoint(back)
+                transport[at[1:] - 1, first + 3 : first + 6, first + 6] = back[:, :3, 3]
         transport[~linked] = 0.0
         return DriftPrior(transport, variance, linked, walk)
 
@@ -147,7 +148,8 @@ def own_directions(rows: Rows, prior: DriftPrior) -> Array:
     else:
         own[:, :3, :3] = np.eye(3)
         own[:, 3:, 3:6] = np.eye(3) if prior.walk.frame == "target" else back[:, :3, :3]
-    own[:, 3:, 6] = rows.length
+    if not prior.walk.is_of_a_trajectory:
+        own[:, 3:, 6] = rows.length
     return own
 
 

@@ -214,6 +214,11 @@ class Walk(NamedTuple):
     correlation: float
     frame: DriftFrame
 
+    @property
+    def is_of_a_trajectory(self) -> bool:
+        """Whether each step errs on its own, where the frame is: as odometry's and SLAM's do."""
+        return self.correlation == 1.0 and self.frame != "detection"
+
 
 #: Whether a track drifts: "auto" (the data decide), a random walk, errors with a correlation time, or neither.
 Drift = Literal["auto", "walk", "correlated", "none"]

@@ -55,6 +55,8 @@ class Settled:
     fit: Fitted
     #: Without drift and systematic errors.
     white: Settled | None = None
+    #: The components of the same model without systematic errors.
+    steadier: Fitted | None = None
     #: How much -2 log of the density falls with drift, and with systematic errors.
     drift_evidence: float = 0.0
     systematic_evidence: float = 0.0
@@ -322,7 +324,7 @@ def typical_sizes(
             C.DRIFT_SCALE: size_t / length / steps,
         }
         # What walks is a trajectory, whose scale may walk too; a tag's size stays, and a late clock looks like that.
-        active += DRIFT if has_scale or (drift.correlation == 1.0 and drift.walk.frame != "detection") else DRIFT[:2]
+        active += DRIFT if has_scale or drift.walk.is_of_a_trajectory else DRIFT[:2]
     if systematic:
         active += SYSTEMATIC
     return {component: typical[component] for component in active}

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from noisy_rows import problem_of, rows_of
+from rwhec_factors import se3
 from settled_models import SIGMA
 
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns, unit_of
-from gtsam_rwhec.fitting.fit_options import About, Component, Walk
+from gtsam_rwhec.fitting.fit_options import About, Component, DriftFrame, Walk
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel, average_information
 
 C = Component
@@ -180,3 +181,22 @@ def test_components_may_go_to_zero() -> None:
     tiny = {component: value or 1e-12 for component, value in white.items()}
     plain = replace(with_all, drift=None).evaluate(white)
     assert with_all.evaluate(tiny).minus_two_log == pytest.approx(plain.minus_two_log, rel=1e-9)
+
+
+@pytest.mark.parametrize("frame", ["sensor", "target"])
+def test_a_scale_that_drifts_stretches_the_steps_that_follow_it(frame: DriftFrame) -> None:
+    """A trajectory whose steps are too long from its fourth pose on, beside the states that carry this on."""
+    rows = rows_of(problem_of(count=12))[0]
+    poses, stretch = rows.predicted, 1e-6
+    poses = se3.inverse(poses) if frame == "sensor" else poses
+    motions = se3.inverse(poses[:-1]) @ poses[1:]
+    motions[3:, :3, 3] *= 1.0 + stretch
+    stretched = poses.copy()
+    state, found = np.append(np.zeros(6), stretch), [np.zeros(6)] * 4
+    for k, motion in enumerate(motions):
+        stretched[k + 1] = stretched[k] @ motion
+        if k >= 3:
+            state = DriftPrior.of(rows, Walk(1.0, frame)).transport[k] @ state
+            found.append(-state[:6])  # the sign of a scale's logarithm is nobody's
+    expected = se3.logmap(se3.inverse(poses) @ stretched)
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
