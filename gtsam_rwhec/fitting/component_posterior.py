@@ -160,21 +160,19 @@ class Mixture:
     step: Array
     #: (p, p)
     covariance: Array
-    #: (n, k) and (n,): The samples of the components' logarithms, and their weights. A model that lacks a component has
-    #: -inf for it.
+    #: (n, k) and (n,): The samples of the components' logarithms, and their weights.
     logs: Array
     weights: Array
     #: For each sample.
     estimates: tuple[Estimate, ...]
 
     def quantiles(self, probabilities: tuple[float, ...]) -> Array:
-        """Quantiles (m, k) of the components' standard deviations, each where its model has it."""
+        """Quantiles (m, k) of the components' standard deviations."""
         order = np.argsort(self.logs, axis=0)
         result = np.empty((len(probabilities), self.logs.shape[1]))
-        for j, logs in enumerate(self.logs.T):
-            there = order[np.isfinite(logs[order[:, j]]), j]
-            cumulative = np.cumsum(self.weights[there]) / self.weights[there].sum()
-            result[:, j] = np.exp(np.interp(probabilities, cumulative, logs[there]))
+        for j in range(self.logs.shape[1]):
+            cumulative = np.cumsum(self.weights[order[:, j]])
+            result[:, j] = np.exp(np.interp(probabilities, cumulative, self.logs[order[:, j], j]))
         return result
 
     def draws(self, rows: Array, added: Array | None = None) -> tuple[Array, Array]:
@@ -204,17 +202,19 @@ class Mixture:
             return FEWEST
         return float(fdtridfd(m, CONFIDENCE, found / m))
 
-    def share_of(self, rows: Array, added: Array) -> float:
-        """The share of the mean square of ``added`` with which the ellipsoid holds as much of the samples as it says.
+    def share_of(self, rows: Array, added: Array, probability: float = 1.0) -> float:
+        """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
 
         The posterior of a standard deviation that the data hardly show has a long tail. Its mean square would make the
-        ellipsoid far too large, its mode too small. Models that do not have it are zero in ``added``, and not in the
-        mean.
+        ellipsoid far too large, its mode too small. ``probability`` is that of ``added`` being there at all.
         """
         samples, weights = self.draws(rows, added)
+        if probability < 1.0:
+            without, as_often = self.draws(rows)
+            samples = np.concatenate([samples, without])
+            weights = np.concatenate([probability * weights, (1.0 - probability) * as_often])
         plain = rows @ self.covariance @ rows.T
-        has = self.weights * added.any(axis=(1, 2))
-        mean = np.einsum("n,nij,nkj->ik", has / has.sum(), added, added)
+        mean = np.einsum("n,nij,nkj->ik", self.weights, added, added)
         wanted = chdtri(len(rows), 1.0 - CONFIDENCE)
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
@@ -261,24 +261,12 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
     weights = np.exp(-0.5 * (heights - fit.objective) + 0.5 * (drawn**2).sum(axis=1))
     weights = np.minimum(weights / weights.mean(), HEAVIEST)
     weights /= weights.sum()
-    return _mixture(logs, weights, tuple(estimates))
-
-
-def average_of(mixture: Mixture, simpler: Mixture, lacks: np.ndarray, probability: float) -> Mixture:
-    """The average of two models of the same unknowns, of which the simpler ``lacks`` (k,) some components."""
-    logs = np.full((len(simpler.logs), len(lacks)), -np.inf)
-    logs[:, ~lacks] = simpler.logs
-    weights = np.concatenate([probability * mixture.weights, (1.0 - probability) * simpler.weights])
-    return _mixture(np.concatenate([mixture.logs, logs]), weights, mixture.estimates + simpler.estimates)
-
-
-def _mixture(logs: Array, weights: Array, estimates: tuple[Estimate, ...]) -> Mixture:
     steps = np.array([e.step for e in estimates])
     mean = weights @ steps
     away = steps - mean
     covariance = np.einsum("n,nij->ij", weights, np.array([e.covariance for e in estimates]))
     covariance += (weights[:, None] * away).T @ away
-    return Mixture(mean, covariance, logs, weights, estimates)
+    return Mixture(mean, covariance, logs, weights, tuple(estimates))
 
 
 #: A component is at least and at most this many times the typical size of what residuals show of it.

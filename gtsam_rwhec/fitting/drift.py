@@ -2,7 +2,8 @@
 
 T_target_sensor as measured is the true one times Expmap(w) (in the sensor's frame), or T_sensor_target is (in the
 target's). A random walk is w_k = Ad(motion^-1) w_{k-1} + xi_k: what odometry does, whose error of a step is made where
-the frame is. Its scale walks too, and stretches each step from then on, not the whole way. With a correlation time it is w_k = phi w_{k-1} + xi_k, as errors of a detector are that vary slowly.
+the frame is. Its scale walks too, and stretches each step from then on, not the whole way. With a correlation time it
+is w_k = phi w_{k-1} + xi_k, as errors of a detector are that vary slowly.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from scipy.special import expit
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.block_agreement import Scatter
-from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, average_of, mixture_of
+from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_search import (
@@ -198,8 +198,6 @@ CONSTANT = 2.0
 FARTHEST_M, CONSTANT_OF_TRACKER = 5.0, 0.5
 #: Before the data, the odds that an arm has errors that matter beside the noise of detections: one in seven.
 LOG_ODDS = -2.0
-#: A model is the only one beyond this probability.
-CERTAIN = 0.999
 
 
 def settled(task: Task, start: State, tell: Progress, before: Settled | None = None) -> Settled:
@@ -227,13 +225,14 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
     if options.systematic:
         steady = task.settle(white.state, side, None, systematic=True, near=white.fit)
     best = with_drift(task, steady, tell)
-    drift_evidence, steadier = steady.fit.objective - best.fit.objective, white
-    if options.systematic and best.model.drift is not None:  # drift may explain the same
-        steadier = task.settle(best.state, side, best.model.drift.walk, systematic=False, near=best.fit)
-    return replace(
-        best, white=white, steadier=steadier.fit if options.systematic else None, drift_evidence=drift_evidence,
-        systematic_evidence=steadier.fit.objective - best.fit.objective if options.systematic else 0.0,
-    )  # fmt: skip
+    drift_evidence, systematic_evidence = steady.fit.objective - best.fit.objective, 0.0
+    if options.systematic:
+        systematic_evidence = white.fit.objective - steady.fit.objective
+        if best is not steady and systematic_evidence > 0.0:  # drift may explain the same
+            kind = None if best.model.drift is None else best.model.drift.walk
+            without = task.settle(best.state, side, kind, systematic=False, near=best.fit)
+            systematic_evidence = without.fit.objective - best.fit.objective
+    return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
 
 
 def noise_in(
@@ -273,7 +272,7 @@ def noise_in(
         has_stamps=task.instants.seconds is not None,
         is_drift_untried=is_drift_untried(task, found),
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
-        systematic_probability=systematic_probability(task, found),
+        systematic_probability=_probability(task, found),
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
         scatter=scatter,
         worst=worst,
@@ -286,7 +285,8 @@ def mixed(task: Task, found: Settled, worst: Scatter | None) -> tuple[JointCovar
 
     Where blocks of the log scatter more than the noise allows (``worst``), it is as much larger.
     """
-    mixture = mixture_under(task, found)
+    is_dense = task.instants.count > INSTANTS
+    mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     constant = constant_variances(task, found, state, mixture)
@@ -295,17 +295,6 @@ def mixed(task: Task, found: Settled, worst: Scatter | None) -> tuple[JointCovar
         shift = _shifts(task, poses)
         finite += (shift * variances) @ shift.T
     return replace(task.layout, finite=finite), mixture, constant
-
-
-def mixture_under(task: Task, found: Settled) -> Mixture:
-    """The unknowns under all probable components, with errors that vary with the configuration and without them."""
-    samples = FEWER_SAMPLES if task.instants.count > INSTANTS else SAMPLES
-    thin, probability = thinned(found.model), systematic_probability(task, found)
-    mixture = mixture_of(thin, found.fit, found.model, samples)
-    if found.steadier is None or probability > CERTAIN:
-        return mixture
-    lacks = np.array([component in SYSTEMATIC for component in found.fit.sizes.active])
-    return average_of(mixture, mixture_of(thin, found.steadier, found.model, samples), lacks, probability)
 
 
 def is_drift_untried(task: Task, found: Settled) -> bool:
@@ -337,7 +326,7 @@ def constant_variances(task: Task, found: Settled, state: State, mixture: Mixtur
     share = CONSTANT_OF_TRACKER if is_no_arm(task) else CONSTANT
     places = [active.index(c) for c in (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)]
     deviations = share * np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)
-    has = mixture.weights * deviations.any(axis=1)
+    probability = _probability(task, found)
 
     def of(poses: dict[str, gtsam.Pose3]) -> Array:
         shift, shares = _shifts(task, poses), [0.0]
@@ -345,8 +334,8 @@ def constant_variances(task: Task, found: Settled, state: State, mixture: Mixtur
             rows = task.layout.slots.get(Unknown(UnknownKind.FRAME, name))
             if rows is not None and shift[rows].any() and not task.layout.free[rows].any():
                 roots = shift[rows] * deviations[:, None, :]
-                shares.append(mixture.share_of(found.model.basis[rows], roots))
-        variances: Array = max(shares) * (has @ deviations**2) / has.sum()
+                shares.append(mixture.share_of(found.model.basis[rows], roots, probability))
+        variances: Array = max(shares) * (mixture.weights @ deviations**2)
         return variances
 
     return of(state.X), of(state.Y)
@@ -362,7 +351,7 @@ def _shifts(task: Task, poses: dict[str, gtsam.Pose3]) -> Array:
     return shift
 
 
-def systematic_probability(task: Task, found: Settled) -> float:
+def _probability(task: Task, found: Settled) -> float:
     """That errors which vary with the configuration are there, by the likelihoods' ratio."""
     is_stated = any(component in task.options.stated for component in SYSTEMATIC)
     return 1.0 if is_stated else float(expit(0.5 * found.systematic_evidence + LOG_ODDS))

@@ -55,8 +55,6 @@ class Settled:
     fit: Fitted
     #: Without drift and systematic errors.
     white: Settled | None = None
-    #: The components of the same model without systematic errors.
-    steadier: Fitted | None = None
     #: How much -2 log of the density falls with drift, and with systematic errors.
     drift_evidence: float = 0.0
     systematic_evidence: float = 0.0

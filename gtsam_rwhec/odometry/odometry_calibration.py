@@ -111,7 +111,7 @@ def calibrate_odometries(
     drive = _Drive(tuple(tracks), tuple(gates), tuple(clocks), reference, given, options, tell)
     tell("choosing windows")
     first = drive.calibrated(options.window_s)
-    return first if options.window_s else _agreeing(drive, first)
+    return _narrowed(first) if options.window_s else _agreeing(drive, first)
 
 
 @dataclass(frozen=True)
@@ -198,9 +198,14 @@ def _agreeing(drive: _Drive, first: OdometryCalibration) -> OdometryCalibration:
             break
         words = words or off
     if not words:
-        return first
+        return _narrowed(first)
     words += f". Its errors are no random walk; the poses are from windows of {answer.windows.seconds:.2g} s"
     return replace(answer, findings=(*answer.findings, Finding(Ground.COVARIANCE_DOUBTED, words)))
+
+
+def _narrowed(found: OdometryCalibration) -> OdometryCalibration:
+    """Blocks of windows that scatter less than expected make the covariance smaller, after all comparisons."""
+    return replace(found, covariance=found.covariance * found.possible)
 
 
 def _disagreement(one: OdometryCalibration, other: OdometryCalibration) -> str:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.special import chdtri
 
 from gtsam_rwhec.calibration.known_frames import MOST_M, MOST_RAD, VERTICAL_RAD, deviations_of
 from gtsam_rwhec.calibration.verdict import Finding, Ground
@@ -39,7 +40,7 @@ def calibration_of(
     sensors = (reference, *(name for name in names if name != reference))
     change, T, order = _in_frame_of(reference, task, state.T)
     scaled = [name for k, name in enumerate(names) if task.scaled[k]]
-    C = answer.freedom.covariance()
+    C = answer.freedom.covariance() + answer.errors.widening
     scatter = _scatter_of_blocks(answer, task, change, order)
     worst = too_much(scatter)
     covariance = change @ C @ change.T * (1.0 if worst is None else worst.ratio)
@@ -84,7 +85,8 @@ def calibration_of(
         influences=_influences(answer, task, change, order),
         others=others,
         findings=(*_findings(answer, task, tracks, clocks, sigmas, sizes), *_of_blocks(worst)),
-        remarks=_remarks(task),
+        remarks=(*_remarks(task), *answer.errors.in_words(names)),
+        possible=_at_most(scatter),
     )
 
 
@@ -110,6 +112,19 @@ def _scatter_of_blocks(answer: Answer, task: Task, change: Array, order: tuple[s
             for k, name in enumerate(order)
         )
     return found
+
+
+#: Blocks that scatter less than expected narrow the covariance: to what it is at most, but for this chance.
+TOO_NARROW = 0.05
+
+
+def _at_most(scatter: list[Scatter]) -> float:
+    """The largest factor of the covariance that some cut into blocks leaves possible, 1 at most.
+
+    White noise of a pose, as motion capture has it, is taken back in the next window, and no walk.
+    """
+    possible = (one.ratio * one.freedom / float(chdtri(one.freedom, 1.0 - TOO_NARROW)) for one in scatter)
+    return min(1.0, max(possible, default=1.0))
 
 
 def _of_blocks(worst: Scatter | None) -> tuple[Finding, ...]:

@@ -157,6 +157,8 @@ class OdometryCalibration:
     #: CONTRADICTED: a whole track looks wrong, or contradicts a given distance; COVARIANCE_DOUBTED: doubtful results
     findings: tuple[Finding, ...] = ()
     remarks: tuple[str, ...] = ()  #: What was assumed, in sentences
+    #: The largest factor of the covariance that blocks of windows leave possible, 1 at most
+    possible: float = 1.0
 
     @property
     def status(self) -> Status:

@@ -119,6 +119,7 @@ class WindowMotions:
     start: Array
     end: Array
     M: Array  #: (m, n, 4, 4): T_before_after of each sensor, lengths as it measured them
+    T_end: Array  #: (m, n, 4, 4): T_start_sensor at the windows' ends
     used: np.ndarray  #: (m, n) booleans: where a sensor has the window
     length: Array  #: (m, n) s
     #: first, second: (m, n, 3) and (m, n, 3, 3): Integrals of p dt and p p' dt along the way, p in the frame at the
@@ -138,9 +139,9 @@ class WindowMotions:
         kept = used.sum(axis=0) >= 2
         start, end, used = start[kept], end[kept], used[:, kept]
         parts = [_of_track(track, start, end, clocks=clocks) for track in tracks]
-        M, length, first, second, by_offset = (np.array(part) for part in zip(*parts, strict=True))
+        M, T_end, length, first, second, by_offset = (np.array(part) for part in zip(*parts, strict=True))
         M[~used] = np.eye(4)
-        return WindowMotions(start, end, M, used, length, first, second, by_offset)
+        return WindowMotions(start, end, M, T_end, used, length, first, second, by_offset)
 
     @property
     def sensors(self) -> int:
@@ -178,7 +179,7 @@ class WindowMotions:
         """The same motions, without those of sensor and window (m, n) where ``left_out`` is true."""
         used = self.used & ~left_out
         kept = used.sum(axis=0) >= 2
-        parts = (self.M, used, self.length, self.first, self.second, self.by_offset)
+        parts = (self.M, self.T_end, used, self.length, self.first, self.second, self.by_offset)
         return WindowMotions(self.start[kept], self.end[kept], *(part[:, kept] for part in parts))
 
 
@@ -187,10 +188,10 @@ def _of_track(track: SampledTrack, start: Array, end: Array, *, clocks: bool) ->
     M = se3.inverse(T_start) @ T_end
     length, first, second = track.path_sums(start, end, T_end)
     if not clocks:
-        return M, length, first, second, np.zeros((len(start), 6))
+        return M, T_end, length, first, second, np.zeros((len(start), 6))
     at_start = np.einsum("nij,nj->ni", se3.adjoint(se3.inverse(M)), track.velocities(start))
     # The sensor's stamp t is the reference's t + offset: a larger offset reads the track earlier.
-    return M, length, first, second, at_start - track.velocities(end)
+    return M, T_end, length, first, second, at_start - track.velocities(end)
 
 
 def first_rotation_variances(windows: WindowMotions) -> Array:

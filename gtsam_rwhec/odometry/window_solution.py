@@ -22,6 +22,7 @@ from gtsam_rwhec.odometry.joint_cost import joint_form, solved, star_starts
 from gtsam_rwhec.odometry.odometry_record import JointCertificate
 from gtsam_rwhec.odometry.prior_knowledge import GivenRows, Rows
 from gtsam_rwhec.odometry.residual_noise import found_variances, outlying, uncertain_by
+from gtsam_rwhec.odometry.trajectory_errors import TrajectoryErrors
 from gtsam_rwhec.odometry.window_likelihood import (
     SCALE,
     Eliminated,
@@ -64,8 +65,12 @@ class Freedom:
 
     def inverse(self) -> Array:
         """The inverse (p, p) of the information, zero along the directions that are left free."""
+        return self.inverse_of(self.information)
+
+    def inverse_of(self, matrix: Array) -> Array:
+        """The inverse (p, p) of a matrix of the unknowns, zero along the directions that are left free."""
         Z = self.complement()
-        inner = Z.T @ self.information @ Z
+        inner = Z.T @ matrix @ Z
         return Z @ np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner))) @ Z.T
 
     def covariance(self) -> Array:
@@ -242,6 +247,7 @@ class Answer:
     fit: Fit
     W: Array  #: (m, n, 6, 6)
     freedom: Freedom
+    errors: TrajectoryErrors
     certificate: JointCertificate
     certified: State  #: The certified answer, before the exact likelihood
 
@@ -265,8 +271,22 @@ def solve_windows(
         if change < 0.2 * SETTLED:
             break
     fit = refined(used.windows, used.W, state, task.layout, task.given, determined)
+    progress("looking for biases, bends and drifts")
+    measured, errors = used.windows, TrajectoryErrors.none(used.windows, task.layout)
+    for _ in range(REFINED):
+        free = freedom_at(used, fit.state, task)
+        linear = replace(fit.linear, r=fit.linear.r + errors.motion)
+        normal, given = eliminated(linear, used.W, task.layout), fit.rows.J.T @ fit.rows.r
+        step = free.inverse_of(free.score)
+        errors = TrajectoryErrors.found(measured, linear, used.W, normal, task.layout, step, given)
+        windows = errors.taken_off(measured)
+        linear = linearised(windows, motions_fitted(windows, used.W, fit.state, task.layout))
+        taken = task.layout.size + round(errors.equations)
+        variances = found_variances(windows, linear, used.variances, task.stated, fit.state.scale, taken)
+        used = replace(used, windows=windows, variances=variances)
+        fit = refined(windows, used.W, fit.state, task.layout, task.given, free.complement())
     free = freedom_at(used, fit.state, task)
-    return Answer(used.windows, used.left_out, used.variances, fit, used.W, free, certificate, certified)
+    return Answer(used.windows, used.left_out, used.variances, fit, used.W, free, errors, certificate, certified)
 
 
 @dataclass(frozen=True)
