@@ -67,8 +67,8 @@ class DriftPrior:
             for chain in range(instants.chains):
                 own = np.flatnonzero(instants.chain == chain)
                 at, first_of = np.unique(instants.index[own], return_index=True)
-                poses = rows.predicted[own[first_of]]
-                if walk.frame == "target":
+                poses = (rows.carriers if walk.is_shared else rows.predicted)[own[first_of]]
+                if walk.frame in ("target", "targetcarrier"):
                     poses = se3.inverse(poses)
                 back = poses[1:] @ se3.inverse(poses[:-1])  # motion^-1, motion = T_before_after
                 first = TRACK * chain
@@ -143,12 +143,15 @@ def own_directions(rows: Rows, prior: DriftPrior) -> Array:
     """The residual's change (N, 6, 7) by its own track's state in rad, m and the logarithm of the scale."""
     N = len(rows.residual)
     own = np.zeros((N, 6, TRACK))
+    frame = prior.walk.frame
     back = se3.inverse(rows.predicted)
-    if prior.walk.frame == "sensor":
+    if frame == "targetcarrier" or frame == "sensorcarrier":
+        own[:, :, :6] = rows.twist[frame]
+    elif frame == "sensor":
         own[:, :, :6] = se3.adjoint(back)
     else:
         own[:, :3, :3] = np.eye(3)
-        own[:, 3:, 3:6] = np.eye(3) if prior.walk.frame == "target" else back[:, :3, :3]
+        own[:, 3:, 3:6] = np.eye(3) if frame == "target" else back[:, :3, :3]
     if not prior.walk.is_of_a_trajectory:
         own[:, 3:, 6] = rows.length
     return own

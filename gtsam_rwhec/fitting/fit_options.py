@@ -204,8 +204,9 @@ CARRIER = (C.CARRIER_ROTATION, C.CARRIER_TRANSLATION)
 DRIFT = (C.DRIFT_ROTATION, C.DRIFT_TRANSLATION, C.DRIFT_SCALE)
 SYSTEMATIC = (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)
 
-#: Whose frame an error is made in; "detection": rotations in the target's axes, translations along the sensor's.
-DriftFrame = Literal["sensor", "target", "detection"]
+#: Whose frame an error is made in; "detection": rotations in the target's axes, translations along the sensor's. In a
+#: carrier's frame it is an error of A, which all tracks share.
+DriftFrame = Literal["sensor", "target", "detection", "targetcarrier", "sensorcarrier"]
 
 
 class Walk(NamedTuple):
@@ -218,6 +219,11 @@ class Walk(NamedTuple):
     def is_of_a_trajectory(self) -> bool:
         """Whether each step errs on its own, where the frame is: as odometry's and SLAM's do."""
         return self.correlation == 1.0 and self.frame != "detection"
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether all tracks share it."""
+        return self.frame in get_args(About)
 
 
 #: Whether a track drifts: "auto" (the data decide), a random walk, errors with a correlation time, or neither.

@@ -21,7 +21,7 @@ from gtsam_rwhec.fitting.noise_search import (
     MOST_TRACKS,
     Settled,
     Task,
-    is_correlated,
+    likeness_of_neighbours,
     moved,
     thinned,
     why_no_drift,
@@ -42,6 +42,8 @@ _UNITS = {
         (C.TRANSLATION, C.DEPTH, C.CARRIER_TRANSLATION, C.DRIFT_TRANSLATION, C.SYSTEMATIC_TRANSLATION), ("mm", 1e3)
     ),
 }  # fmt: skip
+
+_OF_FRAME = {"detection": " of detections", "sensor": " in the sensor's frame", "target": " in the target's frame"}
 
 
 def ratio_words(evidence: float) -> str:
@@ -147,7 +149,7 @@ class NoiseInData:
         if self.correlation is not None:
             steps = [self._words(component) for component in DRIFT if component in self.deviations]
             kind = "Drift in a step" if self.correlation == 1.0 else f"Correlated errors ({self.correlation:g} a step)"
-            kind += " of detections" if self.frame == "detection" else f" in the {self.frame}'s frame"
+            kind += _OF_FRAME.get(self.frame or "", " of the carriers' poses, which all tracks share")
             said.append(
                 f"{kind}: {', '.join(steps)} ({ratio_words(self.drift_evidence)}). "
                 f"{self.instants} frames are worth about {self.worth:.0f}."
@@ -298,8 +300,13 @@ def mixed(task: Task, found: Settled, worst: Scatter | None) -> tuple[JointCovar
 
 
 def is_drift_untried(task: Task, found: Settled) -> bool:
-    """Whether errors of neighbours are alike, and there are too many tracks for a model of that."""
-    return task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED)
+    """Whether errors of neighbours are alike track by track, and there are too many tracks for a model of that."""
+    if task.instants.chains <= MOST_TRACKS:
+        return False
+    eliminated = found.model.eliminated(found.fit.sizes.values(found.fit.logs))
+    left = eliminated.left(eliminated.measured.of.columns)
+    tracks = [left[task.instants.chain == chain] for chain in range(task.instants.chains)]
+    return likeness_of_neighbours(tracks) > SURELY_CORRELATED
 
 
 def is_no_arm(task: Task) -> bool:

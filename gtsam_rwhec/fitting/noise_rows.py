@@ -212,6 +212,8 @@ class Rows:
     predicted: Array
     #: (N, 3): The residual's change by the logarithm of the track's scale.
     length: Array
+    #: (N, 4, 4): A.
+    carriers: Array
 
     @staticmethod
     def of(
@@ -246,7 +248,7 @@ class Rows:
         rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
         return Rows(
             instants, residual, by_unknowns, given, axis, {"targetcarrier": right, "sensorcarrier": left},
-            {"targetcarrier": moving_target, "sensorcarrier": moving_sensor}, rate, predicted, length,
+            {"targetcarrier": moving_target, "sensorcarrier": moving_sensor}, rate, predicted, length, A,
         )  # fmt: skip
 
     @property
@@ -272,6 +274,10 @@ class Rows:
             instants.chains, step, None if instants.seconds is None else instants.seconds[kept],
         )  # fmt: skip
         return Rows(fewer, *(_taken(getattr(self, part.name), rows) for part in fields(self)[1:]))
+
+    def in_one_track(self) -> Rows:
+        """The same rows, whose measurements of an instant share its drift."""
+        return replace(self, instants=replace(self.instants, chain=np.zeros_like(self.instants.chain), chains=1))
 
     def features(self, side: About) -> Array:
         """f (N, k): the centred principal components of the configurations."""

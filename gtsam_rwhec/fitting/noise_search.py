@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
 
 import gtsam
 import numpy as np
@@ -89,10 +88,10 @@ class Task:
     def model(self, state: State, side: About, walk: Walk | None, *, systematic: bool) -> NoiseModel:
         """The model about an estimate, from all measurements."""
         rows = self._rows(state)
-        drift = None if walk is None else DriftPrior.of(rows, walk)
         features = rows.features(side) if systematic else np.zeros((len(rows.residual), 0))
         information, gradient, cost = prior_terms(self.problem, self.variables, state, self.basis)
-        return NoiseModel(rows, side, self.basis, information, gradient, drift, features, cost)
+        model = NoiseModel(rows, side, self.basis, information, gradient, None, features, cost)
+        return model if walk is None else drifting(model, walk)
 
     def model_like(self, model: NoiseModel, state: State) -> NoiseModel:
         """A model of the same kind about another estimate."""
@@ -192,13 +191,11 @@ def moved(state: State, variables: Variables, layout: JointCovariance, d: Array)
 SHORTEST_TRACK = 20
 #: Tracks that are seen at the same instants share a state of at most this many tracks.
 MOST_TRACKS = 9
-#: Kinds of drift that are tried.
-FIRST_WALKS: dict[Drift, tuple[Walk, ...]] = {
-    "auto": tuple(Walk(each, frame) for each in (1.0, 0.9) for frame in get_args(DriftFrame)),
-    "walk": tuple(Walk(1.0, frame) for frame in get_args(DriftFrame)),
-    "correlated": tuple(Walk(0.9, frame) for frame in get_args(DriftFrame)),
-    "none": (),
-}
+#: The frames of a track's own drift, and the correlations that are tried first.
+OWN_FRAMES: tuple[DriftFrame, ...] = ("sensor", "target", "detection")
+FIRST_CORRELATIONS: dict[Drift, tuple[float, ...]] = {
+    "auto": (1.0, 0.9), "walk": (1.0,), "correlated": (0.9,), "none": (),
+}  # fmt: skip
 #: These correlations are tried where the walk is not a random one.
 MORE_CORRELATIONS = (0.6, 0.97, 0.99)
 #: A drift is in the model when it lowers -2 log of the density by more than this.
@@ -213,7 +210,7 @@ CORRELATED = 2.5
 def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     """The best model with drift, where that pays; else the one without."""
     options = task.options
-    if options.drift == "none" or why_no_drift(task) or (options.drift == "auto" and not is_correlated(steady)):
+    if options.drift == "none" or why_no_drift(task):
         return steady
     tell("estimating drift")
     if isinstance(options.drift, Walk):
@@ -228,7 +225,7 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         def fit(kind: Walk, near: Fitted, enough: float) -> Fitted:
             name = "a random walk" if kind.correlation == 1.0 else f"correlation {kind.correlation:g}"
             tell(f"estimating drift: {name}")
-            model, whole = (replace(each, drift=DriftPrior.of(each.rows, kind)) for each in (thin, steady.model))
+            model, whole = (drifting(each, kind) for each in (thin, steady.model))
             sizes = task.sizes(whole, systematic=systematic)
             return fitted(model, sizes, start_at(sizes, near), enough=enough)
 
@@ -236,7 +233,10 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         most = min(map(_height, rough)) + NEAR
         return min(((kind, fit(kind, one, ENOUGH)) for kind, one in rough if _height((kind, one)) <= most), key=_height)
 
-    kind, walk = best_of(FIRST_WALKS[options.drift], steady.fit)
+    kinds = kinds_of(task, steady)
+    if not kinds:
+        return steady
+    kind, walk = best_of(kinds, steady.fit)
     if kind.correlation < 1.0:
         more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
         kind, walk = min((kind, walk), more, key=_height)
@@ -245,14 +245,25 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     return task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
 
 
+def kinds_of(task: Task, steady: Settled) -> list[Walk]:
+    """The kinds of drift that are tried first: of each track, if these are few, and of A, if tracks share it."""
+    kind, chains = task.options.drift, task.instants.chains
+    assert not isinstance(kind, Walk)
+    is_asked = kind != "auto"
+    frames = [*OWN_FRAMES] if chains <= MOST_TRACKS and (is_asked or is_correlated(steady)) else []
+    frames += [steady.model.side] if chains > 1 and (is_asked or frames or is_A_correlated(steady)) else []
+    return [Walk(each, frame) for each in FIRST_CORRELATIONS[kind] for frame in frames]
+
+
+def drifting(model: NoiseModel, walk: Walk) -> NoiseModel:
+    """The model with a drift."""
+    rows = model.rows.in_one_track() if walk.is_shared else model.rows
+    return replace(model, rows=rows, drift=DriftPrior.of(rows, walk))
+
+
 def why_no_drift(task: Task) -> str:
     """Why no drift can be looked for; empty where it can."""
     instants = task.instants
-    if instants.chains > MOST_TRACKS:
-        return (
-            f"{instants.chains} pairs are measured at the same instants, and it can take {MOST_TRACKS} at most; "
-            "errors of neighbours in time are not clearly alike"
-        )
     if instants.count < SHORTEST_TRACK * len(task.data) / instants.chains:
         return f"it takes {SHORTEST_TRACK} instants of each pair, one after the other"
     return ""
@@ -264,12 +275,18 @@ def _height(tried: tuple[Walk, Fitted]) -> float:
     return fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
 
 
-def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:
+def is_correlated(found: Settled) -> bool:
     """Whether residuals of neighbours in time are alike, track by track."""
     rows = found.model.rows
     tracks = np.cumsum(rows.instants.step[rows.instants.index] == 0.0) if rows.instants.chains == 1 else None
     groups = rows.instants.chain if tracks is None else tracks
-    return likeness_of_neighbours([rows.residual[groups == group] for group in np.unique(groups)]) > limit
+    return likeness_of_neighbours([rows.residual[groups == group] for group in np.unique(groups)]) > CORRELATED
+
+
+def is_A_correlated(found: Settled) -> bool:
+    """Whether A's errors of neighbours in time are alike, as all measurements of an instant show them."""
+    sigma = found.fit.sizes.values(found.fit.logs)
+    return likeness_of_neighbours([found.model.eliminated(sigma).effects[1]]) > CORRELATED
 
 
 def likeness_of_neighbours(tracks: Sequence[Array]) -> float:

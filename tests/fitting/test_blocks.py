@@ -30,6 +30,40 @@ def problem_of(correlation: float, frames: int = FRAMES) -> rw.Problem:
     return problem
 
 
+def seen_from_a_path_that_walks(seed: int, frames: int = 60) -> tuple[rw.Problem, np.ndarray]:
+    """Many tags from a body whose path walks in its own frame, as an inertial one does; and T_body_camera."""
+    chance = np.random.default_rng(seed)
+    X, Y = random_poses(chance, 2 * TAGS), random_poses(chance, 1)[0]
+    T_world_body = random_poses(chance, frames, 0.7, 0.3)
+    steps = chance.normal(size=(frames, 6)) * np.repeat([2e-4, 5e-4], 3)
+    error = np.eye(4)
+    A = np.empty_like(T_world_body)
+    for k, T in enumerate(T_world_body):
+        motion = np.eye(4) if k == 0 else np.linalg.inv(T_world_body[k - 1]) @ T
+        error = np.linalg.inv(motion) @ error @ motion @ se3.expmap(steps[k : k + 1])[0]
+        A[k] = np.linalg.inv(T @ error)
+    problem = rw.Problem()
+    for i, at in enumerate(X):
+        noise = chance.normal(size=(frames, 6)) * np.repeat([0.008, 0.002], 3)
+        B = np.linalg.inv(Y) @ np.linalg.inv(T_world_body) @ at @ se3.expmap(noise)
+        problem.add(f"tag_{i}", "camera", A, B, stamps_ns=np.arange(frames) * 10**9)
+    return problem, Y
+
+
+def test_a_path_that_walks_is_in_the_covariance_of_many_tags() -> None:
+    """Each tag's noise hides the walk, and all of an instant show it."""
+    squares = []
+    for seed in range(2):
+        problem, Y = seen_from_a_path_that_walks(seed)
+        found = rw.calibrate(problem)
+        assert found.noise.model is not None
+        assert found.noise.model.frame in ("targetcarrier", "sensorcarrier")
+        error = se3.logmap((np.linalg.inv(found.Y["camera"].matrix()) @ Y)[None])[0]
+        squares.append(float(error @ np.linalg.solve(found.covariance("camera"), error)))
+    assert max(squares) < 22.5  # 99.9 %
+    assert "which all tracks share" in str(found.noise)
+
+
 def settled(problem: rw.Problem) -> tuple[Task, Settled]:
     solution = rw.solve(problem)
     task = task_of(problem, solution)

@@ -56,18 +56,17 @@ def dense_variance(model: NoiseModel, sigma: dict[Component, float]) -> np.ndarr
 
 @pytest.mark.parametrize("side", ["targetcarrier", "sensorcarrier"])
 @pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
+@pytest.mark.parametrize("whose", ["own", "of A"])
 @pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False), (4, 1, True)])
 def test_it_is_that_of_dense_matrices(
-    targets: int, sensors: int, shared: bool, correlation: float | None, side: About
+    targets: int, sensors: int, shared: bool, whose: str, correlation: float | None, side: About
 ) -> None:
     rows, *_ = rows_of(problem_of(targets, sensors, 8, scale="shared", shared=shared))
     # without one frame, nothing is free
     size = rows.jacobian.shape[2]
-    drift = (
-        None
-        if correlation is None
-        else DriftPrior.of(rows, Walk(correlation, "sensor" if side == "targetcarrier" else "target"))
-    )
+    frame: DriftFrame = side if whose == "of A" else "sensor" if side == "targetcarrier" else "target"
+    rows = rows.in_one_track() if whose == "of A" else rows
+    drift = None if correlation is None else DriftPrior.of(rows, Walk(correlation, frame))
     chance = np.random.default_rng(1)
     root = chance.normal(size=(size, size))
     prior, gradient = root @ root.T, chance.normal(size=(size,))
