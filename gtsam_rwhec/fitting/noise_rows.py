@@ -68,6 +68,20 @@ class Instants:
         """The number of instants."""
         return len(self.first)
 
+    @property
+    def bodies(self) -> np.ndarray:
+        """(chains,): The body that each track is of: tracks that share instants are of one."""
+        body = np.arange(self.chains)
+        for _ in range(self.chains):
+            least = np.full(self.count, self.chains)
+            np.minimum.at(least, self.index, body[self.chain])
+            new = body.copy()
+            np.minimum.at(new, self.chain, least[self.index])
+            if np.array_equal(new, body):
+                break
+            body = new
+        return np.unique(body, return_inverse=True)[1]
+
     def cut(self, jumps: np.ndarray) -> Instants:
         """The same, with as good as nothing known of a drift across some instants (J,)."""
         step = self.step.copy()
@@ -276,8 +290,11 @@ class Rows:
         return Rows(fewer, *(_taken(getattr(self, part.name), rows) for part in fields(self)[1:]))
 
     def in_one_track(self) -> Rows:
-        """The same rows, whose measurements of an instant share its drift."""
-        return replace(self, instants=replace(self.instants, chain=np.zeros_like(self.instants.chain), chains=1))
+        """The same rows, whose measurements of an instant share its drift: one track for each body."""
+        bodies = self.instants.bodies
+        return replace(
+            self, instants=replace(self.instants, chain=bodies[self.instants.chain], chains=int(bodies.max()) + 1)
+        )
 
     def features(self, side: About) -> Array:
         """f (N, k): the centred principal components of the configurations."""

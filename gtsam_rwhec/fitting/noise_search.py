@@ -251,7 +251,9 @@ def kinds_of(task: Task, steady: Settled) -> list[Walk]:
     assert not isinstance(kind, Walk)
     is_asked = kind != "auto"
     frames = [*OWN_FRAMES] if chains <= MOST_TRACKS and (is_asked or is_correlated(steady)) else []
-    frames += [steady.model.side] if chains > 1 and (is_asked or frames or is_A_correlated(steady)) else []
+    bodies = int(task.instants.bodies.max()) + 1
+    shares = bodies < chains and bodies <= MOST_TRACKS
+    frames += [steady.model.side] if shares and (is_asked or frames or is_A_correlated(steady)) else []
     return [Walk(each, frame) for each in FIRST_CORRELATIONS[kind] for frame in frames]
 
 
@@ -286,7 +288,10 @@ def is_correlated(found: Settled) -> bool:
 def is_A_correlated(found: Settled) -> bool:
     """Whether A's errors of neighbours in time are alike, as all measurements of an instant show them."""
     sigma = found.fit.sizes.values(found.fit.logs)
-    return likeness_of_neighbours([found.model.eliminated(sigma).effects[1]]) > CORRELATED
+    instants, effects = found.model.rows.instants, found.model.eliminated(sigma).effects[1]
+    bodies = instants.bodies[instants.chain]
+    tracks = [effects[np.unique(instants.index[bodies == body])] for body in np.unique(bodies)]
+    return likeness_of_neighbours(tracks) > CORRELATED
 
 
 def likeness_of_neighbours(tracks: Sequence[Array]) -> float:

@@ -37,8 +37,8 @@ def _groups(stated: np.ndarray) -> Array:
 
 def _by_logarithm(groups: Array, variances: Array) -> Array:
     """Derivatives (2 g, 2 m) of all variances (m, 2) by the logarithms of each group's."""
-    derivatives: Array = np.einsum("gm,mc,cd->gcmd", groups, variances, np.eye(2)).reshape(2 * len(groups), -1)
-    return derivatives
+    derivatives: Array = np.einsum("gm,mc,cd->gcmd", groups, variances, np.eye(2))
+    return derivatives.reshape(2 * len(groups), variances.size)
 
 
 def _unit(scale: Array) -> Array:

@@ -70,6 +70,11 @@ class TrajectoryErrors:
         without = se3.expmap(-self.motion.reshape(-1, 6)).reshape(windows.M.shape)
         return replace(windows, M=windows.M @ without)
 
+    def put_on(self, M: Array) -> Array:
+        """Motions M (m, n, 4, 4) as they are measured with these errors."""
+        found: Array = M @ se3.expmap(self.motion.reshape(-1, 6)).reshape(M.shape)
+        return found
+
     def in_words(self, names: Sequence[str]) -> tuple[str, ...]:
         """A sentence about each sensor that has some."""
         said = []

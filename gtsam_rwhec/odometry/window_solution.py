@@ -34,6 +34,7 @@ from gtsam_rwhec.odometry.window_likelihood import (
     eliminated,
     information_of_noise,
     linearised,
+    predicted,
     weights,
 )
 from gtsam_rwhec.odometry.window_motions import WindowMotions
@@ -278,7 +279,9 @@ def solve_windows(
         linear = replace(fit.linear, r=fit.linear.r + errors.motion)
         normal, given = eliminated(linear, used.W, task.layout), fit.rows.J.T @ fit.rows.r
         step = free.inverse_of(free.score)
-        errors = TrajectoryErrors.found(measured, linear, used.W, normal, task.layout, step, given)
+        # effects on the measured motions would be proportional to their noise
+        as_fitted = replace(measured, M=errors.put_on(predicted(fit.state)))
+        errors = TrajectoryErrors.found(as_fitted, linear, used.W, normal, task.layout, step, given)
         windows = errors.taken_off(measured)
         linear = linearised(windows, motions_fitted(windows, used.W, fit.state, task.layout))
         taken = task.layout.size + round(errors.equations)

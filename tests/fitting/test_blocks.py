@@ -10,7 +10,10 @@ from settled_models import task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.block_agreement import FEWEST, scatter_of_blocks, too_much
+from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import MOST_TRACKS, Settled, Task
+from gtsam_rwhec.fitting.pair_data import PairData
 
 TAGS, FRAMES = MOST_TRACKS + 1, 100
 
@@ -95,3 +98,20 @@ def test_the_verdict_says_that_no_model_holds_the_drift(monkeypatch: pytest.Monk
     for name in ("camera", "tag_0"):
         assert (np.diagonal(calibration.covariance(name)) >= np.diagonal(before.covariance(name))).all()
     assert calibration.covariance("tag_0").trace() > 2.0 * before.covariance("tag_0").trace()
+
+
+def test_bodies_are_told_by_the_instants_that_tracks_share() -> None:
+    """Two bodies with two tracks each: those of one have instants in common."""
+    chance = np.random.default_rng(3)
+    problem = rw.Problem()
+    for body in range(2):
+        A = random_poses(chance, 8)
+        for i in range(2):
+            stamps = np.arange(8) * 10**8 + body * 10**7
+            problem.add(f"tag_{i}_{body}", f"camera_{body}", A, random_poses(chance, 8), stamps_ns=stamps)
+    instants = Instants.of([PairData.of(problem, pair, RefineOptions(), None) for pair in problem.pairs])
+    assert instants.chains == 4
+    body = dict(zip(problem.pairs, instants.bodies.tolist(), strict=True))
+    of = [{body[pair] for pair in problem.pairs if pair.sensor == name} for name in ("camera_0", "camera_1")]
+    assert len(of[0]) == len(of[1]) == 1
+    assert of[0] != of[1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drives_with_sensors import drive, squares, tracks
@@ -90,3 +92,20 @@ def test_what_is_no_random_walk_is_found_and_taken_off(kind: ErrorKind) -> None:
         for one in (found, plain)
     )
     assert error < 5.0 * exact + 0.005
+
+
+def test_outliers_do_not_look_like_errors_that_last() -> None:
+    """Effects on measured motions would be proportional to their noise: a camera was known to 1.6 km."""
+    found = odometry.calibrate_odometries(tracks(drive("3d", 21, outliers=0.02)), reference="lidar")
+    assert found.judgement.verdict == "use"
+    for name in found.order:
+        assert np.sqrt(found.covariance_of(name)[3:, 3:].trace()) < 0.08
+    assert not any("random walk" in remark for remark in found.remarks)
+
+
+def test_noise_may_be_stated_of_every_sensor() -> None:
+    noise = odometry.OdometryNoise(0.002, 0.02)
+    stated = [replace(track, noise=noise) for track in tracks(drive("3d", 2))]
+    found = odometry.calibrate_odometries(stated, reference="lidar")
+    assert found.noise["rear"] == noise
+    assert not found.noise_was_found
