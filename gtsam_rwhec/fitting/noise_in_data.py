@@ -222,11 +222,14 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
     lengths = {"targetcarrier": start.X, "sensorcarrier": start.Y}
     nearer = NEARER if all(lengths.values()) else 0.0  # motions alone have frames on one side only
     score = {side: found.fit.objective + nearer * np.log(_distance(lengths[side])) for side, found in tried.items()}
-    side = min(score, key=lambda each: score[each])
+    side, other = sorted(score, key=lambda each: score[each]) if len(score) > 1 else (sides[0], sides[0])
     white = steady = tried[side]
     if options.systematic:
         steady = task.settle(white.state, side, None, systematic=True, near=white.fit)
     best = with_drift(task, steady, tell)
+    favour = nearer * float(np.log(_distance(lengths[side]) / _distance(lengths[other])))
+    if favour > 0.0:  # beside a drift that nobody knew yet, the far side may have looked better
+        best = task.on_the_other_side(best, tried[other].fit, favour)
     drift_evidence, systematic_evidence = steady.fit.objective - best.fit.objective, 0.0
     if options.systematic:
         systematic_evidence = white.fit.objective - steady.fit.objective

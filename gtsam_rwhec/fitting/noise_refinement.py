@@ -124,7 +124,8 @@ def under_noise(
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
     task = Task(problem, data, variables, layout, Instants.of(data), options, space.directions, tell)
     task = task.cut_at_jumps(state)
-    found = settled(task, state, tell, before)
+    task, found = task.without_false_jumps(settled(task, state, tell, before))
+    task, found = task.without_noise(found)
     return UnderNoise(task, found, solution, how)
 
 
@@ -174,7 +175,9 @@ def agreeing(
             )
             for item in data_of(judged, variables, how)
         ]
-        everything = replace(task, problem=judged, data=data, variables=variables, instants=Instants.of(data))
+        everything = replace(
+            task, problem=judged, data=data, variables=variables, instants=Instants.of(data), white=None
+        )
         everything = everything.cut_at_jumps(state)
         for _ in range(STEPS):
             there = everything.model_like(found.model, state)

@@ -16,6 +16,7 @@ from typing import Any
 import gtsam
 import numpy as np
 from rwhec_factors import se3
+from rwhec_factors.batch import Linearization
 
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -231,10 +232,24 @@ class Rows:
 
     @staticmethod
     def of(
-        data: list[PairData], variables: Variables, state: State, layout: JointCovariance, instants: Instants
+        data: list[PairData],
+        variables: Variables,
+        state: State,
+        layout: JointCovariance,
+        instants: Instants,
+        white: Array | None = None,
     ) -> Rows:
-        """The rows at an estimate; ``layout`` has the places of the unknowns."""
+        """The rows at an estimate; ``layout`` has the places of the unknowns.
+
+        ``white`` (N, 6), in the order of the instants, is the residuals' white noise: derivatives are then without it.
+        """
         at = linearized(data, variables, state)
+        if white is not None:
+            of_data = np.empty_like(white)
+            of_data[instants.order] = white
+            ends = np.cumsum([item.count for item in data])[:-1]
+            for item, own in zip(data, np.split(of_data, ends), strict=True):
+                at[item.pair] = _without_noise(at[item.pair], own)
         frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
         jacobians = []
         blocks: list[list[Array]] = [[] for _ in range(9)]
@@ -306,6 +321,18 @@ class Rows:
         kept = s**2 > SMALLEST_SPREAD * max(float((s**2).sum()), 1e-300)
         found: Array = centred @ directions[kept].T
         return found
+
+
+def _without_noise(linear: Linearization, white: Array) -> Linearization:
+    """The derivatives by X and Y where residuals are nothing, and at poses that are less noisy.
+
+    With r = Log(B^-1 S), S = Y^-1 A X, they are Jr^-1(r) and -Jr^-1(r) Ad(S^-1). Noise of A is in S, and in r: together
+    they say that Y is where it is taken to be. At S Expmap(-white) it would be B's. Nobody knows whose it is: in the
+    middle both weigh the same, with opposite signs.
+    """
+    straight = np.linalg.inv(se3.right_jacobian_inverse(linear.residual))
+    back = se3.adjoint(se3.expmap(0.5 * white)) @ straight
+    return replace(linear, target=straight @ linear.target, sensor=back @ linear.sensor)
 
 
 def _taken(part: Any, rows: np.ndarray) -> Any:

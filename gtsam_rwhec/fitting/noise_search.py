@@ -37,8 +37,11 @@ from gtsam_rwhec.solver.free_directions import FreeDirection
 ROUNDS = 4
 #: The unknowns are settled when they move by less than this part of their standard deviation.
 SETTLED = 0.05
+#: Derivatives' noise counts where it changes a standard deviation by this share.
+FAKE = 0.02
 #: Components are estimated from at most about this many instants; the unknowns, from all.
 INSTANTS = 300
+OTHER_SIDE: dict[About, About] = {"targetcarrier": "sensorcarrier", "sensorcarrier": "targetcarrier"}
 #: The rows at so many estimates are kept.
 KEPT = 3
 #: In fewer rows the unknowns have this share of the information of all rows on top.
@@ -74,6 +77,8 @@ class Task:
     tell: Progress = silent
     #: The instants at which tracks are cut.
     jumps: tuple[int, ...] = ()
+    #: (N, 6): The residuals' white noise, where derivatives are without it.
+    white: Array | None = None
     _known: list[tuple[State, Rows]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -103,9 +108,57 @@ class Task:
         for known, rows in self._known:
             if known is state:
                 return rows
-        self._known.append((state, Rows.of(self.data, self.variables, state, self.layout, self.instants)))
+        found = Rows.of(self.data, self.variables, state, self.layout, self.instants, self.white)
+        self._known.append((state, found))
         del self._known[:-KEPT]
         return self._known[-1][1]
+
+    def on_the_other_side(self, found: Settled, white: Fitted, favour: float) -> Settled:
+        """The optimum with A's errors on the other side, if a drift leads there; else the one that was found.
+
+        ``white`` is what that side's white noise looked like; -2 log of the density may be more by ``favour``.
+        """
+        if found.model.drift is None:
+            return found
+        walk, side = found.model.drift.walk, OTHER_SIDE[found.model.side]
+        walk = Walk(walk.correlation, side) if walk.is_shared else walk
+        systematic = found.model.features.shape[1] > 0
+        model = self.model(found.state, side, walk, systematic=systematic)
+        sizes = self.sizes(model, systematic=systematic)
+        start = np.where([c in DRIFT for c in sizes.active], start_at(sizes, found.fit), start_at(sizes, white))
+        rough = fitted(thinned(model), sizes, start, enough=ROUGH)
+        if rough.objective > found.fit.objective + favour:
+            return found
+        return self.settle(found.state, side, walk, systematic=systematic, near=rough)
+
+    def without_noise(self, found: Settled) -> tuple[Task, Settled]:
+        """The task with derivatives that are without white noise, and the optimum then.
+
+        It matters where a motion hardly excites a direction: a vehicle's heights were 5 standard deviations off.
+        """
+        task, deviations = self, _deviations(found.model, found)
+        for _ in range(ROUNDS):
+            task = replace(self, white=white_noise(found))
+            model = task.model_like(found.model, found.state)
+            after = _deviations(model, found)
+            if (np.abs(after / deviations - 1.0) < FAKE).all():
+                return task, replace(found, model=model)
+            walk = None if model.drift is None else model.drift.walk
+            systematic = model.features.shape[1] > 0
+            again = task.settle(found.state, model.side, walk, systematic=systematic, near=found.fit)
+            found, deviations = replace(found, state=again.state, model=again.model, fit=again.fit), after
+        return task, found
+
+    def without_false_jumps(self, found: Settled) -> tuple[Task, Settled]:
+        """The task with whole tracks and its optimum, where that is as likely as one that is cut at jumps."""
+        if not self.jumps or found.model.drift is None:
+            return self, found
+        whole = replace(self, instants=Instants.of(self.data), jumps=())
+        walk, systematic = found.model.drift.walk, found.model.features.shape[1] > 0
+        again = whole.settle(found.state, found.model.side, walk, systematic=systematic, near=found.fit)
+        if again.fit.objective > found.fit.objective + PAYS * len(self.jumps):
+            return self, found
+        return whole, replace(found, state=again.state, model=again.model, fit=again.fit)
 
     def cut_at_jumps(self, state: State) -> Task:
         """The task with the tracks cut where residuals at an estimate jump: a drift does not reach across."""
@@ -148,6 +201,22 @@ class Task:
             if whole.farthest < SETTLED:
                 break
         return Settled(state, self.model(state, side, walk, systematic=systematic), fit)
+
+
+def _deviations(model: NoiseModel, found: Settled) -> Array:
+    """Standard deviations (p,) of the unknowns under a model with the components that were found."""
+    deviations: Array = np.sqrt(np.diagonal(model.evaluate(found.fit.sizes.values(found.fit.logs)).covariance))
+    return deviations
+
+
+def white_noise(found: Settled) -> Array:
+    """The residuals' white noise (N, 6), of A and of B: what drift and errors of the configuration leave."""
+    eliminated = found.model.eliminated(found.fit.sizes.values(found.fit.logs))
+    rows = found.model.rows
+    of_A = eliminated.effects[1][rows.instants.index]  # of instants that several measurements share
+    left: Array = eliminated.left(eliminated.measured.of.columns)
+    left -= (rows.twist[found.model.side] @ of_A[:, :, None])[:, :, 0]
+    return left
 
 
 def start_at(sizes: Sizes, near: Fitted | None) -> Array:

@@ -131,7 +131,8 @@ def _settled(
             state, space = there, other
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
     task = Task(problem, data, variables, layout, Instants.of(data), noise, space.directions, tell).cut_at_jumps(state)
-    return task, settled(task, state, tell)
+    task, found = task.without_false_jumps(settled(task, state, tell))
+    return task.without_noise(found)
 
 
 def _start(old: RefinedPoses, variables: Variables) -> State:

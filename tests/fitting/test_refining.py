@@ -13,6 +13,7 @@ from gtsam_rwhec.fitting import Component, NoiseOptions, refine_under_noise, und
 from gtsam_rwhec.fitting.component_posterior import SMALLEST, Mixture, Point, Sizes, fitted
 from gtsam_rwhec.fitting.fit_options import Walk
 from gtsam_rwhec.fitting.noise_likelihood import Estimate
+from gtsam_rwhec.fitting.noise_search import Task
 
 C = Component
 X = se3.expmap(np.array([[0.2, -0.3, 0.1, 0.5, 0.4, 0.2]]))[0]
@@ -253,3 +254,44 @@ def test_the_ellipsoid_is_the_average_of_models_with_and_without_an_arms_errors(
     assert shares[0] == pytest.approx(1.0, abs=0.15)
     assert shares[0] > shares[1] > shares[2] > shares[3]
     assert shares[3] < 0.02
+
+
+def hardly_tilting(seed: int, frames: int = 400) -> tuple[rw.Problem, np.ndarray]:
+    """A vehicle that hardly tilts, tracked with white noise, and its camera's odometry, which walks."""
+    chance = np.random.default_rng(seed)
+    t = np.arange(frames) / 15.0
+    frequency, phase = chance.uniform(0.02, 0.3, (4, 6)), chance.uniform(0.0, 6.0, (4, 6))
+    twist = np.sin(2.0 * np.pi * frequency * t[:, None, None] + phase).sum(axis=1) * [0.004, 0.004, 0.8, 2.0, 2.0, 0.03]
+    body = se3.pose(se3.expmap(twist * [1, 1, 1, 0, 0, 0])[:, :3, :3], twist[:, 3:])
+    Y = random_poses(chance, 1, 0.6, 0.1)[0]
+    camera = body @ Y
+    steps = (
+        np.linalg.inv(camera[:-1])
+        @ camera[1:]
+        @ se3.expmap(chance.normal(size=(frames - 1, 6)) * np.repeat([1e-4, 1e-3], 3))
+    )
+    walked = np.empty_like(camera)
+    walked[0] = np.eye(4)
+    for k, step in enumerate(steps):
+        walked[k + 1] = walked[k] @ step
+    noisy = (se3.expmap(chance.normal(size=(frames, 6)) * np.repeat([8e-4, 5e-4], 3)) for _ in range(2))
+    problem = rw.Problem()
+    A, B = (np.linalg.inv(T @ noise) for T, noise in zip((body, walked), noisy, strict=True))
+    problem.add("map", "camera", A, B, stamps_ns=np.round(1e9 * t).astype(np.int64))
+    return problem, Y
+
+
+def test_noise_in_the_derivatives_is_no_information() -> None:
+    """A's noise is in residuals and in their derivatives: together they say that a height is what it is taken to be."""
+    squares, before = [], []
+    for seed in range(2):
+        problem, Y = hardly_tilting(seed)
+        for found, without in ((squares, True), (before, False)):
+            with pytest.MonkeyPatch.context() as patch:
+                if not without:
+                    patch.setattr(Task, "without_noise", lambda self, found: (self, found))
+                refined, _ = refined_under(problem)
+            error = se3.logmap((np.linalg.inv(refined.Y["camera"].matrix()) @ Y)[None])[0]
+            found.append(float(error @ np.linalg.solve(refined.covariance("camera"), error)))
+    assert np.median(squares) < 12.6 < np.median(before)
+    assert max(squares) < max(before)
