@@ -23,13 +23,13 @@ BUDGET = {
     # could not run: 160; issue 27: the acceptance test 1,210, rows that slip and conventions of angles 650, known
     # frames and quick corners of many detections 490, blocks as the last judge 420, mixed cameras 70,
     # errors of trajectories that last, by kind, with their file 230; a drift that tracks share 40
-    "lines": 86_900,
+    "lines": 86_920,
     "code": 54_050,
     # three modules of more than 500 lines were cut in two: three files
     "files": 383,
     "packages": 18,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 67_300,
+    "lines of tests and benchmarks": 67_320,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

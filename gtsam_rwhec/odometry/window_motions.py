@@ -14,6 +14,8 @@ from gtsam_rwhec.geometry.poses import Array
 
 #: Velocities are central differences over this time to each side (s), or over one step where a step is longer.
 HALF_S = 0.1
+#: Poses that are no further apart, m and 1, are the same.
+STILL = 1e-9
 #: Poses of one cubic: the two around the time, one before and one after them.
 POINTS = 4
 
@@ -132,6 +134,7 @@ class WindowMotions:
     def of(tracks: Sequence[SampledTrack], edges: Array, max_gap_s: float, *, clocks: bool = True) -> WindowMotions:
         """Between neighbouring times ``edges`` (n + 1,); windows with fewer than two sensors are left out.
 
+        So are those in which nothing moves: a track that repeats its pose while it stands would seem to have no noise.
         Without ``clocks`` the derivatives with respect to the time offsets are zero.
         """
         start, end = edges[:-1], edges[1:]
@@ -141,7 +144,9 @@ class WindowMotions:
         parts = [_of_track(track, start, end, clocks=clocks) for track in tracks]
         M, T_end, length, first, second, by_offset = (np.array(part) for part in zip(*parts, strict=True))
         M[~used] = np.eye(4)
-        return WindowMotions(start, end, M, T_end, used, length, first, second, by_offset)
+        every = WindowMotions(start, end, M, T_end, used, length, first, second, by_offset)
+        moves = (np.abs(M - np.eye(4)) > STILL).any(axis=(0, 2, 3))
+        return every.without(np.broadcast_to(~moves, used.shape))
 
     @property
     def sensors(self) -> int:

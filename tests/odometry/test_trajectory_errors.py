@@ -109,3 +109,15 @@ def test_noise_may_be_stated_of_every_sensor() -> None:
     found = odometry.calibrate_odometries(stated, reference="lidar")
     assert found.noise["rear"] == noise
     assert not found.noise_was_found
+
+
+def test_tracks_that_repeat_their_pose_while_they_stand_are_no_less_noisy() -> None:
+    def standing(track: odometry.OdometryTrack) -> odometry.OdometryTrack:
+        T = np.asarray(track.T_start_sensor)
+        T = np.concatenate([T[:200], np.repeat(T[200:201], 400, axis=0), T[200:]])
+        return replace(track, stamps_ns=np.arange(len(T)) * 10**8, T_start_sensor=T)
+
+    driven = drive("3d", 7)
+    found = odometry.calibrate_odometries([standing(track) for track in tracks(driven)[:2]], reference="lidar")
+    assert found.judgement.verdict == "use"
+    assert chdtrc(6, squares(found, driven)[0]) > 1e-3
