@@ -235,7 +235,7 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
         systematic_evidence = white.fit.objective - steady.fit.objective
         if best is not steady and systematic_evidence > 0.0:  # drift may explain the same
             kind = None if best.model.drift is None else best.model.drift.walk
-            without = task.settle(best.state, side, kind, systematic=False, near=best.fit)
+            without = task.settle(best.state, best.model.side, kind, systematic=False, near=best.fit)
             systematic_evidence = without.fit.objective - best.fit.objective
     return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
 

@@ -290,7 +290,9 @@ def test_noise_in_the_derivatives_is_no_information() -> None:
             with pytest.MonkeyPatch.context() as patch:
                 if not without:
                     patch.setattr(Task, "without_noise", lambda self, found: (self, found))
-                refined, _ = refined_under(problem)
+                refined, noise = refined_under(problem)
+            assert noise.hand == "sensorcarrier"
+            assert not noise.has_systematic  # the evidence is that of the side that was chosen in the end
             error = se3.logmap((np.linalg.inv(refined.Y["camera"].matrix()) @ Y)[None])[0]
             found.append(float(error @ np.linalg.solve(refined.covariance("camera"), error)))
     assert np.median(squares) < 12.6 < np.median(before)
