@@ -200,7 +200,7 @@ def test_simulated_trajectories_are_right_but_for_their_own_error(imported: Call
     assert found["verdict"] == "use"
     assert found["chance"] > 1e-4
     assert len(trajectories.rows_of([found])) == 5
-    # Beside the drift A's errors are on the body's side, and the evidence of errors of the configuration is of that side.
+    # Beside the drift A's errors are on the body's side, of which the evidence is that they vary with its place.
     flown = trajectories.run("stream", "walk", "flown", 1004)
     assert (flown["verdict"], flown["grounds"]) == ("use", ())
     assert flown["chance"] > 1e-3
