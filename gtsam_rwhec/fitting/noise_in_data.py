@@ -237,6 +237,7 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
             kind = None if best.model.drift is None else best.model.drift.walk
             without = task.settle(best.state, best.model.side, kind, systematic=False, near=best.fit)
             systematic_evidence = without.fit.objective - best.fit.objective
+    white = tried[best.model.side]
     return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
 
 
