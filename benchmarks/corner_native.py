@@ -19,7 +19,7 @@ import corner_times
 import gtsam
 import native_graph
 import numpy as np
-import simulated_models
+import simulated_cells
 from rwhec_factors import se3
 
 from gtsam_rwhec.fitting.corner_graph import CornerGraph
@@ -49,7 +49,7 @@ class Measured:
 def measured(kind: str, views: int) -> Measured:
     """Measure a graph, "ours" or "native"."""
     given = corner_times.large_cell(views)
-    model, start = simulated_models.model_and_point(given)
+    model, start = simulated_cells.model_and_point(given)
     model, start = replace(model, shape_priors={}), replace(start, shapes={"board": np.zeros(3)})
     times = [time.process_time()]
     graph = CornerGraph(model, start) if kind == "ours" else native_graph.NativeGraph(model, start)

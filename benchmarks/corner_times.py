@@ -17,7 +17,6 @@ from dataclasses import replace
 import bars
 import numpy as np
 import simulated_cells
-import simulated_clocks
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.targets import Checkerboard
@@ -72,7 +71,7 @@ def rows(views: int) -> list[bars.Row]:
     clock, own, refined = timed(large)
     most = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     wrong_clock, wrong_own, wrong = timed(with_misread_corners(large, 0.1))
-    moving = simulated_clocks.moving(large, 1, dict.fromkeys(large.observations.sensors, 2e-3))
+    moving = simulated_cells.moving(large, 1, dict.fromkeys(large.observations.sensors, 2e-3))
     clocks = replace(OPTIONS, time_offsets=large.observations.sensors)
     late_clock, late_own, late = timed(moving, clocks)
     board_clock, board_own, board = timed(moving, replace(clocks, corners_m=1e-4))

@@ -2,7 +2,7 @@
 
     python benchmarks/corner_undetermined.py [--runs 60] [--workers 2] [--only WORDS] [--seed 0]
 
-Simulated cells (`tests/fitting/placements.py`): boards that face their camera almost straight, at one depth, or in
+Simulated cells (`tests/fitting/simulated_cells.py`): boards that face their camera almost straight, at one depth, or in
 a corner of the image only; stated intrinsics are drawn from the prior of a calibration, or of nominal ones. Parameters
 that the images do not tell must be named as held by the prior (or as doubted, with a prior that was widened), and
 ellipsoids must hold the truth. Boards that face
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import bars
 import numpy as np
-import placements
 import simulated_cells
 from rwhec_factors import se3
 
@@ -29,7 +28,7 @@ LEVEL, LEAST = 0.95, 0.93
 class Kind:
     """Where the boards are, what is told of intrinsics, which parameters must be named, and whether it is refused."""
 
-    placement: placements.Placement
+    placement: simulated_cells.Placement
     told: Stated
     noisy: bool
     named: tuple[str, ...] = ()
@@ -46,8 +45,8 @@ def _kinds() -> dict[str, Kind]:
     for told in ("calibration", "nominal"):
         for noisy in (False, True):
             words = f"{told}, A {'noisy' if noisy else 'exact'}"
-            every[f"fronto-parallel, {words}"] = Kind(placements.Placement(tilt=0.0), told, noisy, is_refused=True)
-            for name, placement in placements.UNDETERMINED.items():
+            every[f"fronto-parallel, {words}"] = Kind(simulated_cells.Placement(tilt=0.0), told, noisy, is_refused=True)
+            for name, placement in simulated_cells.UNDETERMINED.items():
                 every[f"{name}, {words}"] = Kind(placement, told, noisy, named.get((name, told), ()))
     return every
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import bars
 import numpy as np
-import placements
 import simulated_cells
 from rwhec_factors import se3
 
@@ -98,7 +97,7 @@ def cell_of(geometry: str, name: str, seed: int) -> simulated_cells.Cell:
         stated=kind.told if kind.drawn else None,
         stated_off=off,
         carrier=(1e-3, 5e-4) if kind.noisy else (0.0, 0.0),
-        **({"images": 40, "board": SMALL_BOARD, "facing": placements.WEAK} if geometry == "weak" else {}),
+        **({"images": 40, "board": SMALL_BOARD, "facing": simulated_cells.WEAK} if geometry == "weak" else {}),
     )
     if not kind.without_distortion:
         return given

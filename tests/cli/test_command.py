@@ -1,4 +1,4 @@
-"""The command as people type it: its output and its exit status; a few in a process of their own."""
+"""The command as people type it: its output and exit status, what the shell completes, and what convert passes over."""
 
 from __future__ import annotations
 
@@ -20,10 +20,15 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+import synthetic_logs as made
 from given_commands import given
 from places import CELL, DEMO
+from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.cli.convert_command import MOST_NAMED, messages_not_read
+from gtsam_rwhec.methods import METHODS
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
@@ -344,3 +349,54 @@ def test_a_terminal_without_our_signs_gets_others() -> None:
     )
     assert done.returncode == 0
     assert b"Proven: " in done.stdout
+
+
+def complete(instruction: str, **environment: str) -> str:
+    """What the command prints for a shell."""
+    done = CliRunner(env={"_GTSAM_RWHEC_COMPLETE": instruction, **environment}).invoke(app)
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return str(done.stdout)
+
+
+def words(line: str) -> list[str]:
+    """What bash would offer at the end of a line."""
+    count = str(len(line.split(" ")) - 1)
+    return complete("complete_bash", COMP_WORDS=line, COMP_CWORD=count).split()
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_gets_its_script(shell: str) -> None:
+    script = complete(f"source_{shell}")
+    assert "gtsam-rwhec" in script
+    assert "_GTSAM_RWHEC_COMPLETE=" in script
+
+
+def test_subcommands_options_and_values() -> None:
+    assert words("gtsam-rwhec c") == ["calibrate", "convert", "clean", "compare"]
+    assert words("gtsam-rwhec fetch ") == ["utias"]
+    assert words("gtsam-rwhec calibrate --carrier") == ["--carrier-noise-deg", "--carrier-noise-mm"]
+    assert words("gtsam-rwhec calibrate --scale ") == ["known", "shared", "per_target"]
+    assert words("gtsam-rwhec calibrate --robust g") == ["gnc"]
+
+
+def test_the_names_of_methods() -> None:
+    """In a process of its own, as a shell asks."""
+    line = "gtsam-rwhec compare --method "
+    asked = {"_GTSAM_RWHEC_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": "3"}
+    done = subprocess.run([sys.executable, "-m", "gtsam_rwhec"], capture_output=True, text=True, env=os.environ | asked)
+    assert "Traceback" not in done.stderr
+    assert done.stdout.split() == list(METHODS)
+
+
+def test_types_that_the_next_step_does_not_read_are_named(tmp_path: Path) -> None:
+    known = made.recording(1.0)
+    assert not messages_not_read(made.write(tmp_path / "known.mcap", known))
+    others = [made.Message(f"/of_{i}", "nav.Thing", {"a": 1}, made.BEGIN_NS + i) for i in range(3)]
+    said = messages_not_read(made.write(tmp_path / "log.mcap", [*known, *others]))
+    assert "does not read nav.Thing (3)" in said
+    assert "TagDetections" not in said
+
+
+def test_of_many_types_the_first_are_named(tmp_path: Path) -> None:
+    others = [made.Message(f"/of_{i}", f"nav.Thing{i:02d}", {}, made.BEGIN_NS) for i in range(MOST_NAMED + 2)]
+    assert "and 2 more types" in messages_not_read(made.write(tmp_path / "log.mcap", others))

@@ -1,9 +1,13 @@
-"""Cells with fixed cameras and a board on the hand, whose truth is known: corners are drawn with their noise."""
+"""Cells with fixed cameras and a board on the hand, whose truth is known: corners are drawn with their noise.
+
+Then boards in other places, boards that were misprinted, carriers that move while images are taken, and a model of the
+corners with a point near the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +15,8 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
-from gtsam_rwhec.fitting.corner_residuals import shaped
+from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_residuals import shaped, stacks_of
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.stated_intrinsics import prior_of
@@ -68,7 +73,7 @@ def cell(
     """A cell of fixed cameras in a ring about the arm; the board turns to one of them at each instant.
 
     `facing` draws T_base_board for a camera's T_base_camera; left out, the board is near the middle, tilted, and turned
-    about its normal (`placements.py` has others).
+    about its normal (`Placement` has others).
 
     Stated intrinsics are off by a draw of the prior of `stated`, or by `stated_off` (m,). `carrier` and `shape` are
     standard deviations: of A (rad, m), and of the board's size and warp. `distance` is the ring's radius, metres, and
@@ -140,3 +145,112 @@ def _pixels(T_camera_board: Array, points: Array, camera: Camera) -> Array | Non
         return None
     pixels = camera.with_parameters(camera.parameters).pixels(seen[:, :2] / seen[:, 2:])
     return pixels if camera.inside(pixels).all() else None
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How boards are drawn in front of a camera.
+
+    Attributes
+    ----------
+    depth_m : (float, float)
+        Mean and standard deviation of the depth of the board's middle.
+    tilt : float
+        Standard deviation of the board's tilt about each of its axes, radians; 0: it is fronto-parallel.
+    aim, spread : (float, float) each
+        Where the board's middle is: normalised coordinates, mean and standard deviation.
+    """
+
+    depth_m: tuple[float, float] = (1.5, 0.15)
+    tilt: float = 0.35
+    aim: tuple[float, float] = (0.0, 0.0)
+    spread: tuple[float, float] = (0.1, 0.1)
+
+    def __call__(self, T_base_camera: Array, rng: np.random.Generator) -> Array:
+        """Draw T_base_board: the board's z axis to the camera, tilted, and turned about it by any angle."""
+        x = np.array(self.aim) + rng.normal(size=2) * self.spread
+        depth = self.depth_m[0] + self.depth_m[1] * rng.normal()
+        tilt = np.array([*rng.normal(scale=self.tilt, size=2), 0.0]) if self.tilt else np.zeros(3)
+        turn = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+        R = np.diag([1.0, -1.0, -1.0]) @ se3.expmap(np.array([[*tilt, 0, 0, 0], [*turn, 0, 0, 0]]))[:, :3, :3]
+        R = R[0] @ np.diag([1.0, -1.0, -1.0]) @ R[1]
+        T: Array = T_base_camera @ se3.pose(R, depth * np.array([*x, 1.0]))
+        return T
+
+
+#: Small tilts, at one place in the middle of the image: intrinsics are hardly told.
+WEAK = Placement(depth_m=(2.0, 0.1), tilt=0.1, spread=(0.05, 0.05))
+#: What determines no intrinsics, or only some. Boards that are fronto-parallel to the last milliradian determine no
+#: poses either.
+UNDETERMINED = {
+    "nearly fronto-parallel": Placement(tilt=0.005),
+    "nearly fronto-parallel at one depth": Placement(depth_m=(1.5, 0.0), tilt=0.005),
+    "at one depth": Placement(depth_m=(1.5, 0.0)),
+    "in a corner of the image": Placement(depth_m=(2.5, 0.2), aim=(0.5, 0.28), spread=(0.02, 0.015)),
+}
+
+
+@dataclass(frozen=True)
+class Misprinted(Checkerboard):
+    """A checkerboard with corners that are off their places by a normal draw along each axis, metres."""
+
+    deviation_m: float = 0.0
+    seed: int = 0
+
+    def off(self) -> NDArray[np.float64]:
+        """(n, 3), metres."""
+        return np.random.default_rng(self.seed).normal(scale=self.deviation_m, size=super().corners().shape)
+
+    def corners(self) -> NDArray[np.float64]:
+        return super().corners() + self.off()
+
+
+def misprinted(
+    seed: int, deviation_m: float, board: Checkerboard = BOARD, **others: Any
+) -> tuple[Cell, NDArray[np.float64]]:
+    """A cell as `cell` makes it, whose observations have the board as it should be; and what each corner is off it."""
+    made = Misprinted(board.name, board.columns, board.rows, board.square_m, deviation_m=deviation_m, seed=seed)
+    given = cell(seed, board=made, **others)
+    return replace(given, observations=replace(given.observations, corners={"board": board.corners()})), made.off()
+
+
+#: Speeds of the carriers about and along each axis: rad/s, m/s.
+SPEED = np.repeat([0.4, 0.2], 3)
+
+
+def moving(
+    given: Cell, seed: int, offsets_s: Mapping[str, float], speed: NDArray[np.float64] = SPEED, *, alike: bool = False
+) -> Cell:
+    """The cell with A as it was `offsets_s` before each image of a sensor, and with the velocity that it had there.
+
+    Velocities are drawn for each instant, or once for all.
+    """
+    stacks, A = stacks_of(given.observations)
+    twist = np.random.default_rng(seed).normal(size=(1 if alike else len(A), 6)) * speed
+    views = {}
+    for stack in stacks:
+        view = given.observations.views[stack.target, stack.sensor]
+        of_view = np.broadcast_to(twist, (len(A), 6))[stack.instant]
+        before = view.A @ se3.expmap(-offsets_s.get(stack.sensor, 0.0) * of_view)
+        views[stack.target, stack.sensor] = replace(view, A=before, twist=of_view)
+    return replace(given, observations=replace(given.observations, views=views))
+
+
+A_NOISE = np.repeat([1e-3, 5e-4], 3)
+CORNER_PX = 0.1
+
+
+def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = False) -> tuple[Model, Point]:
+    stacks, A = stacks_of(small.observations)
+    cameras = small.observations.cameras
+    names = small.observations.sensors
+    model = Model(
+        stacks, A, None if exact else A_NOISE, about, {name: name for name in names},  # type: ignore[arg-type]
+        {name: prior_of(cameras[name], "nominal") for name in names}, {"board": np.full(4, 1e-3)}, CORNER_PX,
+        tuple(stack.known.astype(float) for stack in stacks),
+    )  # fmt: skip
+    rng = np.random.default_rng(7)
+    moved = A if exact else A @ se3.expmap(rng.normal(size=(len(A), 6)) * A_NOISE)
+    X, Y = small.near(rng, 1e-3)
+    cameras_at = {name: cameras[name].parameters * (1.0 + 1e-3) for name in names}
+    return model, Point(X, Y, moved, cameras_at, {"board": np.full(4, 5e-4)})

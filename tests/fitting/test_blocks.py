@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from noisy_rows import random_poses
+from noisy_rows import random_poses, task_of
 from rwhec_factors import se3
-from settled_models import task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.block_agreement import FEWEST, scatter_of_blocks, too_much

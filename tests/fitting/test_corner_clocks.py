@@ -12,9 +12,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from rwhec_factors import se3
 from scipy.stats import chi2
-from simulated_cells import CAMERA, Cell, cell
-from simulated_clocks import moving
-from simulated_models import A_NOISE, CORNER_PX, model_and_point
+from simulated_cells import A_NOISE, CAMERA, CORNER_PX, Cell, cell, model_and_point, moving
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, FrameError, OptionError

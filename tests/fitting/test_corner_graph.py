@@ -6,8 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from rwhec_factors import se3
-from simulated_cells import Cell, cell
-from simulated_models import A_NOISE, CORNER_PX, model_and_point
+from simulated_cells import A_NOISE, CORNER_PX, Cell, cell, model_and_point
 
 from gtsam_rwhec.fitting.corner_graph import CornerGraph, key_of
 from gtsam_rwhec.fitting.corner_model import Point

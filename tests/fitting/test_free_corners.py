@@ -11,9 +11,7 @@ import pytest
 from problems_of_corners import problem_of
 from rwhec_factors import se3
 from scipy.stats import chi2
-from simulated_boards import misprinted
-from simulated_cells import BOARD, CAMERA, Cell, cell
-from simulated_models import A_NOISE, CORNER_PX, model_and_point
+from simulated_cells import A_NOISE, BOARD, CAMERA, CORNER_PX, Cell, cell, misprinted, model_and_point
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, OptionError

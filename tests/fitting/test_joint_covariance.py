@@ -1,4 +1,4 @@
-"""Covariances with free directions, against the limit of weak priors along them."""
+"""Covariances with free directions, against the limit of weak priors along them; how unknowns are named."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
-from gtsam_rwhec.fitting.unknowns import Unknown
+from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, slots_of
 
 A, B, SCALE = (Unknown.of(name) for name in ("a", "b", "scale"))
 
@@ -92,3 +92,25 @@ def test_unknown_names_are_refused() -> None:
     joint = JointCovariance.of((A,), np.eye(6), np.zeros((6, 0)), np.ones(6))
     with pytest.raises(rw.errors.FrameError, match="'b' is not among the unknowns; they are a"):
         joint.rows((B,))
+
+
+@pytest.mark.parametrize(
+    ("name", "unknown"),
+    [
+        ("cam_0", Unknown(UnknownKind.FRAME, "cam_0")),
+        ("scale", Unknown(UnknownKind.SCALE)),
+        ("scale:tag_0", Unknown(UnknownKind.SCALE, "tag_0")),
+        ("time_offset:cam:left", Unknown(UnknownKind.TIME_OFFSET, "cam:left")),
+        ("frame:x", Unknown(UnknownKind.FRAME, "frame:x")),
+        ("time_offset", Unknown(UnknownKind.FRAME, "time_offset")),
+    ],
+)
+def test_a_name_is_read_and_written_the_same(name: str, unknown: Unknown) -> None:
+    assert Unknown.of(name) == unknown
+    assert str(unknown) == name
+    assert Unknown.of(unknown) is unknown
+
+
+def test_parameters_stand_one_after_the_other() -> None:
+    cam, scale, tag = (Unknown.of(name) for name in ("cam", "scale", "tag"))
+    assert slots_of((cam, scale, tag)) == {cam: slice(0, 6), scale: slice(6, 7), tag: slice(7, 13)}

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from noisy_rows import problem_of, rows_of
+from noisy_rows import SIGMA, problem_of, rows_of
 from rwhec_factors import se3
-from settled_models import SIGMA
 
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns, unit_of
 from gtsam_rwhec.fitting.fit_options import About, Component, DriftFrame, Walk

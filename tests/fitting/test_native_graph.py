@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from native_graph import NativeGraph
 from rwhec_factors import se3
-from simulated_cells import CAMERA, Cell, cell
-from simulated_models import model_and_point
+from simulated_cells import CAMERA, Cell, cell, model_and_point
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.corner_graph import CornerGraph

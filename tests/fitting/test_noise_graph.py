@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 import pytest
-from noisy_rows import problem_of, random_poses
+from noisy_rows import SIGMA, problem_of, random_poses, settled_at, task_of
 from rwhec_factors import se3
-from settled_models import SIGMA, settled_at, task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotConvergedWarning, NotUniqueWarning

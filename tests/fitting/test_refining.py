@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from noisy_rows import problem_of, random_poses, rows_of
+from noisy_rows import problem_of, random_poses, rows_of, task_of
 from rwhec_factors import se3
-from settled_models import task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting import Component, NoiseOptions, refine_under_noise, under_noise

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from problems_of_corners import problem_of
 from rwhec_factors import se3
-from simulated_cells import Cell, cell
-from simulated_clocks import moving
+from simulated_cells import Cell, cell, moving
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError

@@ -1,4 +1,4 @@
-"""Refinement from corners: truth, noise, intrinsics that are off, outliers, words."""
+"""Refinement from corners: truth, noise, wrong intrinsics, outliers, images that come back or are left out, words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from scipy.stats import chi2
 from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CameraError, FrameError, OptionError
+from gtsam_rwhec.calibration.calibrate_options import Run
+from gtsam_rwhec.calibration.clock_offsets import Answer
+from gtsam_rwhec.calibration.from_corners import answered_by_corners
+from gtsam_rwhec.errors import CameraError, CountError, FrameError, OptionError
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.fitting.held_out import held_out_errors
+from gtsam_rwhec.fitting.observations import Views
+from gtsam_rwhec.fitting.readmission import agreeing_by_corners
 from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior, innovation_of, wider
 
 Array = NDArray[np.float64]
@@ -219,3 +226,89 @@ def test_a_centre_that_is_off_does_not_drown_among_other_parameters() -> None:
     doubted = innovation_of(0.7 * off, prior, np.diag(np.full(12, 0.01)))
     assert not doubted.is_contradicted
     assert wider(prior, doubted).deviation.tolist() == [1.0, 1.0, 3.0, 3.0, *np.ones(8)]
+
+
+PAIR = rw.Pair("board", "cam_0")
+
+
+def test_good_images_come_back_and_a_turned_board_does_not() -> None:
+    given = cell(3, images=30, carrier=(5e-4, 2e-4))
+    view = given.observations.views[PAIR]
+    pixels = view.pixels.copy()
+    pixels[2] = pixels[2][::-1]
+    every = replace(given.observations, views={**given.observations.views, PAIR: Views(view.A, pixels)})
+    kept = {rw.Pair(*at): np.ones(len(of.A), dtype=bool) for at, of in every.views.items()}
+    kept[PAIR][[2, 5, 6]] = False
+    some = replace(every, views={at: of.selected(kept[rw.Pair(*at)]) for at, of in every.views.items()})
+    refined = rw.refine_corners(some, given.X, given.Y)
+    found = agreeing_by_corners(every, kept, refined)
+    assert np.flatnonzero(~found[PAIR]).tolist() == [2]
+    assert all(mask.all() for pair, mask in found.items() if pair != PAIR)
+
+
+def test_an_image_at_another_pose_of_the_arm_stays_out() -> None:
+    """Its corners fit each other, and not the arm's pose."""
+    given = cell(4, images=30, carrier=(2e-4, 1e-4))
+    view = given.observations.views[PAIR]
+    A = view.A.copy()
+    A[3] = A[4]
+    every = replace(given.observations, views={**given.observations.views, PAIR: Views(A, view.pixels)})
+    kept = {rw.Pair(*at): np.ones(len(of.A), dtype=bool) for at, of in every.views.items()}
+    kept[PAIR][3] = False
+    some = replace(every, views={at: of.selected(kept[rw.Pair(*at)]) for at, of in every.views.items()})
+    found = agreeing_by_corners(every, kept, rw.refine_corners(some, given.X, given.Y))
+    assert not found[PAIR][3]
+
+
+def test_calibrate_takes_them_back_too() -> None:
+    given, problem = cell(3, images=30, carrier=(5e-4, 2e-4)), rw.Problem()
+    for (target, sensor), view in given.observations.views.items():
+        board, camera = given.observations.corners[target], given.observations.cameras[sensor]
+        problem.add_corners(target, sensor, view.A, view.pixels, board, camera)
+    base = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate", robust="gnc"))
+    fewer = {pair: mask.copy() for pair, mask in base.inliers.items()}
+    fewer[PAIR][[2, 5]] = False
+    before = Answer(rw.solve(problem), fewer, replace(base, inliers=fewer))
+    found = answered_by_corners(Run(problem, rw.CalibrateOptions(), silent), before)
+    assert all(mask.all() for mask in found.inliers.values())
+    assert found.refined is not None
+    assert found.refined.reprojection is not None
+    assert found.refined.reprojection.sensors["cam_0"].images == len(given.observations.views[PAIR].A)
+    assert found.solution is not before.solution
+
+
+def test_errors_are_those_of_the_corners_and_of_the_carriers() -> None:
+    exact, noisy = (cell(3, images=30, carrier=carrier) for carrier in ((0.0, 0.0), (1e-3, 5e-4)))
+    rms = []
+    for given in (exact, noisy):
+        X, Y = given.near(np.random.default_rng(0))
+        refined = rw.refine_corners(given.observations, X, Y)
+        errors = held_out_errors(refined)
+        assert set(errors) == {"cam_0", "cam_1"}
+        assert sum(each.corners for each in errors.values()) >= 35 * 30 - 3
+        rms.append(errors["cam_0"])
+    # both axes of 0.1 pixels, and more by what the poses do not know
+    assert rms[0].rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.15)
+    # the images themselves fit to 0.1 pixels with the carriers' poses free; others are predicted by A as measured
+    assert rms[1].rms_px > 3.0 * rms[0].rms_px
+    assert rms[0].rms_mm == pytest.approx(1e3 * rms[0].rms_px * 1.5 / 1400.0, rel=0.4)
+    assert np.nanmax(rms[0].regions_px) < 0.3
+
+
+def test_stated_intrinsics_that_are_off_show() -> None:
+    given = cell(4, images=30, stated_off=np.array([0.0, 0.0, 40.0, 30.0, 0.1, 0.0, 0.0, 0.0]))
+    X, Y = given.near(np.random.default_rng(0))
+    free = rw.CornerOptions(carrier_noise="exact")
+    refined = rw.refine_corners(given.observations, X, Y, free)
+    errors = held_out_errors(refined)
+    assert errors["cam_0"].rms_px < 0.25
+
+
+def test_what_cannot_be_left_out_is_refused() -> None:
+    given = cell(0, images=5)
+    X, Y = given.near(np.random.default_rng(0))
+    refined = rw.refine_corners(given.observations, X, Y)
+    with pytest.raises(OptionError, match="whole number from 2"):
+        held_out_errors(refined, folds=1)
+    with pytest.raises(CountError, match="5 instants cannot be left out in 6 blocks"):
+        held_out_errors(refined, folds=6)

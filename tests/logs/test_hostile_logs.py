@@ -7,11 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from crafted_logs import LITTLE_ENDIAN, cdr, described
-from crafted_mcap import Mcap, channel, chunk, message, schema, text
-from hostile_chunks import CHUNKS
-from hostile_messages import MESSAGES
-from hostile_records import INDEX, RECORDS
+from crafted_mcap import LITTLE_ENDIAN, Mcap, cdr, channel, chunk, described, message, schema, text
+from hostile_records import CHUNKS, INDEX, MESSAGES, RECORDS
 from limited_process import MEMORY, SECONDS, Reader, Reading
 from log_files import definition
 

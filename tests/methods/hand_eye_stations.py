@@ -1,4 +1,4 @@
-"""Simulated poses for the hand-eye calls, and OpenCV's answers to them where OpenCV 4 is installed.
+"""Simulated poses for the hand-eye calls, OpenCV's methods by name, its answers, and how far answers are apart.
 
 ``python tests/methods/hand_eye_stations.py`` (with opencv-python-headless < 5) writes
 ``tests/golden/opencv_4_hand_eye.json``: the poses of ``stations(12, seed)`` for the cases in ``CASES`` and OpenCV's
@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from gtsam_rwhec.methods import opencv
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "opencv_4_hand_eye.json"
 #: name: (seed, rotation noise in rad, translation noise in m, spread of the rotations in rad or None for all)
@@ -67,6 +69,22 @@ def main() -> None:
             },
         }
     GOLDEN.write_text(json.dumps({"opencv": cv2.__version__, "cases": cases}, indent=None) + "\n")
+
+
+METHODS = {
+    "tsai": opencv.CALIB_HAND_EYE_TSAI,
+    "park": opencv.CALIB_HAND_EYE_PARK,
+    "horaud": opencv.CALIB_HAND_EYE_HORAUD,
+    "andreff": opencv.CALIB_HAND_EYE_ANDREFF,
+    "daniilidis": opencv.CALIB_HAND_EYE_DANIILIDIS,
+}
+ROBOT_WORLD = {"shah": opencv.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": opencv.CALIB_ROBOT_WORLD_HAND_EYE_LI}
+#: Poses, how far they turn, their noise.
+SHAPES = [(4, None, 0.01), (9, 0.8, 1e-3), (40, None, 0.1), (25, 1.0, 0.0)]
+
+
+def largest_difference(ours, theirs):
+    return max(np.abs(a - b).max() for a, b in zip(ours, theirs, strict=True))
 
 
 if __name__ == "__main__":

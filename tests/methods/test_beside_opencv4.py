@@ -3,8 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from compared import METHODS, ROBOT_WORLD, SHAPES, largest_difference
-from hand_eye_stations import parts, stations, transforms
+from hand_eye_stations import METHODS, ROBOT_WORLD, SHAPES, largest_difference, parts, stations, transforms
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.methods import opencv

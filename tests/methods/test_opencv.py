@@ -6,8 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from compared import METHODS, ROBOT_WORLD, largest_difference
-from hand_eye_stations import CASES, GOLDEN, parts, stations, transforms
+from hand_eye_stations import CASES, GOLDEN, METHODS, ROBOT_WORLD, largest_difference, parts, stations, transforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from drives_with_sensors import drive, tracks
 from rwhec_factors import se3
 
 from gtsam_rwhec import odometry
+from gtsam_rwhec.errors import CountError, StampError
 from gtsam_rwhec.odometry.window_motions import SampledTrack, best_length
 from gtsam_rwhec.runs.odometry_cleaning import gated
 
@@ -65,3 +67,13 @@ def test_windows_are_longer_where_the_noise_is_larger() -> None:
             samples.append(SampledTrack(replace(track, T_start_sensor=np.array(noisy)), 0, 0.0, good))
         lengths.append(best_length(samples, 0.5))
     assert lengths[1] > lengths[0] >= 0.0999
+
+
+def test_stamps_that_do_not_ascend_are_named() -> None:
+    with pytest.raises(StampError, match=r"lidar goes back in time at row 2: 15 ns after 20 ns"):
+        odometry.OdometryTrack("lidar", np.array([10, 20, 15]), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_one_pose_for_each_stamp() -> None:
+    with pytest.raises(CountError, match="3 stamps and poses of shape"):
+        odometry.OdometryTrack("lidar", np.array([10, 20, 30]), np.tile(np.eye(4), (2, 1, 1)))

@@ -13,6 +13,7 @@ from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, MeasurementsNotKeptError, RotationsProjectedWarning, UnitsWarning
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver import Start
@@ -336,3 +337,23 @@ def test_measurements_not_kept_in_one_are_not_kept_in_both() -> None:
         assert merged.keep_measurements is False
         with pytest.raises(MeasurementsNotKeptError):
             merged.measurements("t", "s")
+
+
+def test_a_pair_is_a_tuple_and_found_as_one() -> None:
+    pair = Pair("tag_0", "cam_0")
+    assert pair == ("tag_0", "cam_0")
+    assert {pair: 1}["tag_0", "cam_0"] == 1
+    assert pickle.loads(pickle.dumps(pair)).label == "tag_0-cam_0"
+
+
+def test_its_label_is_how_it_is_written() -> None:
+    assert f"{Pair('tag_0', 'cam_0')}" == Pair("tag_0", "cam_0").label == "tag_0-cam_0"
+    assert str(Pair("cam_0", "cam_0")) == "the motions of cam_0"
+
+
+def test_motions_have_one_frame() -> None:
+    motions, seen = Pair("cam_0", "cam_0"), Pair("tag_0", "cam_0")
+    assert motions.is_motion
+    assert not seen.is_motion
+    assert motions.frames == ("cam_0",)
+    assert seen.frames == ("tag_0", "cam_0")

@@ -1,4 +1,4 @@
-"""What is in an output folder before a run: which of it is gone on with, replaced, or refused."""
+"""What is in an output folder before a run, and which stages a changed rig file asks for: gone on with, or refused."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.rig import parse_rig
 from gtsam_rwhec.runs import output_folder as earlier_output
+from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.output_folder import (
     LIST_FILE,
     MOST_NAMED,
@@ -209,3 +211,27 @@ def test_two_runs_at_once_are_refused(tmp_path: Path) -> None:
     pytest.importorskip("fcntl")
     with output_folder(tmp_path, LOG, replace=True), pytest.raises(LogError, match="another run is at work in this"):
         run(tmp_path, replace=True)
+
+
+RIG = """\
+carriers: {sensors: hand, targets: base, poses: {tf: [base, hand]}}
+sensors: {cam: {images: /image, intrinsics: {file: camera.yaml, stated: nominal}}}
+targets: {tag: {type: tag, family: tag36h11, id: 3, size_m: 0.1}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "other", "detection", "cleaning"),
+    [
+        ("nominal", "calibration", (), ()),  # refinement alone asks it
+        ("file: camera.yaml", "file: other.yaml", ("sensors.cam.intrinsics",), ()),
+        ("size_m: 0.1", "size_m: 0.2", ("targets.tag",), ()),
+        ("tf: [base, hand]", "tf: [hand, base]", (), ("carriers.poses",)),
+    ],
+)
+def test_keys_ask_for_their_stage(
+    right: str, other: str, detection: tuple[str, ...], cleaning: tuple[str, ...]
+) -> None:
+    assert right in RIG
+    found = changes(parse_rig(RIG, "rig.yaml"), parse_rig(RIG.replace(right, other), "rig.yaml"))
+    assert (found.detection, found.cleaning) == (detection, cleaning)

@@ -1,8 +1,11 @@
-"""All stages of a run: how often logs are read and written, and options that count only for images."""
+"""All stages of a run: how often logs are read, problems made, corners refined; options that count for images alone."""
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -10,10 +13,15 @@ import pytest
 import synthetic_logs as made
 from given_commands import given
 from mcap.reader import make_reader
+from places import REPOSITORY
 
+from gtsam_rwhec.calibration.stages import calibrate
 from gtsam_rwhec.errors import LogError, OptionError
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.logs import ImageRecord, Log, LogWriter, open_log
-from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, solve_into
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.rig import read_rig
+from gtsam_rwhec.runs import calibrate_log, clean_log, detect_log, solve_into, solve_log
 
 
 @pytest.fixture(scope="module", params=["detected.mcap", "calibration.mcap"])
@@ -107,3 +115,34 @@ def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
     """All messages of a log, by topic and time."""
     with path.open("rb") as stream:
         return sorted((c.topic, m.log_time, bytes(m.data)) for _, c, m in make_reader(stream).iter_messages())
+
+
+CELL = REPOSITORY / "data" / "cell"
+
+
+@pytest.mark.slow
+def test_the_shipped_log_is_solved_by_one_calibration(tmp_path: Path) -> None:
+    rig = read_rig(CELL / "rig.yaml")
+    detect_log(CELL / "robot_cell.mcap", rig, tmp_path / "detected.mcap")
+    clean_log(tmp_path / "detected.mcap", tmp_path / "cleaned.mcap", rig)
+    codes = {
+        getattr(function, "__wrapped__", function).__code__: name
+        for name, function in (
+            ("calibrations", calibrate), ("problems", Problem.__init__), ("refinements from corners", refine_corners),
+        )
+    }  # fmt: skip
+    count = Counter[str]()
+
+    def on_event(frame: FrameType, event: str, argument: object) -> None:
+        if event == "call" and frame.f_code in codes:
+            count[codes[frame.f_code]] += 1
+
+    before = sys.getprofile()
+    sys.setprofile(on_event)
+    try:
+        solve_log(tmp_path / "cleaned.mcap")
+    finally:
+        sys.setprofile(before)
+    assert count["calibrations"] == 1
+    assert 0 < count["problems"] <= 20
+    assert 0 < count["refinements from corners"] <= 5
