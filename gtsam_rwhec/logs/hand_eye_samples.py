@@ -25,8 +25,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, shown
-from gtsam_rwhec.logs.pose_rows import PoseRow, PoseStatement, poses_of
-from gtsam_rwhec.logs.pose_tables import pose_text
+from gtsam_rwhec.logs.pose_tables import PoseRow, PoseStatement, pose_text, poses_of
 from gtsam_rwhec.logs.pose_trees import TREES, PoseTree, pairs_of_keys, pose_tree
 from gtsam_rwhec.logs.records import Array
 

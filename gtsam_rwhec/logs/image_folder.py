@@ -24,8 +24,15 @@ from gtsam_rwhec.files.budgets import MESSAGE
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseRow, PoseStatement, poses_of, stem_of
-from gtsam_rwhec.logs.pose_tables import pose_text, read_pose_table
+from gtsam_rwhec.logs.pose_tables import (
+    NamedPoses,
+    PoseRow,
+    PoseStatement,
+    pose_text,
+    poses_of,
+    read_pose_table,
+    stem_of,
+)
 from gtsam_rwhec.logs.pose_trees import TREES, PoseReference, read_pose_tree
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]

@@ -15,7 +15,7 @@ from typing import Any
 
 from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_storage
-from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
+from gtsam_rwhec.logs.pose_tables import Kind, PoseRow
 
 #: Files of trees.
 TREES = (".json", ".yaml", ".yml", ".xml", ".samples")

@@ -35,7 +35,7 @@ from gtsam_rwhec.odometry.window_motions import (
     first_rotation_variances,
 )
 from gtsam_rwhec.odometry.window_solution import FEWEST, Answer, Task, solve_windows, too_few
-from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
+from gtsam_rwhec.results.log_history import RemovalReason, Removed
 from gtsam_rwhec.runs.odometry_cleaning import Gated, gated
 
 #: If the drive does not determine a time offset, it stays within about this many seconds of the first guess.

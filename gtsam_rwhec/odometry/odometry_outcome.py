@@ -20,7 +20,7 @@ from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
 from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE, Linear, eliminated
 from gtsam_rwhec.odometry.window_motions import axes_turned
 from gtsam_rwhec.odometry.window_solution import REACHES, Answer, Task, refined, seven_each
-from gtsam_rwhec.results.removed_measurements import Removed
+from gtsam_rwhec.results.log_history import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, free_directions_of, reason_for, sparse_basis
 

@@ -10,7 +10,7 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.removed_measurements import Removed
+from gtsam_rwhec.results.log_history import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
 

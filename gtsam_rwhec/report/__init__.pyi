@@ -6,7 +6,7 @@ from .calibration_report import print_solution as print_solution
 from .change_report import print_difference as print_difference
 from .change_report import print_verification as print_verification
 from .change_report import write_changes as write_changes
-from .hold_out_report import print_cross_validation as print_cross_validation
+from .calibration_report import print_cross_validation as print_cross_validation
 from .corners_section import print_corners as print_corners
 from .demo_report import print_demo as print_demo
 from .report_page import write_html as write_html

@@ -1,4 +1,4 @@
-"""Calibrations, refinements and solutions on the terminal: one screen, or all that their page says in words."""
+"""Calibrations, refinements, solutions and cross-validations on the terminal: one screen, or all of their page."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
+from gtsam_rwhec.calibration.cross_validation import CrossValidation, HoldOutError
 from gtsam_rwhec.calibration.verdict import Finding, Verdict
 from gtsam_rwhec.files.terminal_text import natural_key, rounded
 from gtsam_rwhec.fitting.fit_options import About
@@ -19,7 +20,7 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.advice import advice_of, certificate_sentence, scale_sentence
-from gtsam_rwhec.report.report_blocks import Paragraph, Section, Table, Words, is_absent
+from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Section, Table, Words, is_absent
 from gtsam_rwhec.report.report_page import sections_of
 from gtsam_rwhec.report.residual_section import RESIDUAL_HEADINGS, residual_cells
 from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport
@@ -281,3 +282,64 @@ def _carrier_noise_sentence(refined: Refined) -> str:
         f"Noise of A: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis "
         f"of the {CARRIERS[noise.about]}, as given."
     )
+
+
+HEADINGS = ("rms mm", "median", "95%", "rms°", "median", "95%", "seen mm", "seen°", "n")
+LEGEND = (
+    "Difference between the measured pose of a target and the pose that a calibration without this measurement "
+    "predicts, in true millimetres and degrees. rms: root mean square. 95%: 95th percentile. seen: rms of the same "
+    "measurements when the calibration uses all of them. n: predicted measurements."
+)
+SPLITS = {
+    "time": "{folds} blocks, contiguous in {time}, each predicted from the others",
+    "pair": "each pair predicted from all other pairs",
+    "sensor": "each half in {time} of a sensor's measurements predicted from all others",
+}
+
+
+def print_cross_validation(result: CrossValidation, console: Console | None = None, *, pairs: bool = False) -> None:
+    """Print what was held out, and the hold-out errors of all measurements, of each sensor and of each target.
+
+    Parameters
+    ----------
+    result : CrossValidation
+        The result of `gtsam_rwhec.cross_validate`.
+    pairs : bool
+        Print a line for each pair as well.
+    """
+    time = "time, by their stamps" if result.ordered_by == "stamps" else "the order in which they were added"
+    split = SPLITS[result.by].format(folds=result.number_of_folds, time=time)
+    of_pairs = {pair.label: error for pair, error in result.pairs.items()} if pairs else {}
+    tables = [
+        Table.of(f"Hold-out error by {kind}", kind, HEADINGS, rows)
+        for kind, rows in (
+            ("sensor", {"all": _hold_out_cells(result.overall), **_hold_out_rows(result.sensors)}),
+            ("target", _hold_out_rows(result.targets)),
+            ("pair", _hold_out_rows(of_pairs)),
+        )
+    ]
+    blocks: tuple[Block, ...] = (
+        Paragraph(f"Hold-out error: {split}", "lead"), *tables, Paragraph(LEGEND, "note"),
+        Listing(tuple(result.notes), "care"),
+    )  # fmt: skip
+    print_blocks(report_console() if console is None else console, blocks)
+
+
+def _hold_out_rows(errors: Mapping[str, HoldOutError]) -> dict[str, tuple[Words, ...]]:
+    return {name: _hold_out_cells(errors[name]) for name in sorted(errors, key=natural_key)}
+
+
+def _hold_out_cells(error: HoldOutError) -> tuple[Words, ...]:
+    held, seen = error.held_out, error.training
+    total = held.count + error.not_predicted
+    return (
+        *(_number(value, 1) for value in (held.translation_rms_mm, held.translation_median_mm, held.translation_95_mm)),
+        *(_number(value, 2) for value in (held.rotation_rms_deg, held.rotation_median_deg, held.rotation_95_deg)),
+        _number(seen.translation_rms_mm, 1),
+        _number(seen.rotation_rms_deg, 2),
+        str(held.count) if error.not_predicted == 0 else f"{held.count} of {total}",
+    )
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"

@@ -43,6 +43,6 @@ from .acceptance import write_acceptance as write_acceptance
 from .acceptance_record import Acceptance as Acceptance
 from .acceptance_record import Answer as Answer
 from .acceptance_record import Volume as Volume
-from .touches import Touches as Touches
-from .touches import is_touches_file as is_touches_file
-from .touches import read_touches as read_touches
+from .acceptance import Touches as Touches
+from .acceptance import is_touches_file as is_touches_file
+from .acceptance import read_touches as read_touches

@@ -26,10 +26,10 @@ from .exported_files import FILES as FILES
 from .exported_files import FOLDERS as FOLDERS
 from .exported_files import copied_texts as copied_texts
 from .exported_files import export_all as export_all
-from .exported_poses import python_poses as python_poses
-from .exported_poses import static_tf_launch as static_tf_launch
-from .exported_poses import tf_yaml as tf_yaml
-from .exported_poses import urdf_xacro as urdf_xacro
+from .exported_files import python_poses as python_poses
+from .exported_files import static_tf_launch as static_tf_launch
+from .exported_files import tf_yaml as tf_yaml
+from .exported_files import urdf_xacro as urdf_xacro
 
 # The sections of a rig file.
 from .sections import Intrinsics as Intrinsics

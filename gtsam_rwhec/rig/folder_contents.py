@@ -24,7 +24,7 @@ from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, TABLES, image_stamps, match, pose_stamps, read_poses
-from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement
+from gtsam_rwhec.logs.pose_tables import NamedPoses, PoseStatement
 from gtsam_rwhec.logs.pose_trees import TREES
 
 #: Folders are searched to this depth.

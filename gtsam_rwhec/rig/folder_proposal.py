@@ -16,7 +16,7 @@ from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs.image_folder import pose_stamps
-from gtsam_rwhec.logs.pose_rows import PoseStatement
+from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.rig.carrier_roles import (
     Rest,
     RoleEvidence,

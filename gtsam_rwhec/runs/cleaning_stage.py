@@ -16,8 +16,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.results.log_history import CleaningReport
-from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
+from gtsam_rwhec.results.log_history import CleaningReport, Kept, RemovalReason
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.changed_rig import rig_for_cleaning

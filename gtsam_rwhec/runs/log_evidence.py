@@ -49,8 +49,8 @@ from gtsam_rwhec.results.image_errors import (
     worst_views,
 )
 from gtsam_rwhec.results.linear_model import LinearModel, MeasuredRows
+from gtsam_rwhec.results.log_history import RemovalReason
 from gtsam_rwhec.results.proof_spectrum import proof_of
-from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.residual_evidence import residuals_of
 from gtsam_rwhec.results.result_judgement import shortage
 from gtsam_rwhec.results.scene_evidence import scene_of

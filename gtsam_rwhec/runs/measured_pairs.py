@@ -17,8 +17,7 @@ from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, PairRecord
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.linear_model import MeasuredRows
-from gtsam_rwhec.results.log_history import TrackCount
-from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
+from gtsam_rwhec.results.log_history import Kept, RemovalReason, TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import check_order
 from gtsam_rwhec.runs.run_log import detections_topic, pairs_topic, records_of

@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.results.removed_measurements import RemovalReason, Removed
+from gtsam_rwhec.results.log_history import RemovalReason, Removed
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
 from gtsam_rwhec.runs.odometry_tracks import read_odometry

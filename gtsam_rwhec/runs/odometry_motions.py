@@ -10,7 +10,7 @@ from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.log_history import RemovalReason
 from gtsam_rwhec.rig import Cleaning, OdometrySource, Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction

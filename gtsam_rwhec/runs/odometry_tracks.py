@@ -13,7 +13,7 @@ from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, LogWriter
 from gtsam_rwhec.logs.image_folder import as_ns, read_poses
-from gtsam_rwhec.logs.pose_rows import PoseStatement
+from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_sections import odometry_topic
 from gtsam_rwhec.runs.carrier_motion import poses_of_tf, poses_of_topic

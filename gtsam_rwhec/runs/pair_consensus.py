@@ -15,7 +15,7 @@ import numpy as np
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.removed_measurements import Kept, RemovalReason
+from gtsam_rwhec.results.log_history import Kept, RemovalReason
 from gtsam_rwhec.solver.sample_poses import poses_of_samples
 
 #: A hypothesis is fitted at most this often to the measurements that agree with it. Most need two or three fits.

@@ -36,7 +36,7 @@ from gtsam_rwhec.logs.image_folder import (
     read_poses,
 )
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement, stem_of
+from gtsam_rwhec.logs.pose_tables import NamedPoses, PoseStatement, stem_of
 from gtsam_rwhec.logs.records import Array, DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig

@@ -29,8 +29,15 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs.mcap_reader import Log, open_log
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.results.log_history import CleaningReport, LogFields, OutlierCount, SizeFields, TimeOffsetFields
-from gtsam_rwhec.results.removed_measurements import OF_THE_MOTION, RemovalReason
+from gtsam_rwhec.results.log_history import (
+    OF_THE_MOTION,
+    CleaningReport,
+    LogFields,
+    OutlierCount,
+    RemovalReason,
+    SizeFields,
+    TimeOffsetFields,
+)
 from gtsam_rwhec.results.result_judgement import judge, short_of_measurements
 from gtsam_rwhec.rig.odometry_sections import GivenSection
 from gtsam_rwhec.rig.rig import Rig

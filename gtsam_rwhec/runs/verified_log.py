@@ -24,8 +24,7 @@ from gtsam_rwhec.results.acceptance import LEVEL as PROBABILITY
 from gtsam_rwhec.results.acceptance import accept
 from gtsam_rwhec.results.acceptance_record import Acceptance, Volume
 from gtsam_rwhec.results.change_test import LEVEL, checked_level
-from gtsam_rwhec.results.log_history import DetectionReport
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.log_history import DetectionReport, RemovalReason
 from gtsam_rwhec.results.result_file import Result, parse_result, read_result, result_path
 from gtsam_rwhec.results.verification import Verification, verify
 from gtsam_rwhec.rig import Rig

@@ -14,7 +14,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.cross_validation import PredictionError, cross_validate
 from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError, UnderdeterminedError
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.report.hold_out_report import print_cross_validation
+from gtsam_rwhec.report.calibration_report import print_cross_validation
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=3000.0)

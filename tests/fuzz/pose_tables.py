@@ -16,7 +16,7 @@ from mutations import words_and_lines
 from gtsam_rwhec.logs import image_folder
 from gtsam_rwhec.logs.hand_eye_samples import read_hand_eye_samples
 from gtsam_rwhec.logs.image_folder import read_poses
-from gtsam_rwhec.logs.pose_rows import PoseStatement
+from gtsam_rwhec.logs.pose_tables import PoseStatement
 
 FOLDER = scratch()
 #: Bits of the first byte.

@@ -18,7 +18,7 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files import yaml_lines
 from gtsam_rwhec.logs import pose_trees
 from gtsam_rwhec.logs.image_folder import read_poses
-from gtsam_rwhec.logs.pose_rows import PoseStatement
+from gtsam_rwhec.logs.pose_tables import PoseStatement
 
 RNG = np.random.default_rng(3)
 TURNS = Rotation.random(4, rng=RNG)

@@ -20,8 +20,7 @@ from gtsam_rwhec.report.calibration_report import deviation_cells, proof_line, s
 from gtsam_rwhec.report.choices_section import log_blocks
 from gtsam_rwhec.report.report_blocks import Paragraph, Table, plain_text
 from gtsam_rwhec.report.terminal_report import TerminalTable
-from gtsam_rwhec.results.log_history import TrackCount
-from gtsam_rwhec.results.removed_measurements import RemovalReason
+from gtsam_rwhec.results.log_history import RemovalReason, TrackCount
 from gtsam_rwhec.results.residual_evidence import pooled_residual
 from gtsam_rwhec.simulate import Motion, Noise, general
 from gtsam_rwhec.solver.certificate import Basis, Cause, Status

@@ -17,10 +17,10 @@ from gtsam_rwhec.results.log_history import (
     DetectionReport,
     LogFields,
     OutlierCount,
+    RemovalReason,
     SizeFields,
     TrackCount,
 )
-from gtsam_rwhec.results.removed_measurements import RemovalReason
 from gtsam_rwhec.results.result_file import Result, read_result
 from gtsam_rwhec.results.result_judgement import judge, short_of_measurements, shortage
 

@@ -23,7 +23,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_colmap_cameras
 from gtsam_rwhec.errors import FileFormatError, FrameError, PoseError, StampError
 from gtsam_rwhec.rig import CameraLink, RigFrames, camchain_yaml, export_all, static_tf_launch, tf_yaml, urdf_xacro
-from gtsam_rwhec.rig.exported_poses import fixed_axis_angles, number, quaternion_xyzw
+from gtsam_rwhec.rig.exported_files import fixed_axis_angles, number, quaternion_xyzw
 from gtsam_rwhec.rig.sections import link_of_optical
 
 XACRO = {"xacro": "http://www.ros.org/wiki/xacro"}
