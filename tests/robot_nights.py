@@ -47,8 +47,12 @@ def robot_nights(robot: str, nights: int, moved_at: int = 10**9, size: float = 8
 
 def with_constant_errors(row: RobotRow, size: float) -> RobotRow:
     """The same night with a constant error of both carriers in its covariance, as ``rw.calibrate`` puts it there."""
-    shift = np.vstack([size * se3.adjoint(np.linalg.inv(frame.T)[None])[0] for frame in row.frames])
-    return replace(row, covariance=row.covariance + shift @ shift.T, constant_errors=((size,) * 6, (size,) * 6))
+    covariance = row.covariance.copy()
+    for kind in ("sensor", "target"):  # the errors of the two carriers are independent
+        moves = (size * (frame.kind == kind) * se3.adjoint(np.linalg.inv(frame.T)[None])[0] for frame in row.frames)
+        shift = np.vstack(list(moves))
+        covariance += shift @ shift.T
+    return replace(row, covariance=covariance, constant_errors=((size,) * 6, (size,) * 6))
 
 
 def failed_night(robot: str, night: int) -> RobotRow:

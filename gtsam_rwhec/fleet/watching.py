@@ -27,7 +27,7 @@ from gtsam_rwhec.fleet.drift_events import (
 from gtsam_rwhec.fleet.fleet_rows import RobotRow
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.results.common_quantities import Movement
+from gtsam_rwhec.results.common_quantities import Movement, less_common_errors
 from gtsam_rwhec.results.control_chart import RATE, Alarm, Chart, NightTest
 from gtsam_rwhec.results.nights import FoundSpread, Nights, SpreadPool
 
@@ -35,8 +35,6 @@ from gtsam_rwhec.results.nights import FoundSpread, Nights, SpreadPool
 DETERMINES_SOMETHING = {Ground.NOT_UNIQUE, Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS}
 #: Smaller eigenvalues of a correlation matrix are rounding error and are set to this.
 ROUNDING = 1e-12
-#: A matrix with an eigenvalue below minus this is not a correlation matrix.
-NEGATIVE = 1e-9
 #: Names of a tangent's numbers.
 AXES = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
 
@@ -151,17 +149,13 @@ def _without_constant_errors(row: RobotRow) -> Array:
     finite: Array = np.where(np.isfinite(row.covariance), row.covariance, 0.0)
     if not row.constant_errors:
         return finite
-    shift = np.zeros((len(finite), 6))
+    shifts = np.zeros((2, len(finite), 6))  # the errors of the two carriers are independent
     for i, frame in enumerate(row.frames):
-        deviations = np.array(row.constant_errors[frame.kind == "sensor"])
-        shift[6 * i : 6 * i + 6] = se3.adjoint(se3.inverse(frame.T)[None])[0] * deviations
-    known = np.isfinite(np.diagonal(row.covariance)) & (np.diagonal(row.covariance) > 0.0)
-    rest = finite - shift @ shift.T
-    size = np.sqrt(np.maximum(np.diagonal(rest), 0.0))[known]
-    if not (size > 0.0).all():
-        return finite
-    correlations = rest[np.ix_(known, known)] / size[:, None] / size
-    return rest if np.linalg.eigvalsh(correlations).min(initial=0.0) >= -NEGATIVE else finite
+        carrier = int(frame.kind == "sensor")
+        deviations = np.array(row.constant_errors[carrier])
+        shifts[carrier, 6 * i : 6 * i + 6] = se3.adjoint(se3.inverse(frame.T)[None])[0] * deviations
+    rest = less_common_errors(finite, shifts)
+    return finite if rest is None else rest
 
 
 def _information(C: Array, rows: np.ndarray) -> Array:

@@ -15,7 +15,7 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
-from gtsam_rwhec.results.common_quantities import Movement, Quantities, numbers_of, quantities
+from gtsam_rwhec.results.common_quantities import Movement, Quantities, less_common_errors, numbers_of, quantities
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.results.schema import CalibrationFields
 from gtsam_rwhec.solver.solution import Solution
@@ -286,10 +286,6 @@ def remarks_of(old: Result, new: Result) -> list[str]:
     return remarks
 
 
-#: An eigenvalue of correlations below zero by more than this is not a rounding error.
-ROUNDING = 1e-9
-
-
 def has_constant_errors(result: Result) -> bool:
     """Whether the covariance holds a constant error of the carriers' poses, as the result says."""
     return result.calibration is not None and bool(np.any(result.calibration.constant_errors))
@@ -305,19 +301,11 @@ def without_constant_errors(result: Result) -> RefinedPoses:
     if fields is None or not has_constant_errors(result):
         return refined
     joint = refined.joint
-    finite = joint.finite.copy()
-    for poses, deviations in zip((refined.X, refined.Y), fields.constant_errors, strict=True):
-        shift = np.zeros((len(finite), 6))
+    shifts = np.zeros((2, len(joint.finite), 6))
+    for shift, poses, deviations in zip(shifts, (refined.X, refined.Y), fields.constant_errors, strict=True):
         for name, pose in poses.items():
             unknown = Unknown(UnknownKind.FRAME, name)
             if unknown in joint.slots:
                 shift[joint.slots[unknown]] = pose.inverse().AdjointMap() * np.array(deviations)
-        finite -= shift @ shift.T
-    size = np.sqrt(np.maximum(np.diagonal(finite), 0.0))
-    has = np.diagonal(joint.finite) > 0.0
-    if not (size[has] > 0.0).all():
-        return refined
-    correlations = finite[np.ix_(has, has)] / size[has, None] / size[has]
-    if np.linalg.eigvalsh(correlations).min(initial=0.0) < -ROUNDING:
-        return refined
-    return replace(refined, joint=replace(joint, finite=finite))
+    rest = less_common_errors(joint.finite, shifts)
+    return refined if rest is None else replace(refined, joint=replace(joint, finite=rest))

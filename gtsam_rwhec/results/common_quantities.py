@@ -175,3 +175,22 @@ def _unit(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> Array:
     """The unit of each row, from the first of both that has the unknown."""
     joint = old.joint if unknown in old.joint.slots else new.joint
     return joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)
+
+
+#: An eigenvalue of correlations below zero by more than this is not a rounding error.
+ROUNDING = 1e-9
+
+
+def less_common_errors(covariance: Array, shifts: Array) -> Array | None:
+    """A covariance (m, m) less those of errors that several estimates share; None where it is smaller than these.
+
+    ``shifts`` (k, m, 6) are how each of k independent errors moves all numbers, for one standard deviation along each
+    of its axes.
+    """
+    rest: Array = covariance - sum(shift @ shift.T for shift in shifts)
+    has = np.diagonal(covariance) > 0.0
+    size = np.sqrt(np.maximum(np.diagonal(rest), 0.0))[has]
+    if not (size > 0.0).all():
+        return None
+    correlations = rest[np.ix_(has, has)] / size[:, None] / size
+    return rest if np.linalg.eigvalsh(correlations).min(initial=0.0) >= -ROUNDING else None
