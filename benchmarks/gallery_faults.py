@@ -17,27 +17,15 @@ Make = Callable[[np.random.Generator], Recording]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of the gallery.
+    """One fault of the gallery."""
 
-    Attributes
-    ----------
-    name, title : str
-        A word for files, and a heading.
-    done : str
-        What is done to the data.
-    words : tuple of str
-        Patterns (regular expressions) that must all be in the verdict or the first paragraph.
-    cure : str
-        What to do about it.
-    bad, good : callable
-        The recording of a generator, with the fault and without it.
-    """
-
+    #: name, title: A word for files, and a heading.
     name: str
     title: str
-    done: str
-    words: tuple[str, ...]
-    cure: str
+    done: str  #: What is done to the data
+    words: tuple[str, ...]  #: Patterns (regular expressions) that must all be in the verdict or the first paragraph
+    cure: str  #: What to do about it
+    #: bad, good: The recording of a generator, with the fault and without it.
     bad: Make
     good: Make
 

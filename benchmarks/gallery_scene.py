@@ -42,44 +42,25 @@ T_BASE_BOARD[:3, 3] = (-0.60, -0.15, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What was true while images were taken, and what of it is written.
+    """What was true while images were taken, and what of it is written."""
 
-    Attributes
-    ----------
-    T_base_hand, T_hand_camera, T_base_board : (N, 4, 4) arrays
-        The truth in each image.
-    reported : (N, 4, 4) array
-        T_base_hand as the controller has it; of a moving log also at other times.
-    camera, stated : Camera
-        The lens, and the intrinsics of the rig file.
-    size : float
-        The board's true size over the stated one.
-    stamps_ns, reported_ns : (N,) and (M,) arrays, optional
-        Of images and of poses, where the arm moved; else the images were taken at rest.
-    exposure_s : float
-        For how long the shutter is open.
-    turned : tuple of int
-        Images that are upside down.
-    poses : str
-        How poses are written: "xyzw", "wxyz", "mm" or "inverse".
-    carriers : (str, str)
-        What the rig file says of sensors and targets.
-    """
-
+    #: T_base_hand, T_hand_camera, T_base_board: (N, 4, 4): The truth in each image.
     T_base_hand: Array
     T_hand_camera: Array
     T_base_board: Array
-    reported: Array
+    reported: Array  #: (N, 4, 4): T_base_hand as the controller has it; of a moving log also at other times
+    #: camera, stated: The lens, and the intrinsics of the rig file.
     camera: Camera
     stated: Camera
-    size: float = 1.0
+    size: float = 1.0  #: The board's true size over the stated one
+    #: stamps_ns, reported_ns: (N,): Of images and of poses, where the arm moved; else images were taken at rest
     stamps_ns: Array | None = None
     reported_ns: Array | None = None
     velocity: Array | None = field(default=None, repr=False)
-    exposure_s: float = 0.0
-    turned: tuple[int, ...] = ()
-    poses: str = "xyzw"
-    carriers: tuple[str, str] = ("hand", "base")
+    exposure_s: float = 0.0  #: For how long the shutter is open
+    turned: tuple[int, ...] = ()  #: Images that are upside down
+    poses: str = "xyzw"  #: How poses are written: "xyzw", "wxyz", "mm" or "inverse"
+    carriers: tuple[str, str] = ("hand", "base")  #: What the rig file says of sensors and targets
 
     @property
     def T_camera_board(self) -> Array:

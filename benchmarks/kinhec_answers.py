@@ -27,27 +27,17 @@ LEVEL, FAR_LEVEL = 0.95, 0.9999
 
 @dataclass(frozen=True)
 class OurAnswer:
-    """What `rw.calibrate` said of a sequence, and whether it was true.
+    """What `rw.calibrate` said of a sequence, and whether it was true."""
 
-    Attributes
-    ----------
-    status : str
-        "unique", "not unique", "not proven", or "no answer" where the call raised or the protocol has no keyframes.
-    error : (float, float)
-        Of KinHEC's X, degrees and millimetres.
-    held, held_far : bool or None
-        Whether the 95 and the 99.99 % ellipsoid of KinHEC's X hold the truth; None where there is no ellipsoid.
-    other_held : bool or None
-        The 95 % ellipsoid of the other frame.
-    """
-
+    #: "unique", "not unique", "not proven", or "no answer" where the call raised or the protocol has no keyframes
     status: Literal["unique", "not unique", "not proven", "no answer"]
-    error: Error
+    error: Error  #: Of KinHEC's X, degrees and millimetres
     verdict: str
     reason: str
+    #: held, held_far: Whether the 95 and the 99.99 % ellipsoid of KinHEC's X hold the truth; None without an ellipsoid
     held: bool | None = None
     held_far: bool | None = None
-    other_held: bool | None = None
+    other_held: bool | None = None  #: The 95 % ellipsoid of the other frame
     seconds: float = float("nan")
     offset_error_ms: float = float("nan")
 

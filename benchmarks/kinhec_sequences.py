@@ -55,29 +55,18 @@ class Keyframes:
 
 @dataclass(frozen=True)
 class NeutralSequence:
-    """One sequence: its truth, what its user would know of it, and the package's own object for its baselines.
-
-    Attributes
-    ----------
-    number : int
-        Its place in the tier, which seeds its baselines.
-    hand_eye : "X" or "Y"
-        Which of this library's poses is KinHEC's X.
-    X, Y : (4, 4) arrays
-    scale : float
-        t_B = scale * true length.
-    scale_mode : "known" or "shared"
-        Shared where the camera is a monocular one that tracks itself: the user of such odometry knows that.
-    """
+    """One sequence: its truth, what its user would know of it, and the package's own object for its baselines."""
 
     name: str
     seed: int
     track: str
-    number: int
-    hand_eye: Literal["X", "Y"]
+    number: int  #: Its place in the tier, which seeds its baselines
+    hand_eye: Literal["X", "Y"]  #: Which of this library's poses is KinHEC's X
+    #: X, Y: (4, 4)
     X: FloatArray
     Y: FloatArray
-    scale: float
+    scale: float  #: t_B = scale * true length
+    #: Shared where the camera is a monocular one that tracks itself: the user of such odometry knows that.
     scale_mode: Literal["known", "shared"]
     stations: bool
     synchronous: bool

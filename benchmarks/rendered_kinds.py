@@ -36,42 +36,21 @@ class Thing:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of target.
-
-    Attributes
-    ----------
-    target : Target
-    draw : callable
-        Of the target, the picture's pixels a unit, and the margin in units: its print.
-    unit_m : float
-        The unit of the drawing, metres.
-    element_m, least_px : float
-        What must be large enough, and its least shorter projected side: a square, a tag, a circle's cell.
-    margins : pair of float
-        The range of the white margin, in units.
-    half_m : pair of float
-        Half the sides of what must be seen, metres.
-    peer : callable
-        OpenCV's own detector, for its time.
-    ways : int
-        In how many ways the target looks the same.
-    drawn : Target or None
-        What is drawn in the target's place: then nothing may be read. Half the sides are its own.
-    beside : tuple of Thing
-        One or two of these are in each image too, the target over them.
-    """
+    """A kind of target."""
 
     target: Target
-    draw: Callable[..., Print]
-    unit_m: float
+    draw: Callable[..., Print]  #: Of the target, the picture's pixels a unit, and the margin in units: its print
+    unit_m: float  #: The unit of the drawing, metres
+    #: element_m, least_px: What must be large enough (a square, a tag, a circle's cell), its least shorter seen side
     element_m: float
     least_px: float
-    margins: tuple[float, float]
-    half_m: tuple[float, float]
-    peer: Callable[[Gray], object]
-    ways: int = 1
+    margins: tuple[float, float]  #: The range of the white margin, in units
+    half_m: tuple[float, float]  #: Half the sides of what must be seen, metres
+    peer: Callable[[Gray], object]  #: OpenCV's own detector, for its time
+    ways: int = 1  #: In how many ways the target looks the same
+    #: What is drawn in the target's place: then nothing may be read. Half the sides are its own.
     drawn: Target | None = None
-    beside: tuple[Thing, ...] = ()
+    beside: tuple[Thing, ...] = ()  #: One or two of these are in each image too, the target over them
 
     def outline(self) -> Array:
         """(n, 3) along the edges of what must be seen, metres."""

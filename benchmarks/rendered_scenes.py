@@ -36,31 +36,16 @@ class Pose:
 
 @dataclass(frozen=True)
 class Light:
-    """What happens between paper and gray values.
+    """What happens between paper and gray values."""
 
-    Attributes
-    ----------
-    black, white : float
-        Of ink and of paper, of full scale.
-    vignetting : float
-        The share of light that the image's corners lose.
-    blur_px : float
-        Standard deviation.
-    motion_px : tuple of float
-        The way of the image during the exposure.
-    gamma : float
-        Gray values are light to this power.
-    noise : float
-        Standard deviation, of 255.
-    """
-
+    #: black, white: Of ink and of paper, of full scale.
     black: float
     white: float
-    vignetting: float
-    blur_px: float
-    motion_px: tuple[float, float]
-    gamma: float
-    noise: float
+    vignetting: float  #: The share of light that the image's corners lose
+    blur_px: float  #: Standard deviation
+    motion_px: tuple[float, float]  #: The way of the image during the exposure
+    gamma: float  #: Gray values are light to this power
+    noise: float  #: Standard deviation, of 255
 
 
 def random_camera(rng: np.random.Generator) -> Camera:

@@ -149,20 +149,12 @@ def _pixels(T_camera_board: Array, points: Array, camera: Camera) -> Array | Non
 
 @dataclass(frozen=True)
 class Placement:
-    """How boards are drawn in front of a camera.
+    """How boards are drawn in front of a camera."""
 
-    Attributes
-    ----------
-    depth_m : (float, float)
-        Mean and standard deviation of the depth of the board's middle.
-    tilt : float
-        Standard deviation of the board's tilt about each of its axes, radians; 0: it is fronto-parallel.
-    aim, spread : (float, float) each
-        Where the board's middle is: normalised coordinates, mean and standard deviation.
-    """
-
-    depth_m: tuple[float, float] = (1.5, 0.15)
+    depth_m: tuple[float, float] = (1.5, 0.15)  #: Mean and standard deviation of the depth of the board's middle
+    #: Standard deviation of the board's tilt about each of its axes, radians; 0: it is fronto-parallel.
     tilt: float = 0.35
+    #: aim, spread: Where the board's middle is: normalised coordinates, mean and standard deviation.
     aim: tuple[float, float] = (0.0, 0.0)
     spread: tuple[float, float] = (0.1, 0.1)
 

@@ -36,23 +36,12 @@ sensors:
 
 @dataclass(frozen=True)
 class MadeFleet:
-    """Where it is, and the truth.
-
-    Attributes
-    ----------
-    manifest : str
-    rig : str
-        The rig file of all robots.
-    logs : dict of str to tuple of Path
-        By robot.
-    truth : dict of str to dict of str to (4, 4) array
-        By robot, then by frame: T_hand_camera and T_base_tag.
-    """
+    """Where it is, and the truth."""
 
     manifest: str
-    rig: str
-    logs: dict[str, tuple[Path, ...]]
-    truth: dict[str, dict[str, Array]]
+    rig: str  #: The rig file of all robots
+    logs: dict[str, tuple[Path, ...]]  #: By robot
+    truth: dict[str, dict[str, Array]]  #: By robot, then by frame: T_hand_camera and T_base_tag
 
 
 def write_fleet(

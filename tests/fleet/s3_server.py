@@ -19,21 +19,11 @@ BUCKET = "robots"
 
 @dataclass
 class S3Server:
-    """The store.
+    """The store."""
 
-    Attributes
-    ----------
-    sent : int
-        Bytes of objects that it has sent, counted where they leave it.
-    asked : int
-        How many requests sent them.
-    cut_after : int or None
-        Each answer with an object breaks off after so many bytes.
-    """
-
-    sent: int = 0
-    asked: int = 0
-    cut_after: int | None = None
+    sent: int = 0  #: Bytes of objects that it has sent, counted where they leave it
+    asked: int = 0  #: How many requests sent them
+    cut_after: int | None = None  #: Each answer with an object breaks off after so many bytes
 
     def counting(self, app: Any) -> Any:
         """`app` with this counter around it."""

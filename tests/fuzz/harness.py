@@ -14,24 +14,13 @@ Mutate = Callable[[bytes, random.Random, Callable[[bytes], bytes]], bytes]
 
 @dataclass(frozen=True)
 class Harness:
-    """One reader under attack.
+    """One reader under attack."""
 
-    Attributes
-    ----------
-    read : callable
-        Reads one input. Whatever leaves it but RwhecError is a finding.
-    seeds : callable
-        Valid inputs, made by code, from which the changes start.
-    mutate : callable or None
-        Changes that know the format, so that they get behind its first checks; None for changes of bytes alone.
-    limit_s : float
-        Seconds of the processor that one input may take.
-    """
-
-    read: Callable[[bytes], None]
-    seeds: Callable[[], Iterable[bytes]]
+    read: Callable[[bytes], None]  #: Reads one input. Whatever leaves it but RwhecError is a finding
+    seeds: Callable[[], Iterable[bytes]]  #: Valid inputs, made by code, from which the changes start
+    #: Changes that know the format, so that they get behind its first checks; None for changes of bytes alone.
     mutate: Mutate | None = None
-    limit_s: float = 10.0
+    limit_s: float = 10.0  #: Seconds of the processor that one input may take
 
 
 def scratch() -> Path:

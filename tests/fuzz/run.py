@@ -44,20 +44,13 @@ MOST_FINDINGS = 200
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run did.
-
-    Attributes
-    ----------
-    coverage : int
-        How many of the branches of the library, and of the libraries that parse for it, the corpus reaches.
-    refused : int
-        How many inputs ended with an RwhecError; the rest was read.
-    """
+    """What one run did."""
 
     reader: str
     seconds: float
     executions: int
-    refused: int
+    refused: int  #: How many inputs ended with an RwhecError; the rest was read
+    #: How many of the branches of the library, and of the libraries that parse for it, the corpus reaches.
     coverage: int
     corpus: int
     peak_mb: int
