@@ -1,4 +1,4 @@
-"""Boards' corners against their true places, for turned boards, turned tags and all lenses."""
+"""Boards' corners against their true places, for turned boards and tags and all lenses; other grids are rejected."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from rendered import BARREL, FISHEYE, OMNI, PINHOLE, Print, pose, printed, proje
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import AprilGrid, Charuco, Checkerboard, Target
 from gtsam_rwhec.detect import board_corners as boards
+from gtsam_rwhec.detect.board_evidence import evidence
+from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.detector import Detection, Detector
 
 BOARD = Charuco("board", "aruco_5x5_100", 6, 4, 0.03, 0.0225, first_id=7)
@@ -112,3 +114,84 @@ def test_the_rendered_board_is_the_board_that_opencv_draws() -> None:
     for number, place in middle.items():
         u, v = (place - 0.5 * np.array(picture.picture.shape[::-1])) * picture.pixel_m
         np.testing.assert_allclose([u, -v], expected[number - 11, :2], atol=1e-3)
+
+
+T = pose((15.0, -20.0, 10.0), (0.0, 0.0, 0.33))
+#: Small, since rays through a lens take time.
+SMALL_BARREL = Camera.of(
+    160, 120, "plumb_bob", [[140.0, 0.0, 79.0], [0.0, 139.0, 60.5], [0.0, 0.0, 1.0]], (-0.28, 0.09), "test"
+)
+SMALL_CAMERAS = pytest.mark.parametrize("camera", [PINHOLE, SMALL_BARREL], ids=["pinhole", "barrel"])
+
+
+def grid_of(camera: Camera, columns_off: int = 0, rows_off: int = 0) -> np.ndarray:
+    """Corners of the board, or of one that is whole squares beside it."""
+    corners = CHESS.corners() + 0.03 * np.array([columns_off, -rows_off, 0.0])
+    return projected(camera, corners, T).reshape(4, 5, 2)
+
+
+@SMALL_CAMERAS
+def test_the_boards_corners_pass(camera: Camera) -> None:
+    image = render(camera, [(printed(CHESS), T)])
+    seen = evidence(image, grid_of(camera), camera)
+    assert (seen.rejection, seen.first_is_dark) == (None, True)
+    turned = evidence(image, grid_of(camera)[::-1, ::-1], camera)
+    assert (turned.rejection, turned.first_is_dark) == (None, False)
+
+
+@SMALL_CAMERAS
+@pytest.mark.parametrize("off", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (2, 0)], ids=str)
+def test_a_board_whole_squares_off_is_rejected(camera: Camera, off: tuple[int, int]) -> None:
+    image = render(camera, [(printed(CHESS), T)])
+    assert evidence(image, grid_of(camera, *off), camera).rejection is Rejection.SQUARES
+
+
+def test_a_thin_margin_does_not_hide_that_a_board_is_one_square_off() -> None:
+    whole = printed(CHESS)
+    thin = type(whole)(whole.picture[35:-35, 35:-35], whole.pixel_m)
+    image = render(PINHOLE, [(thin, T)])
+    assert evidence(image, grid_of(PINHOLE), PINHOLE).rejection is None
+    for off in ((1, 0), (0, -1)):
+        assert evidence(image, grid_of(PINHOLE, *off), PINHOLE).rejection is Rejection.SQUARES
+
+
+def test_a_part_of_a_larger_board_is_rejected() -> None:
+    image = render(PINHOLE, [(printed(Checkerboard("larger", 7, 4, 0.03)), T)])
+    assert evidence(image, grid_of(PINHOLE), PINHOLE).rejection is Rejection.OTHER_SIZE
+
+
+def test_wrong_corners_do_not_count_and_many_are_no_grid() -> None:
+    image, grid = render(PINHOLE, [(printed(CHESS), T)]), grid_of(PINHOLE)
+    grid[1, 2] += [1.0, 0.0]
+    grid[3, 0] += [0.0, -2.0]
+    seen = evidence(image, grid, PINHOLE)
+    assert seen.rejection is None
+    assert np.argwhere(~seen.kept).tolist() == [[1, 2], [3, 0]]
+    off_board = grid_of(PINHOLE)
+    off_board[0] -= [0.0, 3.0]
+    assert evidence(image, off_board, PINHOLE).rejection is Rejection.NOT_A_GRID
+    grid[:2, :3] += [3.0, 0.0]
+    assert evidence(image, grid, PINHOLE).rejection is Rejection.NOT_A_GRID
+    grid[:] = 7.0
+    assert evidence(image, grid, PINHOLE).rejection is Rejection.NOT_A_GRID
+
+
+def test_a_board_at_the_images_edge_is_rejected_where_its_outer_squares_are_not_in_it() -> None:
+    near = pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.14))
+    grid = projected(PINHOLE, CHESS.corners(), near).reshape(4, 5, 2)
+    assert PINHOLE.inside(grid).all()
+    image = render(PINHOLE, [(printed(CHESS), near)])
+    assert evidence(image, grid, PINHOLE).rejection is Rejection.NOT_WHOLE
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_a_flat_patch_is_no_board(value: int) -> None:
+    # The contrast of its squares is 0 / 0.
+    flat = np.full((240, 320), value, np.uint8)
+    assert evidence(flat, grid_of(PINHOLE), PINHOLE).rejection is Rejection.SQUARES
+
+
+def test_shade_on_a_half_does_not_reject() -> None:
+    image = render(PINHOLE, [(printed(CHESS), T)]).astype(float)
+    image[:, :160] *= 0.25
+    assert evidence(image.astype(np.uint8), grid_of(PINHOLE), PINHOLE).rejection is None
