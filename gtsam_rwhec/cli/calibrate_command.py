@@ -35,6 +35,7 @@ from gtsam_rwhec.cli.shared_options import (
     refuse,
     show,
     show_odometries,
+    written_in,
 )
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
@@ -186,15 +187,20 @@ def calibrate(
     if rig is not None or is_log(source):
         refuse(context, NOT_FOR_A_LOG)
         described = None if rig is None else rw.rig.read_rig(rig)
-        if rw.odometry.is_of_odometries(described, source):
+        is_of_odometries = rw.odometry.is_of_odometries(described, source)
+        if is_of_odometries:
             refuse(context, NOT_FOR_ODOMETRIES)
         if output is None:
             needed = "give -o FOLDER"
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
-        if rw.odometry.is_of_odometries(described, source):
-            return calibrate_odometries(source, described, output, anyway=anyway, force=force, verbose=verbose)
+        if is_of_odometries:
+            with StageDisplay() as stage, said_in_the_report():
+                solved = rw.odometry.calibrate_odometry_log(
+                    source, described, output, anyway=anyway, replace=force, progress=stage
+                )
+            return show_odometries(solved, output, anyway=anyway, verbose=verbose)
         return calibrate_log(
             source,
             rig,
@@ -335,16 +341,5 @@ def calibrate_log(
             replace=force,
             progress=stage,
         )
-    written = [name for name in rw.runs.OUTPUTS if (output / name).exists()]
-    page = output / rw.runs.REPORT_FILE if rw.runs.REPORT_FILE in written else None
-    messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(calibrated, anyway=anyway)]
-    return show(calibrated, messages, verbose=verbose, page=page)
-
-
-def calibrate_odometries(
-    source: Path, rig: rw.rig.Rig | None, output: Path, *, anyway: bool, force: bool, verbose: bool
-) -> ExitStatus:
-    """Run all stages of sensors that know only their own motion, and print the report."""
-    with StageDisplay() as stage, said_in_the_report():
-        solved = rw.odometry.calibrate_odometry_log(source, rig, output, anyway=anyway, replace=force, progress=stage)
-    return show_odometries(solved, output, anyway=anyway, verbose=verbose)
+    written, page = written_in(output)
+    return show(calibrated, [written, *exported(calibrated, anyway=anyway)], verbose=verbose, page=page)

@@ -122,13 +122,18 @@ def show(
     return exit_status(calibrated.judgement, of_rig=True)
 
 
-def show_odometries(solved: rw.odometry.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
-    """Print the report of sensors that know only their own motion, and where the files are; its exit status."""
+def written_in(output: Path) -> tuple[str, Path | None]:
+    """A message with the files that a calibration wrote into its folder; and its page, if it wrote one."""
     written = [name for name in rw.runs.OUTPUTS if (output / name).exists()]
     page = output / rw.runs.REPORT_FILE if rw.runs.REPORT_FILE in written else None
+    return f"Written to {shown_path(output)}: {', '.join(written)}.", page
+
+
+def show_odometries(solved: rw.odometry.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
+    """Print the report of sensors that know only their own motion, and where the files are; its exit status."""
+    written, page = written_in(output)
     rw.odometry.print_odometry(solved.result, verbose=verbose, page=page)
-    messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(solved, anyway=anyway)]
-    for message in messages:
+    for message in (written, *exported(solved, anyway=anyway)):
         say(message, to_errors=True)
     return exit_status(solved.judgement, of_rig=True)
 

@@ -245,18 +245,22 @@ def _quiet_on_one_thread() -> None:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-def measured_corner_px(squared_px: np.ndarray, corners: np.ndarray, least_px: float = 0.02) -> float:
+#: Pixels: a corner is known no better, whatever few reprojection errors say.
+LEAST_PX = 0.02
+
+
+def measured_corner_px(squared_px: np.ndarray, corners: np.ndarray) -> float:
     """Standard deviation of a corner along each axis, from reprojection errors.
 
     `squared_px` (n,) are sums of squared errors of n poses of one target in one camera, px^2; a pose of `corners` (n,)
-    corners has 2 corners - 6 degrees of freedom. The result is at least `least_px`, since few data can give a value
+    corners has 2 corners - 6 degrees of freedom. The result is at least `LEAST_PX`, since few data can give a value
     that is too small.
     """
     freedom = 2 * corners - 6
     mask = np.isfinite(squared_px) & (freedom > 0)
     if not mask.any():
-        return least_px
+        return LEAST_PX
     # A few wrong poses must not count: poses above six times the median are left out.
     each = squared_px[mask] / freedom[mask]
     kept = each <= 6.0 * np.median(each) + 1e-12
-    return max(least_px, float(np.sqrt(squared_px[mask][kept].sum() / freedom[mask][kept].sum())))
+    return max(LEAST_PX, float(np.sqrt(squared_px[mask][kept].sum() / freedom[mask][kept].sum())))

@@ -76,9 +76,9 @@ class YamlFile:
         return {name: YamlFile(self.where, value, lines[name]) for name, value in self.data[key].items()}
 
 
-def read_yaml(path: str | Path, *, tags: Collection[str] = ()) -> YamlFile:
+def read_yaml(path: str | Path) -> YamlFile:
     """Read a file, with the errors of `read_text` and `parse_yaml`."""
-    return parse_yaml(read_text(path), str(path), tags=tags)
+    return parse_yaml(read_text(path), str(path))
 
 
 def read_text(path: str | Path) -> str:

@@ -163,8 +163,8 @@ def scale_sentence(solution: Solution) -> str:
     )
 
 
-def weights_sentence(solution: Solution, source: str = "as given", *, noise_is_estimated: bool = False) -> str:
-    """Where the weights of the measurements come from (`source`), and what the cost means with these weights.
+def weights_sentence(solution: Solution, *, noise_is_estimated: bool = False) -> str:
+    """Where the weights of the measurements come from, and what the cost means with these weights.
 
     ``noise_is_estimated``: there are covariances from the noise that the residuals show.
     """
@@ -179,8 +179,8 @@ def weights_sentence(solution: Solution, source: str = "as given", *, noise_is_e
             "for absolute numbers."
         )
     if solution.certificate.objective.form == "inverse":
-        return f"Weights: {source}. The cost is not a chi-square: it is of the inverse equation B X^-1 = Y^-1 A."
-    return f"Weights: {source}. If they are true, the cost is half a chi-square."
+        return "Weights: as given. The cost is not a chi-square: it is of the inverse equation B X^-1 = Y^-1 A."
+    return "Weights: as given. If they are true, the cost is half a chi-square."
 
 
 def time_sentence(certificate: Certificate) -> str:

@@ -148,18 +148,16 @@ class Chart:
     title: str
     says: str
     svg: SvgFigure
-    is_wide: bool = False
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph: JPEG or PNG bytes."""
+    """A photograph: bytes of a JPEG file."""
 
     name: str
     title: str
     says: str
     content: bytes
-    media_type: Literal["image/jpeg", "image/png"] = "image/jpeg"
     is_wide: bool = True
 
 

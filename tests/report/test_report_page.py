@@ -69,7 +69,7 @@ def test_every_block_is_shown_and_names_are_text() -> None:
         Listing((name, (name, Number("result.json#/a", 1.0)))),
         Table(name, (name, "number"), ((name, Number("result.json#/a", None)),), name),
         Chart("chart", name, name, svg),
-        Picture("picture", name, name, b"\x89PNG", "image/png"),
+        Picture("picture", name, name, b"\xff\xd8"),
         Drawing("drawing", name, name, ({"type": "scatter3d", "name": name},), {"title": name}, svg),
         CopyText("copy", name, name),
         Folded(name, (Paragraph(name),)),
