@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import bars
 import numpy as np
 import simulated_cells
-from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import Stated
@@ -61,10 +60,7 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
         cameras = {sensor: first_intrinsics(observations, sensor) for sensor in observations.sensors}
         observations = replace(observations, cameras=cameras)
     result = rw.refine_corners(observations, X, Y, options)
-    errors = {
-        "target": ("board", se3.logmap((se3.inverse(result.X["board"].matrix()) @ given.X["board"])[None])[0]),
-        "sensor": ("cam_0", se3.logmap((se3.inverse(result.Y["cam_0"].matrix()) @ given.Y["cam_0"])[None])[0]),
-    }
+    errors = {"target": ("board", given.error(result, "board")), "sensor": ("cam_0", given.error(result, "cam_0"))}
     if kind.told != "exact":
         found = result.intrinsics["cam_0"].camera.parameters
         truth = given.cameras["cam_0"].parameters

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import bars
 import numpy as np
 import simulated_cells
-from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.fit_options import Stated
@@ -61,16 +60,15 @@ def one(name: str, seed: int) -> dict[str, bool]:
     given = simulated_cells.cell(
         seed, facing=kind.placement, stated=kind.told, carrier=(1e-3, 5e-4) if kind.noisy else (0.0, 0.0)
     )
-    X, Y = given.near(np.random.default_rng(seed))
     options = rw.CornerOptions(stated=kind.told, carrier_noise="estimate" if kind.noisy else "exact")
     try:
-        result = rw.refine_corners(given.observations, X, Y, options)
+        result = given.refined(options, seed=seed)
     except rw.errors.UnderdeterminedError:
         return {"refused": True}
     found = {"refused": False}
     errors = {
-        "target": ("board", se3.logmap((se3.inverse(result.X["board"].matrix()) @ given.X["board"])[None])[0]),
-        "sensor": ("cam_0", se3.logmap((se3.inverse(result.Y["cam_0"].matrix()) @ given.Y["cam_0"])[None])[0]),
+        "target": ("board", given.error(result, "board")),
+        "sensor": ("cam_0", given.error(result, "cam_0")),
         "intrinsics": (
             "intrinsics:cam_0",
             simulated_cells.CAMERA.parameters - result.intrinsics["cam_0"].camera.parameters,

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import bars
 import numpy as np
 import simulated_cells
-from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.camera import Camera
@@ -128,14 +127,9 @@ def one(case: str, seed: int) -> Found:
     kind = KINDS[name]
     given = cell_of(geometry, name, seed)
     options = rw.CornerOptions(stated=kind.told, carrier_noise="estimate" if kind.noisy else "exact")
-    X, Y = given.near(np.random.default_rng(seed))
-    result = rw.refine_corners(given.observations, X, Y, options)
-    poses = {**result.X, **result.Y}
-    inside = {}
-    for frame, truth in {**given.X, **given.Y}.items():
-        error = se3.logmap((se3.inverse(poses[frame].matrix()) @ truth)[None])[0]
-        squared = float(error @ np.linalg.solve(result.covariance(frame), error))
-        inside[frame] = squared < result.squared_radius(frame, LEVEL)
+    result = given.refined(options, seed=seed)
+    frames = (*given.X, *given.Y)
+    inside = {name: given.squared_error(result, name) < result.squared_radius(name, LEVEL) for name in frames}
     stated = given.observations.cameras
     return Found(
         inside,

@@ -16,8 +16,10 @@ from rwhec_factors import se3
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corner_residuals import shaped, stacks_of
-from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.corners_refined import CornersRefined
+from gtsam_rwhec.fitting.fit_options import CornerOptions, Stated
 from gtsam_rwhec.fitting.observations import Observations
 from gtsam_rwhec.fitting.stated_intrinsics import prior_of
 
@@ -52,6 +54,21 @@ class Cell:
             return {name: T @ se3.expmap(rng.normal(scale=off, size=(1, 6)))[0] for name, T in poses.items()}
 
         return moved(self.X), moved({name: self.Y[name] for name in self.observations.sensors})
+
+    def refined(self, options: CornerOptions | None = None, seed: int = 9) -> CornersRefined:
+        """The refinement from a start near the truth."""
+        return refine_corners(self.observations, *self.near(np.random.default_rng(seed)), options)
+
+    def error(self, found: CornersRefined, frame: str) -> Array:
+        """xi (6,) with the found pose Expmap(xi) the frame's true one."""
+        pose, truth = ((of.X | of.Y)[frame] for of in (found, self))
+        error: Array = se3.logmap((se3.inverse(pose.matrix()) @ truth)[None])[0]
+        return error
+
+    def squared_error(self, found: CornersRefined, frame: str) -> float:
+        """The squared error of a frame's pose over its covariance."""
+        error = self.error(found, frame)
+        return float(error @ np.linalg.solve(found.covariance(frame), error))
 
 
 def cell(

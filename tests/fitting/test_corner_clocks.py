@@ -110,10 +110,7 @@ def test_offsets_are_found_with_everything_else(late: Cell, noise: rw.fitting.Ca
     off = np.array([refined.time_offsets_s[name] - LATE[name] for name in LATE])
     assert np.sqrt(np.diagonal(covariance)).max() < 1e-4
     assert off @ np.linalg.solve(covariance, off) < 14.0
-    for name in ("board", "cam_0", "cam_1"):
-        pose, truth = (refined.X[name], late.X[name]) if name in late.X else (refined.Y[name], late.Y[name])
-        error = se3.logmap((se3.inverse(pose.matrix()) @ truth)[None])[0]
-        assert error @ np.linalg.solve(refined.covariance(name), error) < 22.5
+    assert all(late.squared_error(refined, name) < 22.5 for name in ("board", "cam_0", "cam_1"))
     # without the offsets the corners are off
     assert held_out_errors(refined, folds=2)["cam_0"].rms_px < 0.16
     kept = replace(options, time_offsets=())
@@ -136,8 +133,7 @@ def test_errors_of_offsets_are_as_large_as_their_deviations() -> None:
 
 def test_a_carrier_that_stands_still_tells_no_offset() -> None:
     still = moving(cell(6, images=20), 2, {}, np.zeros(6))
-    X, Y = still.near(np.random.default_rng(0))
-    refined = rw.refine_corners(still.observations, X, Y, OPTIONS)
+    refined = still.refined(OPTIONS, seed=0)
     assert refined.time_offsets_s == pytest.approx({"cam_0": 0.0, "cam_1": 0.0})
     assert refined.covariance("time_offset:cam_1")[0, 0] == pytest.approx(1.0)
     said = [words for words in refined.findings if "time offset" in words]
@@ -150,8 +146,7 @@ def test_a_carrier_that_stands_still_tells_no_offset() -> None:
 
 def test_motion_that_is_alike_in_all_images_tells_no_offset() -> None:
     alike = moving(cell(6, images=12), 2, {}, np.repeat([0.04, 0.02], 3), alike=True)
-    X, Y = alike.near(np.random.default_rng(0))
-    refined = rw.refine_corners(alike.observations, X, Y, OPTIONS)
+    refined = alike.refined(OPTIONS, seed=0)
     assert any("since the carriers move alike in all of them" in words for words in refined.findings)
     # what an offset would do, the target's pose does too
     assert np.sqrt(refined.covariance("board")[0, 0]) > 1e-3
@@ -159,8 +154,7 @@ def test_motion_that_is_alike_in_all_images_tells_no_offset() -> None:
 
 def test_a_long_offset_asks_for_another_refinement() -> None:
     long = moving(cell(6, images=20), 2, {"cam_0": 0.05})
-    X, Y = long.near(np.random.default_rng(0))
-    refined = rw.refine_corners(long.observations, X, Y, replace(OPTIONS, time_offsets=("cam_0",)))
+    refined = long.refined(replace(OPTIONS, time_offsets=("cam_0",)), seed=0)
     assert any("images of cam_0 were taken +49.9 ms from the times of their A" in words for words in refined.findings)
 
 

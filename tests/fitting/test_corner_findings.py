@@ -15,11 +15,6 @@ from gtsam_rwhec.fitting.observations import Views
 EXACT = rw.CornerOptions(carrier_noise="exact")
 
 
-def refined(given: Cell, options: rw.CornerOptions | None = None) -> rw.CornersRefined:
-    X, Y = given.near(np.random.default_rng(9))
-    return rw.refine_corners(given.observations, X, Y, options)
-
-
 @pytest.fixture(scope="module")
 def good() -> Cell:
     return cell(1, images=20)
@@ -27,11 +22,11 @@ def good() -> Cell:
 
 @pytest.mark.parametrize("options", [rw.CornerOptions(), EXACT], ids=["estimated", "exact"])
 def test_nothing_is_doubtful_in_a_good_cell(good: Cell, options: rw.CornerOptions) -> None:
-    assert refined(good, options).findings == ()
+    assert good.refined(options).findings == ()
 
 
 def test_noise_of_a_good_arm_is_no_finding() -> None:
-    assert not any("noise of A" in words for words in refined(cell(2, images=30, carrier=(1e-3, 5e-4))).findings)
+    assert not any("noise of A" in words for words in cell(2, images=30, carrier=(1e-3, 5e-4)).refined().findings)
 
 
 def with_a_larger_board(given: Cell) -> Cell:
@@ -40,14 +35,14 @@ def with_a_larger_board(given: Cell) -> Cell:
 
 
 def test_a_wrong_size_shows_as_noise_of_the_carriers(good: Cell) -> None:
-    result = refined(with_a_larger_board(good))
+    result = with_a_larger_board(good).refined()
     mm = 1e3 * result.noise.carrier_m
     assert f"{mm:.2g} mm, more than an arm or tracker has" in result.findings[0]
     assert "a wrong size of a target" in result.findings[0]
 
 
 def test_a_wrong_size_shows_as_errors_of_corners_where_a_is_exact(good: Cell) -> None:
-    result = refined(with_a_larger_board(good), EXACT)
+    result = with_a_larger_board(good).refined(EXACT)
     assert f"Corners are off by {result.noise.corner_px:.2g} pixels" in result.findings[0]
 
 
@@ -55,7 +50,7 @@ def test_images_shuffled_against_a_reach_the_bound() -> None:
     given = cell(2, images=14, cameras=1)
     views = {pair: Views(view.A, np.roll(view.pixels, 1, axis=0)) for pair, view in given.observations.views.items()}
     shuffled = replace(given, observations=replace(given.observations, views=views))
-    result = refined(shuffled, rw.CornerOptions(stated="calibration"))
+    result = shuffled.refined(rw.CornerOptions(stated="calibration"))
     assert result.findings[0].startswith("The noise of A is at its bound (0.1 rad and 0.1 m)")
     assert "Do not use this answer. Likely causes: poses of other images" in result.findings[0]
     number = result.left_out["board", "cam_0"].sum()
@@ -65,7 +60,7 @@ def test_images_shuffled_against_a_reach_the_bound() -> None:
 def test_exact_intrinsics_are_held_and_it_is_said(good: Cell) -> None:
     off = np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0])
     given = cell(1, images=20, stated_off=off)
-    result = refined(given, replace(EXACT, stated="exact"))
+    result = given.refined(replace(EXACT, stated="exact"))
     for name, camera in given.observations.cameras.items():
         np.testing.assert_allclose(result.intrinsics[name].camera.K, camera.K, atol=1e-2)
         assert result.intrinsics[name].widened == 1.0
@@ -74,7 +69,7 @@ def test_exact_intrinsics_are_held_and_it_is_said(good: Cell) -> None:
 
 def test_a_calibration_that_is_contradicted_is_named_with_its_deviations() -> None:
     given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
-    result = refined(given, replace(EXACT, stated="calibration"))
+    result = given.refined(replace(EXACT, stated="calibration"))
     camera = result.intrinsics["cam_0"]
     words = next(words for words in result.findings if "of cam_0: the focal" in words)
     off = camera.innovation.off
@@ -88,7 +83,7 @@ def test_a_calibration_that_is_contradicted_is_named_with_its_deviations() -> No
 def test_a_lens_that_was_left_out_is_named_with_the_terms_that_fit(good: Cell, stated: str) -> None:
     pinhole = rw.cameras.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
     without = replace(good.observations, cameras=dict.fromkeys(good.observations.cameras, pinhole))
-    result = refined(replace(good, observations=without), replace(EXACT, stated=stated))
+    result = replace(good, observations=without).refined(replace(EXACT, stated=stated))
     lens = [words for words in result.findings if "have no distortion" in words]
     assert len(lens) == 2
     camera = result.intrinsics["cam_0"]
@@ -104,19 +99,19 @@ def test_a_lens_that_was_left_out_is_named_with_the_terms_that_fit(good: Cell, s
 def test_a_lens_without_distortion_is_none(good: Cell) -> None:
     bare = rw.cameras.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
     given = cell(1, images=20, camera=bare)
-    assert refined(given, EXACT).findings == ()
+    assert given.refined(EXACT).findings == ()
 
 
 def test_cameras_that_share_intrinsics_are_named_together(good: Cell) -> None:
     options = rw.CornerOptions(stated="calibration", carrier_noise="exact", shared=(("cam_0", "cam_1"),))
     off = cell(5, images=20, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
-    found = [words for words in refined(off, options).findings if "contradict" in words]
+    found = [words for words in off.refined(options).findings if "contradict" in words]
     assert len(found) == 1
     assert "of cam_0, cam_1: the focal" in found[0]
 
 
 def test_what_only_the_prior_holds_is_named() -> None:
-    result = refined(cell(7, images=3, cameras=1), replace(EXACT, stated="calibration"))
+    result = cell(7, images=3, cameras=1).refined(replace(EXACT, stated="calibration"))
     held = ", ".join(result.intrinsics["cam_0"].held_by_prior)
     assert any(f"do not tell {held} of cam_0" in words for words in result.findings)
 

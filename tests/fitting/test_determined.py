@@ -101,8 +101,7 @@ def test_arguments_of_another_type_are_named(given: Cell) -> None:
 
 
 def test_other_failures_stay_what_they_are(given: Cell) -> None:
-    X, Y = given.near(np.random.default_rng(9))
-    found = rw.refine_corners(given.observations, X, Y)
+    found = given.refined()
     with pytest.raises(RuntimeError, match=r"out of paper"), told_where_it_fails(found.graph.model, found.point):
         raise RuntimeError("out of paper")
 

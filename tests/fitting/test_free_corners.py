@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 import pytest
 from problems_of_corners import problem_of
-from rwhec_factors import se3
 from scipy.stats import chi2
 from simulated_cells import A_NOISE, BOARD, CAMERA, CORNER_PX, Cell, cell, misprinted, model_and_point
 
@@ -76,17 +75,13 @@ def test_the_sums_by_instant_have_the_graphs_information(small: Cell) -> None:
 
 def test_a_misprinted_board_is_found_with_everything_else() -> None:
     given, off = misprinted(3, MISPRINT_M, images=40, cameras=3, stated="calibration", carrier=(1e-3, 5e-4))
-    X, Y = given.near(np.random.default_rng(0))
-    refined = rw.refine_corners(given.observations, X, Y, OPTIONS)
+    refined = given.refined(OPTIONS, seed=0)
     assert refined.noise.corner_px == pytest.approx(0.1, rel=0.05)
     error = (BOARD.corners() + off - refined.corners["board"]).ravel()
     covariance = refined.covariance("corners:board")
     assert np.sqrt((error**2).mean()) < 0.5 * MISPRINT_M
     assert chi2.ppf(1e-3, 105) < error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 105)
-    for name in ("board", "cam_0", "cam_1", "cam_2"):
-        pose, truth = (refined.X[name], given.X[name]) if name in given.X else (refined.Y[name], given.Y[name])
-        xi = se3.logmap((se3.inverse(pose.matrix()) @ truth)[None])[0]
-        assert xi @ np.linalg.solve(refined.covariance(name), xi) < chi2.ppf(0.999, 6)
+    assert all(given.squared_error(refined, name) < chi2.ppf(0.999, 6) for name in ("board", "cam_0", "cam_1", "cam_2"))
     assert not any("corners of board" in words for words in refined.findings)
 
 
@@ -106,8 +101,7 @@ def test_images_that_were_left_out_are_predicted_better() -> None:
 
 def test_corners_far_from_their_places_are_named() -> None:
     given, _ = misprinted(5, 3e-4, images=30)
-    X, Y = given.near(np.random.default_rng(0))
-    refined = rw.refine_corners(given.observations, X, Y, replace(OPTIONS, corners_m=1e-4))
+    refined = given.refined(replace(OPTIONS, corners_m=1e-4), seed=0)
     said = [words for words in refined.findings if "corners of board are farther" in words]
     assert len(said) == 1
     assert "than corners_m=0.0001 explains (corner " in said[0]
@@ -133,8 +127,7 @@ def test_results_and_their_files_have_the_corners(tmp_path: Path) -> None:
 
 
 def test_a_board_as_stated_has_its_corners_where_they_are_stated(small: Cell) -> None:
-    X, Y = small.near(np.random.default_rng(0))
-    refined = rw.refine_corners(small.observations, X, Y, rw.CornerOptions(carrier_noise="exact"))
+    refined = small.refined(rw.CornerOptions(carrier_noise="exact"), seed=0)
     assert refined.corners["board"] == pytest.approx(BOARD.corners(), abs=0.0)
     assert "corners:board" not in refined.names
     with pytest.raises(OptionError, match=r"corners_m=-1\.0; give a standard deviation, or 0"):

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rwhec_factors import se3
 from scipy.stats import chi2
 from simulated_cells import CAMERA, Cell, cell
 
@@ -91,13 +90,12 @@ def off(camera: Camera, pixels: NDArray[np.float64]) -> float:
 
 def test_xi_is_refined_with_everything_else() -> None:
     given = cell(21, images=20, camera=LENS, stated="calibration", carrier=(1e-3, 5e-4))
-    X, Y = given.near(np.random.default_rng(9))
-    result = rw.refine_corners(given.observations, X, Y, rw.CornerOptions(stated="calibration"))
+    result = given.refined(rw.CornerOptions(stated="calibration"))
     intrinsics = result.intrinsics["cam_0"]
     assert intrinsics.names == ("fx/(1+xi)", "fy/(1+xi)", "cx", "cy", "xi", "k1", "k2", "p1", "p2")
     errors, names = [], []
-    for name, T in (given.X | given.Y).items():
-        errors.append(se3.logmap((se3.inverse((result.X | result.Y)[name].matrix()) @ T)[None])[0])
+    for name in given.X | given.Y:
+        errors.append(given.error(result, name))
         names.append(name)
     for name in given.Y:
         errors.append(LENS.parameters - result.intrinsics[name].camera.parameters)
@@ -117,9 +115,7 @@ def test_an_unknown_unified_lens_is_found_from_corners() -> None:
     found = rw.calibrate_corners(replace(given.observations, cameras=nothing), options).refined
     pixels = given.observations.views["board", "cam_0"].pixels.reshape(-1, 2)
     assert off(found.intrinsics["cam_0"].camera, pixels) < 1.0
-    for name, T in (given.X | given.Y).items():
-        xi = se3.logmap((se3.inverse((found.X | found.Y)[name].matrix()) @ T)[None])[0]
-        assert xi @ np.linalg.solve(found.covariance(name), xi) < chi2.ppf(0.999, 6)
+    assert all(given.squared_error(found, name) < chi2.ppf(0.999, 6) for name in given.X | given.Y)
 
 
 #: It folds back where r^2 = 1 / (3 * 1.5), 440 pixels from the centre; corners are seen to 570.
@@ -133,14 +129,9 @@ def given() -> Cell:
     return replace(folded, observations=replace(folded.observations, cameras=dict.fromkeys(folded.Y, FOLDED)))
 
 
-def refined(given: Cell, options: rw.CornerOptions) -> rw.CornersRefined:
-    X, Y = given.near(np.random.default_rng(9))
-    return rw.refine_corners(given.observations, X, Y, options)
-
-
 @pytest.fixture(scope="module")
 def result(given: Cell) -> rw.CornersRefined:
-    return refined(given, rw.CornerOptions())
+    return given.refined(rw.CornerOptions())
 
 
 def test_where_rays_end() -> None:
@@ -151,9 +142,7 @@ def test_where_rays_end() -> None:
 
 
 def test_a_nominal_lens_without_rays_is_replaced_and_named(given: Cell, result: rw.CornersRefined) -> None:
-    for name, T in (given.X | given.Y).items():
-        xi = se3.logmap((se3.inverse((result.X | result.Y)[name].matrix()) @ T)[None])[0]
-        assert xi @ np.linalg.solve(result.covariance(name), xi) < chi2.ppf(0.999, 6)
+    assert all(given.squared_error(result, name) < chi2.ppf(0.999, 6) for name in given.X | given.Y)
     stack = result.graph.model.stacks[0]
     seen = np.linalg.norm(result.intrinsics["cam_0"].camera.undistort(stack.pixels), axis=2)[stack.known]
     assert result.graph.model.seen(stack, result.point).radius[stack.known] == pytest.approx(seen, abs=3e-3)
@@ -181,7 +170,7 @@ def test_corners_beyond_the_fold_whose_pixels_lead_back_are_seen_too() -> None:
 
 def test_exact_intrinsics_without_rays_are_refused(given: Cell) -> None:
     with pytest.raises(CameraError, match=rf"^the intrinsics of cam_0 are held .*exact\), but .*ray for {PLACE}: its"):
-        refined(given, rw.CornerOptions(stated="exact"))
+        given.refined(rw.CornerOptions(stated="exact"))
 
 
 def test_poses_are_made_of_corners_with_rays(given: Cell) -> None:

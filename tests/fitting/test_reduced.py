@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from noisy_rows import random_poses, rows_of
 from rwhec_factors import se3
-from simulated_cells import Cell, Placement, cell, model_and_point
+from simulated_cells import Placement, cell, model_and_point
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
@@ -95,11 +95,6 @@ def test_exact_poses_and_free_corners_leave_nothing_to_share(reduced: Reduced) -
 NOISE = (1e-3, 5e-4)
 
 
-def refined(given: Cell, options: rw.CornerOptions) -> rw.CornersRefined:
-    X, Y = given.near(np.random.default_rng(9))
-    return rw.refine_corners(given.observations, X, Y, options)
-
-
 @pytest.mark.parametrize("stated", ["calibration", "exact"])
 def test_boards_that_face_the_camera_straight_determine_no_place_along_its_axis(stated: str) -> None:
     # they turn about the camera's axis only; measured, about axes that are a milliradian apart
@@ -107,12 +102,12 @@ def test_boards_that_face_the_camera_straight_determine_no_place_along_its_axis(
     with pytest.raises(
         UnderdeterminedError, match=r"pose of board, cam_0, cam_1: .* noise of A .* turn about two axes"
     ):
-        refined(given, rw.CornerOptions(stated=stated))  # type: ignore[arg-type]
+        given.refined(rw.CornerOptions(stated=stated))  # type: ignore[arg-type]
 
 
 def test_tilts_of_more_than_the_noise_determine_it() -> None:
     given = cell(0, images=12, facing=Placement(tilt=0.01), carrier=NOISE)
-    result = refined(given, rw.CornerOptions(stated="calibration"))
+    result = given.refined(rw.CornerOptions(stated="calibration"))
     model = result.graph.model
     grows = grows_by_noise(model, result.point, result.noise, result.joint, result.slots, farthest(model, result.point))
     assert sorted(grows) == ["board", "cam_0", "cam_1"]
@@ -120,7 +115,7 @@ def test_tilts_of_more_than_the_noise_determine_it() -> None:
 
 
 def test_frames_with_small_deviations_are_not_asked() -> None:
-    result = refined(cell(0, images=12, carrier=NOISE), rw.CornerOptions(stated="exact"))
+    result = cell(0, images=12, carrier=NOISE).refined(rw.CornerOptions(stated="exact"))
     model = result.graph.model
     assert not grows_by_noise(model, result.point, result.noise, result.joint, result.slots, 1.5)
 

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rwhec_factors import se3
 from scipy.stats import chi2
 from simulated_cells import CAMERA, Cell, cell
 
@@ -26,21 +25,9 @@ from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior, innovation_of, wi
 Array = NDArray[np.float64]
 
 
-def refined(given: Cell, options: rw.CornerOptions | None = None) -> rw.CornersRefined:
-    X, Y = given.near(np.random.default_rng(9))
-    return rw.refine_corners(given.observations, X, Y, options)
-
-
-def off(given: Cell, result: rw.CornersRefined, name: str) -> Array:
-    """The error of a pose."""
-    poses, truth = (result.X, given.X) if name in given.X else (result.Y, given.Y)
-    error: Array = se3.logmap((se3.inverse(poses[name].matrix()) @ truth[name])[None])[0]
-    return error
-
-
 def squared_deviations(given: Cell, result: rw.CornersRefined) -> tuple[float, int]:
     """Of all unknowns together: chi-square of their number."""
-    errors = [off(given, result, name) for name in (*result.X, *result.Y)]
+    errors = [given.error(result, name) for name in (*result.X, *result.Y)]
     errors += [given.cameras[name].parameters - result.intrinsics[name].camera.parameters for name in result.Y]
     names = [*result.X, *result.Y, *(f"intrinsics:{name}" for name in result.Y)]
     if "shape:board" in result.names:
@@ -52,9 +39,9 @@ def squared_deviations(given: Cell, result: rw.CornersRefined) -> tuple[float, i
 
 def test_exact_corners_give_the_truth() -> None:
     given = cell(1, corner_px=1e-9, images=12)
-    result = refined(given, rw.CornerOptions(carrier_noise="exact"))
+    result = given.refined(rw.CornerOptions(carrier_noise="exact"))
     for name in ("board", "cam_0", "cam_1"):
-        assert np.abs(off(given, result, name)).max() < 1e-6
+        assert np.abs(given.error(result, name)).max() < 1e-6
     assert result.intrinsics["cam_0"].camera.parameters == pytest.approx(CAMERA.parameters, abs=1e-4)
 
 
@@ -62,7 +49,7 @@ def test_exact_corners_give_the_truth() -> None:
 def test_noise_is_found_and_everything_is_within_its_covariance(about: str) -> None:
     given = cell(2, images=40, stated="calibration", carrier=(1e-3, 5e-4), shape=(1e-3, 1e-3, 1e-3))
     options = rw.CornerOptions(stated="calibration", size_share=1e-3, warp_m=1e-3, about=about)  # type: ignore[arg-type]
-    result = refined(given, options)
+    result = given.refined(options)
     assert result.noise.corner_px == pytest.approx(0.1, rel=0.05)
     if about == "targetcarrier":
         assert result.noise.carrier_rad == pytest.approx(1e-3, rel=0.3)
@@ -77,7 +64,7 @@ def test_noise_is_found_and_everything_is_within_its_covariance(about: str) -> N
 
 def test_a_warped_board_of_known_size() -> None:
     given = cell(2, images=20, shape=(0.0, 1e-3, 1e-3))
-    result = refined(given, rw.CornerOptions(carrier_noise="exact", warp_m=1e-3))
+    result = given.refined(rw.CornerOptions(carrier_noise="exact", warp_m=1e-3))
     assert result.shapes["board"][0] == 0.0
     assert result.shapes["board"][1:] == pytest.approx(given.shape[1:], abs=3e-4)
     error = given.shape[1:] - result.shapes["board"][1:]
@@ -86,7 +73,7 @@ def test_a_warped_board_of_known_size() -> None:
 
 def test_nominal_intrinsics_that_are_off_do_not_move_the_poses_beyond_their_covariance() -> None:
     given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
-    result = refined(given, rw.CornerOptions(carrier_noise="exact"))
+    result = given.refined(rw.CornerOptions(carrier_noise="exact"))
     squares, number = squared_deviations(given, result)
     assert squares < chi2.ppf(0.999, number)
     assert result.intrinsics["cam_0"].widened == 1.0
@@ -94,7 +81,7 @@ def test_nominal_intrinsics_that_are_off_do_not_move_the_poses_beyond_their_cova
 
 def test_a_calibration_that_the_images_contradict_is_widened_and_said() -> None:
     given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
-    result = refined(given, rw.CornerOptions(stated="calibration", carrier_noise="exact"))
+    result = given.refined(rw.CornerOptions(stated="calibration", carrier_noise="exact"))
     intrinsics = result.intrinsics["cam_0"]
     assert intrinsics.widened > 1.0
     assert intrinsics.innovation.is_contradicted
@@ -107,7 +94,7 @@ def test_a_pinhole_that_nobody_calibrated_may_have_distortion() -> None:
     given = cell(6, images=30)
     pinhole = rw.cameras.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
     stated = replace(given.observations, cameras=dict.fromkeys(given.observations.cameras, pinhole))
-    result = refined(replace(given, observations=stated), rw.CornerOptions(carrier_noise="exact"))
+    result = replace(given, observations=stated).refined(rw.CornerOptions(carrier_noise="exact"))
     assert pytest.approx(CAMERA.D, abs=0.02) == result.intrinsics["cam_0"].camera.D
     squares, number = squared_deviations(given, result)
     assert squares < chi2.ppf(0.999, number)
@@ -115,7 +102,7 @@ def test_a_pinhole_that_nobody_calibrated_may_have_distortion() -> None:
 
 def test_what_one_flat_view_cannot_tell_is_held_by_the_prior() -> None:
     given = cell(7, images=3, cameras=1)
-    result = refined(given, rw.CornerOptions(stated="calibration", carrier_noise="exact"))
+    result = given.refined(rw.CornerOptions(stated="calibration", carrier_noise="exact"))
     assert result.intrinsics["cam_0"].held_by_prior
     deviations = np.sqrt(np.diagonal(result.covariance("intrinsics:cam_0")))
     assert (deviations <= result.intrinsics["cam_0"].prior.deviation * (1.0 + 1e-9)).all()
@@ -124,7 +111,7 @@ def test_what_one_flat_view_cannot_tell_is_held_by_the_prior() -> None:
 def test_cameras_of_one_model_may_share_their_intrinsics() -> None:
     given = cell(8, images=30, stated="calibration")
     options = rw.CornerOptions(stated="calibration", carrier_noise="exact", shared=(("cam_0", "cam_1"),))
-    shared, apart = refined(given, options), refined(given, replace(options, shared=()))
+    shared, apart = given.refined(options), given.refined(replace(options, shared=()))
     first, second = (shared.intrinsics[name].camera.parameters for name in ("cam_0", "cam_1"))
     assert np.array_equal(first, second)
     better = np.diagonal(shared.intrinsics["cam_0"].covariance) < np.diagonal(apart.intrinsics["cam_0"].covariance)
@@ -133,7 +120,7 @@ def test_cameras_of_one_model_may_share_their_intrinsics() -> None:
 
 def test_a_shared_camera_must_be_one_of_the_sensors() -> None:
     with pytest.raises(FrameError, match="shared names 'cam_9'; the sensors are cam_0, cam_1"):
-        refined(cell(0, images=5), rw.CornerOptions(shared=(("cam_9", "cam_0"),)))
+        cell(0, images=5).refined(rw.CornerOptions(shared=(("cam_9", "cam_0"),)))
 
 
 def test_a_tenth_of_misread_corners_is_left_out() -> None:
@@ -145,7 +132,7 @@ def test_a_tenth_of_misread_corners_is_left_out() -> None:
         views[pair] = replace(
             view, pixels=view.pixels + wrong[pair][..., None] * rng.normal(scale=20.0, size=view.pixels.shape)
         )
-    result = refined(replace(given, observations=replace(given.observations, views=views)))
+    result = replace(given, observations=replace(given.observations, views=views)).refined()
     for pair, mask in wrong.items():
         assert (result.left_out[pair] & ~mask).sum() <= 2
         assert (mask & ~result.left_out[pair]).sum() <= 2  # some are off by less than their limit
@@ -158,7 +145,7 @@ def test_intrinsics_are_no_worse_than_opencvs_and_better_with_the_arm_known() ->
     ours, theirs = [], []
     for seed in range(5):
         given = cell(20 + seed, images=12, cameras=1, stated="nominal")
-        result = refined(given, rw.CornerOptions(carrier_noise="exact"))
+        result = given.refined(rw.CornerOptions(carrier_noise="exact"))
         view = given.observations.views["board", "cam_0"]
         points = [given.observations.corners["board"].astype(np.float32)] * len(view.A)
         stated = given.observations.cameras["cam_0"]
@@ -189,7 +176,7 @@ def test_names_and_options_are_checked() -> None:
     with pytest.raises(
         FrameError, match="'cam_9' is not among the unknowns; they are board, cam_0, cam_1, intrinsics:cam_0"
     ):
-        refined(given).covariance("cam_9")
+        given.refined().covariance("cam_9")
     for wrong in ({"stated": "guessed"}, {"stated": {"cam_0": "guessed"}}, {"about": "base"}, {"warp_m": -1.0},
                   {"carrier_noise": "some"}, {"max_iterations": 0}):  # fmt: skip
         with pytest.raises(OptionError, match=next(iter(wrong))):
@@ -197,9 +184,9 @@ def test_names_and_options_are_checked() -> None:
 
 
 def test_ellipsoids_are_wider_where_the_carriers_noise_was_estimated_from_few_images() -> None:
-    few, many = (refined(cell(3, images=n, carrier=(1e-3, 5e-4))) for n in (12, 60))
-    known = refined(
-        cell(3, images=12, carrier=(1e-3, 5e-4)), rw.CornerOptions(carrier_noise=rw.CarrierNoise(1e-3, 5e-4))
+    few, many = (cell(3, images=n, carrier=(1e-3, 5e-4)).refined() for n in (12, 60))
+    known = cell(3, images=12, carrier=(1e-3, 5e-4)).refined(
+        rw.CornerOptions(carrier_noise=rw.CarrierNoise(1e-3, 5e-4))
     )
     chi_square = chi2.ppf(0.95, 6)
     assert few.squared_radius("board") > many.squared_radius("board") > chi_square
@@ -281,8 +268,7 @@ def test_errors_are_those_of_the_corners_and_of_the_carriers() -> None:
     exact, noisy = (cell(3, images=30, carrier=carrier) for carrier in ((0.0, 0.0), (1e-3, 5e-4)))
     rms = []
     for given in (exact, noisy):
-        X, Y = given.near(np.random.default_rng(0))
-        refined = rw.refine_corners(given.observations, X, Y)
+        refined = given.refined(seed=0)
         errors = held_out_errors(refined)
         assert set(errors) == {"cam_0", "cam_1"}
         assert sum(each.corners for each in errors.values()) >= 35 * 30 - 3
@@ -306,8 +292,7 @@ def test_stated_intrinsics_that_are_off_show() -> None:
 
 def test_what_cannot_be_left_out_is_refused() -> None:
     given = cell(0, images=5)
-    X, Y = given.near(np.random.default_rng(0))
-    refined = rw.refine_corners(given.observations, X, Y)
+    refined = given.refined(seed=0)
     with pytest.raises(OptionError, match="whole number from 2"):
         held_out_errors(refined, folds=1)
     with pytest.raises(CountError, match="5 instants cannot be left out in 6 blocks"):

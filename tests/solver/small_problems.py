@@ -74,13 +74,15 @@ def whole(problem: rw.Problem) -> PartForm:
     return PartForm.of(part_of(problem))
 
 
+def kkt_of(evaluation: Evaluation) -> Array:
+    """The multipliers of R'R = I by the gradient at a point, whose numbers are 13 for each frame and one more."""
+    return kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
+
+
 def bound_at(form: PartForm, R: Array, multipliers: Array | None = None) -> tuple[Bound, Evaluation]:
     """The bound at rotations of the form, by the multipliers of R'R = I unless others are given; and the cost there."""
     _, evaluation = form.answer_near(R)
-    if multipliers is None:
-        gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
-        multipliers = kkt_multipliers(evaluation.point.rotations, gradient)
-    return lower_bound(form, evaluation, multipliers), evaluation
+    return lower_bound(form, evaluation, kkt_of(evaluation) if multipliers is None else multipliers), evaluation
 
 
 def gradient_norm(form: ReducedForm, R: Array) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_problems import GROSS_NOISE, SMALL_NOISE, bound_at, optimum, simulated, whole
+from small_problems import GROSS_NOISE, SMALL_NOISE, bound_at, kkt_of, optimum, simulated, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
@@ -16,7 +16,7 @@ from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.region import half_widths
 from gtsam_rwhec.solver.relaxation import solve_relaxation
-from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, vec
+from gtsam_rwhec.solver.rotations import random_rotations, vec
 from gtsam_rwhec.solver.small_dual import improve
 
 
@@ -115,7 +115,7 @@ def test_any_multipliers_at_any_point_bound_the_optimum(name: str, seed: int) ->
     n = len(end.R)
     _, best = form.answer_near(end.R)
     elsewhere = form.cost.at(Point(np.c_[generator.standard_normal((n, 4)), vec(random_rotations(n, generator))], 1.0))
-    kkt = kkt_multipliers(best.point.rotations, best.gradient[:-1].reshape(-1, 13)[:, 4:])
+    kkt = kkt_of(best)
     for _ in range(2):
         size = form.reduced.magnitude * 10.0 ** generator.uniform(-16, 0)
         random = size * generator.standard_normal((n, 20))
@@ -136,9 +136,7 @@ def test_small_duals_and_relaxations_multipliers_bound_the_optimum(name: str, se
     relaxation = solve_relaxation(form.reduced.Q, 1e-8, 100)
     bound, evaluation = bound_at(form, end.R, relaxation.multipliers)
     assert bound.lower_bound <= evaluation.upper
-    gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
-    kkt = kkt_multipliers(evaluation.point.rotations, gradient)
-    improved, _ = improve(form.reduced.Q, evaluation.point.rotations, kkt)
+    improved, _ = improve(form.reduced.Q, evaluation.point.rotations, kkt_of(evaluation))
     assert bound_at(form, end.R, improved)[0].lower_bound <= evaluation.upper
 
 
@@ -181,8 +179,7 @@ class TestBranches:
         form = whole(problem)
         R = random_rotations(3, np.random.default_rng(0))
         at = form.cost.at(Point(np.c_[np.zeros((3, 4)), vec(R)], 1.0))
-        multipliers = kkt_multipliers(R, at.gradient[:-1].reshape(-1, 13)[:, 4:])
-        bound = lower_bound(form, at, multipliers)
+        bound = lower_bound(form, at, kkt_of(at))
         assert not bound.semidefinite
         assert bound.direction is not None
         assert bound.eigenvalue < 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from large_problems import loop, optimum_of_star
-from small_problems import GROSS_NOISE, flat, optimum, simulated, whole
+from small_problems import GROSS_NOISE, flat, kkt_of, optimum, simulated, whole
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.answers import Evaluation
@@ -25,19 +25,26 @@ from gtsam_rwhec.solver.local_dual import (
 )
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.relaxation import solve_relaxation
-from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
+from gtsam_rwhec.solver.rotations import random_rotations
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
 
 def form_of(form: PartForm, R: Array, frames: list[int]) -> tuple[LocalForm, Evaluation, Array]:
     """The local form of some frames at the answer near R, with the multipliers of R'R = I."""
     _, evaluation = form.answer_near(R)
-    kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
+    kkt = kkt_of(evaluation)
     diagonal = np.abs(form.curvature.diagonal)
     Q, Z = form.curvature.plus(OF_Q * diagonal), form.curvature.less(kkt).plus(OF_Z * diagonal)
     found = local_form(Q, Z, evaluation, kkt, np.array(frames))
     assert found is not None
     return found, evaluation, kkt
+
+
+def at_optimum_of_star() -> tuple[PartForm, Evaluation, Array]:
+    """The star's form, the cost where its search ends, and the multipliers of R'R = I there."""
+    search, found = optimum_of_star(1)
+    _, evaluation = search.whole.answer_near(found.R)
+    return search.whole, evaluation, kkt_of(evaluation)
 
 
 @pytest.mark.parametrize("frames", [[1], [0, 3], [0, 1, 2, 3, 4]])
@@ -68,7 +75,7 @@ class TestManyFrames:
         assert found.cause is Cause.PROVEN_WITH_REDUNDANT_CONSTRAINTS
         assert found.path.multipliers is Multipliers.ALL_CONSTRAINTS
         _, evaluation = search.whole.answer_near(found.R)
-        kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
+        kkt = kkt_of(evaluation)
         assert lower_bound(search.whole, evaluation, kkt).lower_bound < 0.9 * found.cost
         local = improve_locally(search.whole, evaluation, kkt, 120)
         assert local.t > 0.0
@@ -78,20 +85,16 @@ class TestManyFrames:
         assert 0 < len(changed) <= 20
 
     def test_fewer_frames_than_it_takes_are_too_large(self) -> None:
-        search, found = optimum_of_star(1)
-        _, evaluation = search.whole.answer_near(found.R)
-        kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
-        local = improve_locally(search.whole, evaluation, kkt, 1)
+        form, evaluation, kkt = at_optimum_of_star()
+        local = improve_locally(form, evaluation, kkt, 1)
         assert local.t <= 0.0
         assert local.needed > 1
 
     def test_the_frames_that_help_are_others(self) -> None:
-        search, found = optimum_of_star(1)
-        _, evaluation = search.whole.answer_near(found.R)
-        kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
-        local = improve_locally(search.whole, evaluation, kkt, 120).form
+        form, evaluation, kkt = at_optimum_of_star()
+        local = improve_locally(form, evaluation, kkt, 120).form
         assert local is not None
-        more = helpful_frames(search.whole, evaluation, local, local.kkt, -1e-3)
+        more = helpful_frames(form, evaluation, local, local.kkt, -1e-3)
         assert len(more) > 0
         assert not np.isin(more, local.frames).any()
 
@@ -120,8 +123,7 @@ def test_own_curvature_is_one_without_multipliers_and_negative_at_a_wrong_point(
     form = whole(simulated(3, 2, 1).problem)
     np.testing.assert_allclose(own_curvature(form, np.zeros((5, 20))), 1.0)
     _, evaluation = form.answer_near(random_rotations(5, np.random.default_rng(0)))
-    kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
-    assert own_curvature(form, kkt).min() < 0.0
+    assert own_curvature(form, kkt_of(evaluation)).min() < 0.0
 
 
 class TestLocalRelaxation:
@@ -132,7 +134,7 @@ class TestLocalRelaxation:
             key=lambda end: end.cost,
         )
         _, evaluation = search.whole.answer_near(end.R)
-        kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
+        kkt = kkt_of(evaluation)
         form = improve_locally(search.whole, evaluation, kkt, 120).form
         assert form is not None
         relaxed = relax_locally(evaluation, kkt, form, SolveOptions())
@@ -149,13 +151,12 @@ class TestLocalRelaxation:
         assert all(R.shape == (3, 3, 3) for R in relaxed.starts)
 
     def test_of_a_few_it_is_a_lower_bound(self) -> None:
-        search, found = optimum_of_star(1)
-        _, evaluation = search.whole.answer_near(found.R)
-        kkt = kkt_multipliers(evaluation.point.rotations, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
-        local = improve_locally(search.whole, evaluation, kkt, 120).form
+        _, found = optimum_of_star(1)
+        form, evaluation, kkt = at_optimum_of_star()
+        local = improve_locally(form, evaluation, kkt, 120).form
         assert local is not None
         relaxed = relax_locally(evaluation, kkt, local, SolveOptions())
         assert relaxed.dual == pytest.approx(found.cost, rel=1e-6)
-        bound = lower_bound(search.whole, evaluation, relaxed.multipliers)
+        bound = lower_bound(form, evaluation, relaxed.multipliers)
         assert found.cost * (1.0 - 1e-5) <= bound.lower_bound <= found.cost
         np.testing.assert_allclose(relaxed.starts[0], found.R, atol=1e-3)

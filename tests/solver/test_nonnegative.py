@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from small_problems import GROSS_NOISE, flat, optimum, part_of, reduced, searched, simulated, whole
+from small_problems import GROSS_NOISE, flat, kkt_of, optimum, part_of, reduced, searched, simulated, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OptionError, ScaleError
@@ -18,7 +18,7 @@ from gtsam_rwhec.solver.certificate import Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import cost_of, descend
 from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale, scale_row, scale_spread, without_scale
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
+from gtsam_rwhec.solver.rotations import random_rotations
 from gtsam_rwhec.solver.search import Found
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
@@ -76,8 +76,7 @@ def test_any_multiplier_of_the_scale_gives_a_bound_on_positive_scales(seed: int)
     problem = noisy(seed)
     form, end = whole(problem), optimum(problem)
     _, evaluation = form.answer_near(end.R)
-    gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
-    multipliers = kkt_multipliers(evaluation.point.rotations, gradient)
+    multipliers = kkt_of(evaluation)
     generator = np.random.default_rng(seed)
     costs = [cost_on_positive_scales(problem, random_rotations(2, generator)) for _ in range(30)]
     costs.append(cost_on_positive_scales(problem, end.R))
