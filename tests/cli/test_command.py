@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -24,6 +23,7 @@ import synthetic_logs as made
 from given_commands import given
 from places import CELL, DEMO
 from typer.testing import CliRunner
+from web_server import served
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.app import app
@@ -65,45 +65,26 @@ def write_csv(problem: rw.Problem, folder: Path) -> Path:
 @pytest.fixture
 def serve(utias_folder: Path) -> Iterator[str]:
     """Address of a server on this machine that serves the real dataset."""
-    handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(utias_folder))
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}"
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with served(partial(http.server.SimpleHTTPRequestHandler, directory=str(utias_folder))) as address:
+        yield address
 
 
-class SlowServer:
+class SlowHandler(http.server.BaseHTTPRequestHandler):
     """Answers every request after some seconds, with 404."""
 
-    def __init__(self, seconds: float) -> None:
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                time.sleep(seconds)
-                self.send_error(404)
+    def do_GET(self) -> None:
+        time.sleep(2.5)
+        self.send_error(404)
 
-            def log_message(self, format: str, *args: object) -> None:
-                pass
-
-        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.address = f"http://127.0.0.1:{self._server.server_address[1]}"
-        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.01})
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+    def log_message(self, format: str, *args: object) -> None:
+        pass
 
 
 @pytest.fixture
 def slow_address() -> Iterator[str]:
     """Address of a server that takes more than a second for anything."""
-    server = SlowServer(seconds=2.5)
-    yield server.address
-    server.stop()
+    with served(SlowHandler) as address:
+        yield address
 
 
 def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path) -> None:

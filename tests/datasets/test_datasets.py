@@ -7,8 +7,9 @@ import http.server
 import importlib.util
 import shutil
 import socket
-import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from places import DATA
+from web_server import served
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.datasets import UTIAS_URL, fetch_utias, utias_files
@@ -44,32 +46,29 @@ class CountingHandler(http.server.SimpleHTTPRequestHandler):
         """Say nothing."""
 
 
+@dataclass
 class Server:
     """An HTTP server on this machine; `answers` is a list of statuses for its next answers."""
 
-    def __init__(self, folder: Path) -> None:
-        self.requested: list[str] = []
-        self.answers: list[int] = []
-        handler = type("Handler", (CountingHandler,), {"requested": self.requested, "answers": self.answers})
-        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=str(folder)))
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.01})
-        self._thread.start()
+    url: str
+    requested: list[str]
+    answers: list[int]
 
-    def close(self) -> None:
-        """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+
+@contextmanager
+def serving(folder: Path) -> Iterator[Server]:
+    """Serve a folder."""
+    kept: dict[str, list[Any]] = {"requested": [], "answers": []}
+    with served(partial(type("Handler", (CountingHandler,), kept), directory=str(folder))) as address:
+        yield Server(f"{address}/", **kept)
 
 
 @pytest.fixture
 def server(utias_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     """Serves the real dataset's folder."""
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    running = Server(utias_folder)
-    yield running
-    running.close()
+    with serving(utias_folder) as running:
+        yield running
 
 
 @pytest.fixture
@@ -80,9 +79,8 @@ def spoilt(utias_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     folder.chmod(0o755)
     for path in folder.iterdir():
         path.chmod(0o644)
-    running = Server(folder)
-    yield running, folder
-    running.close()
+    with serving(folder) as running:
+        yield running, folder
 
 
 def test_the_registry_is_that_of_the_real_files(utias_folder: Path) -> None:
