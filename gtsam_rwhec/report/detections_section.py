@@ -103,7 +103,8 @@ def _detections(seen: SeenEvidence) -> Iterator[Block]:
     if not seen.tracks:
         return
     rows = "a row for each target and sensor" if seen.tracks[0].target is not None else "a row for each sensor"
-    left = "" if seen.used + seen.removed == _drawn(seen) else " Only the sensors with the most removed ones are shown."
+    drawn = sum(track.used + track.removed for track in seen.tracks)
+    left = "" if seen.used + seen.removed == drawn else " Only the sensors with the most removed ones are shown."
     piece = (
         f"one tick stands for all within {seen.span_s / PIECES:.2g} s"
         if seen.span_s
@@ -115,10 +116,6 @@ def _detections(seen: SeenEvidence) -> Iterator[Block]:
         f"A tick for each measurement in the answer, a sign above where it was removed: {rows}, {piece}.{left}",
         detections_figure(seen),
     )
-
-
-def _drawn(seen: SeenEvidence) -> int:
-    return sum(track.used + track.removed for track in seen.tracks)
 
 
 def _removed(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:

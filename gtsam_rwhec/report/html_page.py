@@ -15,7 +15,7 @@ from typing import Any
 
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.report.figures import SvgFigure
-from gtsam_rwhec.report.report_blocks import Block, Drawing, Link, Number, Page, Words, every, pieces_of
+from gtsam_rwhec.report.report_blocks import Drawing, Link, Number, Page, Words, every, pieces_of
 
 
 def write_page(page: Page, path: str | Path) -> None:
@@ -41,8 +41,9 @@ def page_html(page: Page) -> str:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters.update(
-        base64=_base64, script_json=_script_json, pieces=pieces_of, signs=_signs, own_ids=_own_ids, kind=_kind
-    )
+        base64=_base64, script_json=_script_json, pieces=pieces_of, signs=_signs, own_ids=_own_ids,
+        kind=lambda block: type(block).__name__,
+    )  # fmt: skip
     environment.tests.update(number=lambda piece: isinstance(piece, Number), link=lambda piece: isinstance(piece, Link))
     has_drawing = any(isinstance(block, Drawing) for section in page.sections for block in every(section.blocks))
     script = _own_file("page.js")
@@ -98,10 +99,6 @@ def _script_json(value: Any) -> str:
     """JSON for a script element: `<`, `>` and `&` are escaped."""
     text = json.dumps(value, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _kind(block: Block) -> str:
-    return type(block).__name__
 
 
 def _signs(words: Words) -> int:

@@ -75,17 +75,14 @@ class Touches:
         away_m = float(np.median(np.linalg.norm(points[0], axis=1))) if len(points[0]) else 0.0
         if away_m > FARTHEST_M:
             raise PoseError(f"the points of the sensor are {away_m:.4g} m away (median): give metres, not millimetres")
-        poses = None if A is None else _checked_poses(A, f"A of {source or 'the touches'}")
+        poses, where = None, f"A of {source or 'the touches'}"
+        if A is not None:
+            transforms = as_transforms(A, "wxyz" if np.ndim(A) == 2 else None, where)  # type: ignore[arg-type]
+            poses = rows_to_transforms(checked_rows(transforms, 0, where).rows)
         counts = [len(each) for each in (*points, *([] if poses is None else [poses]))]
         if len(set(counts)) > 1 or not counts[0]:
             raise CountError(f"sensor_m, known_m and A have {', '.join(map(str, counts))} rows; give one of each touch")
         return Touches(points[0], points[1], poses, source)
-
-
-def _checked_poses(A: PosesLike, where: str) -> Array:
-    """Valid poses (n, 4, 4)."""
-    transforms = as_transforms(A, "wxyz" if np.ndim(A) == 2 else None, where)  # type: ignore[arg-type]
-    return rows_to_transforms(checked_rows(transforms, 0, where).rows)
 
 
 def is_touches_file(path: str | Path) -> bool:

@@ -81,15 +81,14 @@ def quantities(old: RefinedPoses, new: RefinedPoses, without: Collection[Unknown
     not_compared = {}
     differences: dict[Unknown, Array] = {}
     units: list[Array] = []
-    by_errors: tuple[list[Array], list[Array]] = (
-        [],
-        [],
-    )  # derivatives of the differences by all that each leaves unknown
+    # Derivatives of the differences by all that each leaves unknown.
+    by_errors: tuple[list[Array], list[Array]] = ([], [])
     for unknown in _common(old, new):
         if unknown.kind in without:
             continue
         G = [_selector(each, unknown) for each in (old, new)]
-        unit = _unit(old, new, unknown)
+        joint = old.joint if unknown in old.joint.slots else new.joint  # the first of both that has the unknown
+        unit = joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)
         if why := _why_not(old, new, unknown, G, unit):
             not_compared[unknown] = why
             continue
@@ -169,12 +168,6 @@ def numbers_of(refined: RefinedPoses, unknown: Unknown) -> Array:
         return np.array([refined.time_offsets_s[unknown.owner]])
     scale = refined.scale
     return np.array([scale[unknown.owner] if isinstance(scale, Mapping) else scale])
-
-
-def _unit(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> Array:
-    """The unit of each row, from the first of both that has the unknown."""
-    joint = old.joint if unknown in old.joint.slots else new.joint
-    return joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)
 
 
 #: An eigenvalue of correlations below zero by more than this is not a rounding error.
