@@ -21,6 +21,7 @@ from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables
+from gtsam_rwhec.fitting.view_errors import errors_of_view
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -58,7 +59,9 @@ class UnderNoise:
         task.tell("covariances: with the uncertainty of the noise itself")
         scatter = scatter_of_blocks(task, found)
         worst = too_much(scatter, is_drift_untried=is_drift_untried(task, found))
-        joint, mixture, constant = mixed(task, found, worst)
+        by_view = errors_of_view(task, found)
+        larger = max(1.0 if one is None else one.ratio for one in (worst, by_view))
+        joint, mixture, constant = mixed(task, found, larger)
         layout = task.layout
         frames = [
             layout.slots[unknown]
@@ -72,7 +75,7 @@ class UnderNoise:
         freedom = freedom if worst is None else min(freedom, worst.freedom)
         task.tell("covariances: the graph of the answer")
         refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
-        noise = noise_in(task, found, mixture, constant, scatter, worst)
+        noise = noise_in(task, found, mixture, constant, scatter, worst, by_view)
         return replace(refined, noise_sentences=noise.sentences), noise
 
 
