@@ -88,8 +88,10 @@ class _Compared:
             return self.weighed(self.covariance(distance, logs))[0] + float((((logs - start) / PRIOR) ** 2).sum())
 
         simplex = start + np.vstack([np.zeros(3), np.eye(3)])
-        options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.1, "maxfev": MOST_EVALUATIONS}
-        found = minimize(cost, start, method="Nelder-Mead", options=options)
+        found = minimize(
+            cost, start, method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.1, "maxfev": MOST_EVALUATIONS},
+        )  # fmt: skip
         return float(found.fun), found.x
 
 
@@ -139,7 +141,8 @@ def _compared(model: NoiseModel, sigma: dict[C, float]) -> tuple[_Compared, Arra
         rows.residual.ravel(),
         rows.by_unknowns.by(model.basis).whole.reshape(6 * n, -1),
         base.reshape(6 * n, 6 * n),
-        *(own @ own.T for own in (states[:, :3], states[:, 3:])),
+        states[:, :3] @ states[:, :3].T,
+        states[:, 3:] @ states[:, 3:].T,
         model.prior_information,
     )
     between = np.linalg.norm(view[:, None] - view, axis=2)
