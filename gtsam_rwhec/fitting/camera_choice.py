@@ -399,9 +399,10 @@ def _leaves_enough(model: Model, inside: np.ndarray) -> bool:
     """Whether without some instants (I,) each target and each sensor keeps enough images."""
     left: dict[tuple[str, str], int] = {}
     for stack in model.stacks:
-        number = int((~inside[stack.instant]).sum())
-        for at in (("x", stack.target), ("y", stack.sensor)):
-            left[at] = left.get(at, 0) + number
+        outside = stack.sums((~inside[stack.instant]).astype(int)).tolist()
+        for (pair, _), number in zip(stack.pairs, outside, strict=True):
+            for at in zip("xy", pair, strict=True):
+                left[at] = left.get(at, 0) + number
     return min(left.values()) >= FEWEST
 
 
