@@ -156,7 +156,7 @@ class Model:
         return [np.repeat(np.sqrt(weights), 2, axis=1) / self.corner_px for weights in self.weights]
 
     def sums(self, point: Point) -> Sums:
-        """Of the rows of all stacks, weighted and of unit noise, in the model's `slots`; without A where it is exact."""
+        """Of all rows, weighted and of unit noise, by the model's `slots`; without A where it is exact."""
         slots = self.slots(point)
         result = Sums.zeros(len(self.A), slots)
         for s, (stack, root) in enumerate(zip(self.stacks, self._roots, strict=True)):

@@ -21,6 +21,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows, Sums
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
+from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -168,14 +169,13 @@ class Reduced:
         sums, log_det = self.without_common(noise)
         at = sums.eliminated(noise, log_det)
         H, h, K, KC, Kb = at.H + self.prior, at.h + self.prior @ self.prior_off, at.K, at.KC, at.Kb
-        size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-        sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
-        if sign <= 0.0:
+        try:
+            inverse, log_H = _inverse(H)
+        except np.linalg.LinAlgError:
             return np.inf, np.zeros(4)
-        inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
         theta = -inverse @ h
         off = float(self.prior_off @ self.prior @ self.prior_off)
-        value = at.rr + off + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
+        value = at.rr + off + float(h @ theta) + at.log_det + log_H
         free = len(H) - float((self.prior * inverse).sum())
         squares = sums.rr + 2.0 * float(sums.g @ theta) + float(theta @ sums.G @ theta)
         gradient, a = np.zeros(4), -(Kb + KC @ theta)
@@ -273,6 +273,14 @@ class Reduced:
         return [0, *((1, 2) if carrier else ()), *((3,) if shares else ())]
 
 
+def _inverse(H: Array) -> tuple[Array, float]:
+    """The inverse and log |H|; LinAlgError if it is not positive definite."""
+    size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+    scaled = H / size[:, None] / size
+    inverse, log_det = EliminationOrder.of(scaled).inverse(scaled)
+    return inverse / size[:, None] / size, log_det + 2.0 * float(np.log(size).sum())
+
+
 def deviations_of(noise: Noise) -> Array:
     """All of them (4,)."""
     return np.array([getattr(noise, field.name) for field in fields(noise)])
@@ -303,7 +311,7 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     hessian = np.array(gradients) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
     V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
-    above, below = ([np.linalg.inv(reduced.information(at(sign * step))) for step in steps] for sign in (1.0, -1.0))
+    above, below = ([_inverse(reduced.information(at(sign * step)))[0] for step in steps] for sign in (1.0, -1.0))
     result = {}
     for name, rows in reduced.slots.items():
         size = rows.stop - rows.start

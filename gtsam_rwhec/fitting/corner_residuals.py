@@ -71,7 +71,7 @@ class Stack:
             yield (target, self.sensor), slice(begin, end)
 
     def each(self, values: Array) -> Array:
-        """Values of the targets (T, ...) as values of the images: (V, ...), or as they are where there is one target."""
+        """Values of the targets (T, ...) as values of the images (V, ...); as they are where there is one target."""
         return values if len(self.targets) == 1 else np.asarray(values[self.target])
 
     def sums(self, values: Array) -> Array:
@@ -268,8 +268,8 @@ def linearised(
 ) -> Linear:
     """Residuals and derivatives of a stack at X (T, 4, 4), Y (4, 4), A (I, 4, 4), a camera and shapes (T, 4).
 
-    Of one target they may be (4, 4) and (4,). `moved` (n, 3) is how far its corners are off their places, metres. The images were taken `offset_s` after
-    their instants.
+    Of one target they may be (4, 4) and (4,). `moved` (n, 3) is how far its corners are off their places, metres. The
+    images were taken `offset_s` after their instants.
     """
     V, n = stack.known.shape
     at = seen(stack, X, Y, A, shape, offset_s, moved)
