@@ -160,25 +160,26 @@ def stacks_of(
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     instant = rank[index.ravel()]
-    alike: dict[tuple[object, ...], dict[str, np.ndarray]] = {}
+    alike: dict[tuple[str, int, bool, object], dict[str, np.ndarray]] = {}
     for number, ((target, sensor), view) in enumerate(observations.views.items()):
         key = sensor, view.pixels.shape[1], view.twist is None, kind(target)
         alike.setdefault(key, {})[target] = instant[ends[number] : ends[number + 1]]
     result = []
-    for (sensor, *_), instants in alike.items():
-        views = [observations.views[target, str(sensor)] for target in instants]
+    for key, instants in alike.items():
+        sensor = key[0]
+        views = [observations.views[target, sensor] for target in instants]
         pixels = np.concatenate([view.pixels for view in views])
         known = np.asarray(np.isfinite(pixels).all(axis=2))
         result.append(
             Stack(
                 tuple(instants),
-                str(sensor),
+                sensor,
                 np.repeat(np.arange(len(views)), [len(view.A) for view in views]),
                 np.concatenate(list(instants.values())),
                 np.array([observations.corners[target] for target in instants]),
                 np.where(known[:, :, None], pixels, 0.0),
                 known,
-                observations.cameras[str(sensor)],
+                observations.cameras[sensor],
                 np.concatenate(twists) if (twists := [v.twist for v in views if v.twist is not None]) else None,
             )
         )

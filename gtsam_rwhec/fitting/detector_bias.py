@@ -43,8 +43,8 @@ def gradients_of_bias(model: Model, reduced: Reduced, noise: Noise) -> Array:
         sums.squares[:, -1], sums.of_A[..., -1] = 0.0, 0.0
         for each, of in zip(every.stacks, px, strict=True):
             of_unknowns = each.stack.sums(of[:, None] * each.of_unknowns[:, k])
-            np.add.at(sums.squares, (each.columns, -1), of_unknowns)
-            np.add.at(sums.of_A, (each.stack.instant, slice(None), -1), of[:, None] * each.of_A[:, k])
+            np.add.at(sums.squares[:, -1], each.columns, of_unknowns)
+            np.add.at(sums.of_A[..., -1], each.stack.instant, of[:, None] * each.of_A[:, k])
             of_bias.append(replace(each, of_residual=of[:, None] * each.P[..., k]))
         biased = replace(reduced, sums=sums, patterns=CommonErrors(tuple(of_bias)))
         found.append(biased.without_carriers(noise).h)
