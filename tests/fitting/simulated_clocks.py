@@ -27,8 +27,8 @@ def moving(
     twist = np.random.default_rng(seed).normal(size=(1 if alike else len(A), 6)) * speed
     views = {}
     for stack in stacks:
-        view = given.observations.views[stack.target, stack.sensor]
+        view = given.observations.views[stack.targets[0], stack.sensor]
         of_view = np.broadcast_to(twist, (len(A), 6))[stack.instant]
         before = view.A @ se3.expmap(-offsets_s.get(stack.sensor, 0.0) * of_view)
-        views[stack.target, stack.sensor] = replace(view, A=before, twist=of_view)
+        views[stack.targets[0], stack.sensor] = replace(view, A=before, twist=of_view)
     return replace(given, observations=replace(given.observations, views=views))

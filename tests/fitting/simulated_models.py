@@ -21,7 +21,7 @@ def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = 
     model = Model(
         stacks, A, None if exact else A_NOISE, about, {name: name for name in names},  # type: ignore[arg-type]
         {name: prior_of(cameras[name], "nominal") for name in names}, {"board": np.full(4, 1e-3)}, CORNER_PX,
-        tuple(stack.known.astype(float) for stack in stacks),
+        tuple(stack.known.astype(float) for stack in stacks), bias_px={"board": 0.0},
     )  # fmt: skip
     rng = np.random.default_rng(7)
     moved = A if exact else A @ se3.expmap(rng.normal(size=(len(A), 6)) * A_NOISE)
