@@ -13,6 +13,7 @@ from scipy.special import expit
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.block_agreement import Scatter
+from gtsam_rwhec.fitting.clock_rates import ClockRate
 from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -103,6 +104,8 @@ class NoiseInData:
     by_view: ViewErrors | None = None
     #: How often the errors of a track jump: it was cut there.
     jumps: int = 0
+    #: What is known of the rates of clocks along a path.
+    clocks: tuple[ClockRate, ...] = ()
 
     @property
     def has_systematic(self) -> bool:
@@ -168,6 +171,7 @@ class NoiseInData:
                 f"({ratio_words(self.systematic_evidence)}): {100.0 * self.systematic_probability:.0f} % probable. "
                 "Their constant part, which residuals do not show, is assumed to be twice as large."
             )
+        said += [f"{clock}, which is taken off." for clock in self.clocks if clock.is_sure]
         if self.jumps:
             said.append(f"The errors jump {self.jumps} times, as where loops are closed; the track is cut there.")
         if self.by_view is not None and self.by_view.ratio > TOLD_RATIO:

@@ -18,12 +18,13 @@ import numpy as np
 from rwhec_factors import se3
 from rwhec_factors.batch import Linearization
 
+from gtsam_rwhec.fitting.clock_rates import RATE
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.pose_fit import linearized
 from gtsam_rwhec.fitting.pose_graph import add_priors, normal_equations_of
-from gtsam_rwhec.fitting.unknowns import State, Variables
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables, slots_of
 from gtsam_rwhec.fitting.variance_components import jacobian_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
@@ -251,9 +252,7 @@ class Rows:
             of_data = np.empty_like(white)
             of_data[instants.order] = white
             every = _without_noise(every, residual, of_data)
-        jacobians = [
-            jacobian_of(item.pair, linear, variables, layout) for item, linear in zip(data, every, strict=True)
-        ]
+        jacobians = [jacobian_of(item, linear, variables, layout) for item, linear in zip(data, every, strict=True)]
         frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
         X, Y = (np.repeat([frames[item.pair[i]] for item in data], counts, axis=0) for i in (0, 1))
         scales = [variables.scale_of_pair.get(item.pair) for item in data]
@@ -440,9 +439,18 @@ def summed(values: Array, places: np.ndarray, shape: tuple[int, ...]) -> Array:
 
 
 def prior_terms(problem: Problem, variables: Variables, state: State, basis: Array) -> tuple[Array, Array, float]:
-    """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis."""
+    """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis.
+
+    And those of the clocks' rates.
+    """
     graph, values = gtsam.NonlinearFactorGraph(), variables.values(state)
     add_priors(graph, variables, problem, "geodesic")
     information, gradient = normal_equations_of(graph, values, variables)
     cost = graph.error(values)
+    slots = slots_of(variables.unknowns)
+    for name, rate in state.rates.items():
+        place = slots[Unknown(UnknownKind.CLOCK_RATE, name)]
+        information[place, place] += RATE**-2
+        gradient[place] += rate / RATE**2
+        cost += 0.5 * (rate / RATE) ** 2
     return basis.T @ information @ basis, basis.T @ gradient, cost
