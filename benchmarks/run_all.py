@@ -46,6 +46,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "rendered_cells": ("--cells 300 --folder build/cells --keep build/cells.jsonl", None),
     "cell_models": ("--folder build/cells --keep build/cells.jsonl --models build/models.jsonl --opencv 60", None),
     "thousand_images": ("", None),
+    "many_tags": ("", "--tags 9"),
     "workcell": ("--splits 20", "--repetitions 1"),
     "report_cost": ("", ""),
     "gallery": ("--runs 10", None),

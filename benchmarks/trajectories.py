@@ -151,7 +151,8 @@ def stream(sequence: Sequence) -> tuple[str, Array, Array, float, tuple[str, ...
     problem = rw.Problem()
     A, B = np.linalg.inv(at[there]), np.linalg.inv(sequence.T_map_camera[there])
     problem.add(MAP, CAMERA, A, B, stamps_ns=sequence.stamps_ns[there])
-    found = rw.calibrate(problem, rw.CalibrateOptions(carrier_path=sequence.path, time_offsets=True))
+    path = Trajectory(sequence.path.stamps_ns, np.linalg.inv(sequence.path.T))  # T_sensorcarrier_targetcarrier, as A
+    found = rw.calibrate(problem, rw.CalibrateOptions(carrier_path=path, time_offsets=True))
     grounds = tuple(ground.value for ground in found.judgement.grounds)
     if found.refined is None or not np.isfinite(found.refined.covariance(CAMERA)).all():
         return found.verdict.value, np.full((4, 4), np.nan), np.full((6, 6), np.nan), np.nan, grounds

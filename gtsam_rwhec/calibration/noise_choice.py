@@ -173,7 +173,8 @@ def refined_under_its_noise(
     record, number = run.record, run.problem.number_of_measurements
     run.tell("refining")
     try:
-        if run.agreed is not None and inliers:  # a log's were chosen under each detection's own noise, and stay
+        # a log's were chosen under each detection's own noise, and stay
+        if run.recording is not None and run.agreed is not None and inliers:
             refined, noise, _ = estimated(agreeing(run.problem, inliers), solution, {}, run.options, run.tell)
             refined = replace(refined, inliers=inliers)
         else:
@@ -205,6 +206,9 @@ def refined_under_its_noise(
             times = f"{rounded(1.0 / math.sqrt(ratio))} times"
             words = f"the residuals are far smaller ({times}) than the noise that you stated for A makes them"
             record.find(Ground.NOISE_OVERSTATED, words)
+        for clock in noise.model.clocks:
+            if clock.is_sure:
+                record.choose(f"rate of the clock of {clock.sensor}", "estimated, and taken off", str(clock))
         _say_drift(run, noise.model)
         _say_systematic(run, noise.model)
         _say_blocks(run, noise.model)

@@ -218,6 +218,8 @@ def _calibrated(run: Run) -> Calibration:
         repaired = _repaired(run, reading)
         if repaired is not None:
             return _calibrated(repaired)
+        if run.options.repair and not run.is_repaired:
+            run.record.choose("rows of A and B", "as they are", "none of them slipped")
         better, thin = with_better_poses(run, found)
         if better is not None:
             run.tell("once more, with the poses of targets that the answer says")

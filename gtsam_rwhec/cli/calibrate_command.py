@@ -256,6 +256,8 @@ def calibrate(
                 noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read, repair=repair
             )
             calibration = rw.calibrate(problem, options, progress=stage)
+            if repair and rw.Ground.ROWS_REPAIRED not in calibration.judgement.grounds:
+                say("--repair: no rows slipped, and every row is as it was.", to_errors=True)
             write = partial(rw.write_calibration, calibration)
             evidence = None if output is None else partial(_evidence, source, problem, calibration, command_of(context))
             report = partial(rw.report.print_calibration, calibration)

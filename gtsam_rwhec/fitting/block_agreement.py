@@ -177,7 +177,7 @@ def scatter_about(
     moves = np.array([reach @ (b - information @ answer) for information, b in parts])
     reached = np.array([reach @ information for information, _ in parts])
     own = np.array([one @ reach.T for one in reached])
-    both = -np.einsum("iap,pq,jbq->ijab", reached, covariance, reached)
+    both = -np.einsum("iap,jbp->ijab", reached @ covariance, reached, optimize=True)
     both[np.arange(len(parts)), np.arange(len(parts))] += own
     expected = np.einsum("iiab->ab", both)
     values, vectors = np.linalg.eigh(0.5 * (expected + expected.T))

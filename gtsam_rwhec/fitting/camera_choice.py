@@ -26,6 +26,7 @@ from typing import get_args
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.sparse import csr_array
 from scipy.special import chdtri
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -254,7 +255,8 @@ def _levels(refined: CornersRefined, names: Sequence[str]) -> list[FreeLens]:
 class LinearModel:
     """theta = T phi + start, with the prior's precision P on phi, and how far phi = 0 is from the prior's mean."""
 
-    T: Array
+    #: Each number is one of phi's: it has one 1 in each row
+    T: csr_array
     start: Array
     P: Array
     off: Array
@@ -291,7 +293,7 @@ class LinearModel:
             P[rows, rows] = prior.precision
             off[rows] = vectors[at] - prior.mean
         kept = np.setdiff1d(np.arange(size), gone)
-        return LinearModel(T[:, kept], start, P[np.ix_(kept, kept)], off[kept])
+        return LinearModel(csr_array(T[:, kept]), start, P[np.ix_(kept, kept)], off[kept])
 
     def theta(self, H: Array, h: Array) -> Array:
         """The unknowns (d,) of least cost, for sums of rows."""
@@ -399,9 +401,10 @@ def _leaves_enough(model: Model, inside: np.ndarray) -> bool:
     """Whether without some instants (I,) each target and each sensor keeps enough images."""
     left: dict[tuple[str, str], int] = {}
     for stack in model.stacks:
-        number = int((~inside[stack.instant]).sum())
-        for at in (("x", stack.target), ("y", stack.sensor)):
-            left[at] = left.get(at, 0) + number
+        outside = stack.sums((~inside[stack.instant]).astype(int)).tolist()
+        for (pair, _), number in zip(stack.pairs, outside, strict=True):
+            for at in zip("xy", pair, strict=True):
+                left[at] = left.get(at, 0) + number
     return min(left.values()) >= FEWEST
 
 

@@ -8,51 +8,31 @@ determinant gains log |I + t^2 P'P / s^2|.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
+from gtsam_rwhec.fitting.corner_residuals import Stack
 from gtsam_rwhec.geometry.poses import Array
 
 
 @dataclass(frozen=True, eq=False)
 class OfStack:
-    """Products of the patterns P of V images of a target by a sensor with their rows.
+    """Products of the patterns P of a stack's V images with their rows.
 
-    An image's rows have few of the unknowns: of d columns only ``columns`` (m,) are stored.
+    An image's rows have few of the unknowns: only ``columns`` (T, m) are stored, those of its target.
     """
 
-    instant: np.ndarray
+    stack: Stack
     columns: np.ndarray
     of_unknowns: Array  #: (V, k, m)
     of_A: Array  #: (V, k, 6)
     of_residual: Array  #: (V, k)
     P: Array  #: (V, k, k)
 
-    @cached_property
-    def is_once(self) -> bool:
-        """Whether no two of the images are of one instant."""
-        return len(np.unique(self.instant)) == len(self.instant)
-
     def first(self, number: int) -> OfStack:
         """The products of the first patterns."""
         of_unknowns, of_A, of_residual = (each[:, :number] for each in (self.of_unknowns, self.of_A, self.of_residual))
         return replace(self, of_unknowns=of_unknowns, of_A=of_A, of_residual=of_residual, P=self.P[:, :number, :number])
-
-    def add(self, sums: Array, values: Array) -> None:
-        """Add values of the images (V, ...) to sums by instant (I, ...)."""
-        if self.is_once:
-            sums[self.instant] += values
-        else:
-            np.add.at(sums, self.instant, values)
-
-    def add_columns(self, sums: Array, values: Array) -> None:
-        """Add values of the images by their own unknowns (V, 6, m) to sums by instant and all unknowns (I, 6, d)."""
-        at = self.instant[:, None, None], np.arange(6)[:, None], self.columns
-        if self.is_once:
-            sums[at] += values
-        else:
-            np.add.at(sums, at, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +60,14 @@ class CommonErrors:
         squares, number = 0.0, 0
         of_a = carriers.K + carriers.KC_covariance @ carriers.KC.transpose(0, 2, 1)
         for stack, K in zip(self.stacks, self.inverse(common_px, s2)[0], strict=True):
-            at, own = stack.instant, stack.columns
+            at, own = stack.stack.instant, stack.columns
             E, D = K @ stack.of_unknowns / s2, K @ stack.of_A / s2
             e = (K @ stack.of_residual[..., None])[..., 0] / s2
-            c = -(e + E @ theta[own] + (D @ carriers.a[at][..., None])[..., 0])
-            with_a = carriers.KC_covariance[:, :, own][at].transpose(0, 2, 1)  # (V, m, 6)
+            of_theta = (E @ stack.stack.each(theta[own])[..., None])[..., 0]
+            c = -(e + of_theta + (D @ carriers.a[at][..., None])[..., 0])
+            with_a = carriers.KC_covariance.transpose(0, 2, 1)[at[:, None], stack.stack.each(own)]  # (V, m, 6)
             variance = np.diagonal(K, axis1=1, axis2=2) + ((D @ of_a[at]) * D).sum(axis=2)
-            variance = variance + ((E @ covariance[np.ix_(own, own)]) * E).sum(axis=2)
+            variance = variance + ((E @ stack.stack.each(covariance[own[:, :, None], own[:, None]])) * E).sum(axis=2)
             variance = variance - 2.0 * ((E @ with_a) * D).sum(axis=2)
             squares += float((c**2 + variance).sum())
             number += c.size
@@ -106,12 +87,17 @@ class Carriers:
     KC_covariance: Array
 
 
-def whitened(rows: Array, P: Array) -> Array:
-    """Rows (V, 2n, m) of unit noise and the common errors P c, c ~ N(0, I): (I + P P')^(-1/2) of them.
+def whitener(P: Array) -> Array:
+    """W (V, 2n, k) with I - W W' = (I + P P')^(-1/2): what makes common errors P c, c ~ N(0, I), and unit noise white.
 
-    With P = U S V', that is I - U (1 - (1 + S^2)^(-1/2)) U'.
+    With P = U S V', W is U (1 - (1 + S^2)^(-1/2))^(1/2).
     """
     U, S, _ = np.linalg.svd(P, full_matrices=False)
-    lost = 1.0 - 1.0 / np.sqrt(1.0 + S**2)
-    result: Array = rows - (U * lost[:, None]) @ (U.transpose(0, 2, 1) @ rows)
+    W: Array = U * np.sqrt(1.0 - 1.0 / np.sqrt(1.0 + S**2))[:, None]
+    return W
+
+
+def whitened(rows: Array, W: Array) -> Array:
+    """Rows (V, 2n, m) of unit noise and common errors, made white by their `whitener`."""
+    result: Array = rows - W @ (W.transpose(0, 2, 1) @ rows)
     return result

@@ -126,14 +126,15 @@ def told_where_it_fails(model: Model, point: Point) -> Iterator[None]:
 def check_corners(model: Model, point: Point) -> None:
     """OutlierError where half of the corners or more are far from where the poses put them."""
     for stack, error in zip(model.stacks, errors_px(model, point), strict=True):
-        median = float(np.median(error[stack.known]))
-        if not median < FARTHEST_PX:
-            raise OutlierError(
-                f"the corners of {stack.target} in the images of {stack.sensor} do not belong to the poses: half of "
-                f"them are off by {min(median, 1e5):.0f} pixels or more ({_what_there_is(model)}); check that each "
-                "image has the pose A of its own instant, that corners have the target's order, and that A, the start "
-                "and the sizes are in metres"
-            )
+        for (target, sensor), at in stack.pairs:
+            median = float(np.median(error[at][stack.known[at]]))
+            if not median < FARTHEST_PX:
+                raise OutlierError(
+                    f"the corners of {target} in the images of {sensor} do not belong to the poses: half of them are "
+                    f"off by {min(median, 1e5):.0f} pixels or more ({_what_there_is(model)}); check that each image "
+                    "has the pose A of its own instant, that corners have the target's order, and that A, the start "
+                    "and the sizes are in metres"
+                )
 
 
 def check_determined(
@@ -200,8 +201,9 @@ def few_corners(model: Model) -> str:
     numbers = 2 * sum(int(stack.known.sum()) for stack in model.stacks)
     cameras = sum(len(prior.mean) for prior in model.camera_priors.values() if prior.deviation[2] > CENTRE_PX["exact"])
     boards = sum(len(model.free_shape(name)) for name in model.targets)
-    corners = {stack.target: 3 * len(stack.points) for stack in model.stacks if stack.target in model.corner_priors}
-    unknowns = 6 * (len(model.targets) + len(model.sensors)) + cameras + boards + sum(corners.values())
+    of = {target: 3 * stack.points.shape[1] for stack in model.stacks for target in stack.targets}
+    corners = sum(number for name, number in of.items() if name in model.corner_priors)
+    unknowns = 6 * (len(model.targets) + len(model.sensors)) + cameras + boards + corners
     unknowns += len(model.offset_priors)
     return "" if numbers > unknowns else f"{numbers} coordinates of corners for {unknowns} unknowns"
 
@@ -278,8 +280,8 @@ def check_spread(stacks: tuple[Stack, ...]) -> None:
     faults = []
     for stack in stacks:
         seen = np.where(stack.known[..., None], stack.pixels, np.nan)
-        if (np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1)).max() < ONE_PLACE_PX:
-            faults.append(f"{stack.sensor} to {stack.target}")
+        largest = np.maximum.reduceat((np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1)).max(axis=1), stack.first)
+        faults += [f"{stack.sensor} to {stack.targets[t]}" for t in np.flatnonzero(largest < ONE_PLACE_PX)]
     if faults:
         raise UnderdeterminedError(
             f"the images do not determine the pose of {', '.join(faults)}: in each image all corners are within "
@@ -290,9 +292,10 @@ def check_spread(stacks: tuple[Stack, ...]) -> None:
 def check_rays(stacks: tuple[Stack, ...], options: CornerOptions) -> None:
     """Raise CameraError if intrinsics held as stated have no ray for a corner."""
     for stack in stacks:
-        words = without_rays(stack.camera, _seen(stack), stack.known)
-        if words and options.stated_of(options.camera_of(stack.sensor)) == "exact":
-            raise CameraError(f"the intrinsics of {stack.sensor} are held as stated (exact), but {words}; {LENS_CURE}")
+        if options.stated_of(options.camera_of(stack.sensor)) == "exact":
+            for _, words in _without_rays(stack.camera, stack, stack.known):
+                what = f"the intrinsics of {stack.sensor} are held as stated (exact), but {words}; {LENS_CURE}"
+                raise CameraError(what)
 
 
 def findings_of_rays(refined: CornersRefined) -> Iterator[str]:
@@ -301,12 +304,15 @@ def findings_of_rays(refined: CornersRefined) -> Iterator[str]:
     for stack, weights in zip(model.stacks, model.weights, strict=True):
         counted = stack.known & (weights > 0.0)
         camera = refined.intrinsics[stack.sensor].camera
-        now = without_rays(camera, _seen(stack), counted, model.seen(stack, refined.point).radius >= camera.ring)
-        before = without_rays(stack.camera, _seen(stack), counted)
-        if now:
-            yield f"As estimated, {now}: do not use these intrinsics there, and doubt this answer; {LENS_CURE}."
-        elif before:
-            yield f"As stated, {before}. The estimated one has rays there: {LENS_CURE}."
+        beyond = model.seen(stack, refined.point).radius >= camera.ring
+        now = dict(_without_rays(camera, stack, counted, beyond))
+        before = dict(_without_rays(stack.camera, stack, counted))
+        for target in stack.targets:
+            if target in now:
+                what = f"As estimated, {now[target]}: do not use these intrinsics there, and doubt this answer"
+                yield f"{what}; {LENS_CURE}."
+            elif target in before:
+                yield f"As stated, {before[target]}. The estimated one has rays there: {LENS_CURE}."
 
 
 def findings_of_images_left_out(observations: Observations, inliers: Mapping[Pair, np.ndarray]) -> Iterator[str]:
@@ -319,8 +325,16 @@ def findings_of_images_left_out(observations: Observations, inliers: Mapping[Pai
             yield f"Images of {sensor} are left out, in which, as stated, {words}. {LENS_CURE.capitalize()}."
 
 
-def _seen(stack: Stack) -> tuple[str, str, Array]:
-    return stack.target, stack.sensor, np.where(stack.known[..., None], stack.pixels, np.nan)
+def _without_rays(
+    camera: Camera, stack: Stack, counted: np.ndarray, beyond: np.ndarray | None = None
+) -> Iterator[tuple[str, str]]:
+    """`without_rays` of each target of a stack that has such corners, in words."""
+    pixels = np.where(stack.known[..., None], stack.pixels, np.nan)
+    if camera.has_ray(pixels[stack.known]).all() and (beyond is None or not beyond.any()):
+        return
+    for pair, at in stack.pairs:
+        if words := without_rays(camera, (*pair, pixels[at]), counted[at], None if beyond is None else beyond[at]):
+            yield pair[0], words
 
 
 def without_rays(

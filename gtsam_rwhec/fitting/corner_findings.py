@@ -101,12 +101,13 @@ def _of_corners(refined: CornersRefined) -> Iterator[str]:
             f"causes: noise of A that is not in the model, {CAUSES}."
         )
     for stack in refined.graph.model.stacks:
-        left_out, seen = int(refined.left_out[stack.target, stack.sensor].sum()), int(stack.known.sum())
-        if left_out > MANY * seen:
-            yield (
-                f"{left_out} of {seen} corners of {stack.target} by {stack.sensor} disagree with the others and are "
-                "left out: look at those images (left_out)."
-            )
+        for (target, sensor), at in stack.pairs:
+            left_out, seen = int(refined.left_out[target, sensor].sum()), int(stack.known[at].sum())
+            if left_out > MANY * seen:
+                yield (
+                    f"{left_out} of {seen} corners of {target} by {sensor} disagree with the others and are left out: "
+                    "look at those images (left_out)."
+                )
 
 
 def _of_clocks(refined: CornersRefined) -> Iterator[str]:

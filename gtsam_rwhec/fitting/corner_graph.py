@@ -9,14 +9,13 @@ Variables
     p      how far a board's corners are off their places, held by a prior; absent where they are not free
     t      the offset of a sensor's clock, held by a weak prior; absent where it is not free
 
-An instant's factor has of each of its images the six linear rows in which A is; what the other rows say has no A, and
-is summed over all images of a target by a sensor (`row_sums`). GTSAM asks each factor by itself, in any order: all rows
-are computed when the first factor is asked at new values. It costs much to ask a factor in Python: images share one.
+An instant's factor has six linear rows, in which its A is; what the other rows of its images say has no A, and is
+summed over all of them in one factor (`Sums.few_rows`). GTSAM asks each factor by itself, in any order: all rows are
+computed when the first factor is asked at new values.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,15 +24,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from gtsam_rwhec.fitting.corner_model import FewRows, Model, Point
+from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.geometry.poses import Array
 
 #: A symbol's letter is in the bits of its key from this one on.
 LETTER = 56
 #: Letters of the variables that are vectors; the others are poses.
 _VECTORS = frozenset(map(ord, "kbtp"))
-#: A factor has at most so many images of an instant: most of its derivatives are zeros, and they are stored.
-AT_ONCE = 32
 
 
 def key_of(letter: str, number: int) -> int:
@@ -47,38 +44,35 @@ class CornerGraph:
     """The graph of a model, with its variables' keys.
 
     A factor's vector is not the pixel errors but a turn of them: all factors together have their length, and the linear
-    rows are as few as can be. Asked without derivatives, the pair's factor has the whole length.
+    rows are as few as can be. Asked without derivatives, the instants' factors have the whole length, or that of all
+    images where A is exact.
     """
 
     model: Model
     start: Point
     graph: gtsam.NonlinearFactorGraph = field(init=False)
+    slots: dict[tuple[str, str], slice] = field(init=False)  #: Columns of each variable but those of A
     keys: dict[tuple[str, str], int] = field(init=False)  #: By a variable's letter and name; without those of A
     _at: dict[int, bytes] = field(init=False, default_factory=dict)
     _point: Point = field(init=False)
-    #: (V,) of each stack: the squared length of each image's errors
-    _squares: list[Array] = field(init=False, default_factory=list)
-    _rows: list[FewRows] = field(init=False, default_factory=list)
+    #: (I,): the squared length of each instant's errors
+    _squares: Array = field(init=False)
+    _rows: tuple[Array, Array, Array] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        model = self.model
-        vectors = model.vectors(self.start)
-        names = [*(("x", name) for name in model.targets), *(("y", name) for name in model.sensors), *vectors]
-        letters = [letter for letter, _ in names]
-        self.keys = {at: key_of(at[0], letters[:i].count(at[0])) for i, at in enumerate(names)}
-        self._widths = {at: len(vectors.get(at, np.zeros(6))) for at in names}
-        carriers = range(len(model.A)) if model.A_noise is not None else ()
-        self._keys = [*self.keys.values(), *(key_of("a", i) for i in carriers)]
+        model, is_exact = self.model, self.model.A_noise is None
+        self.slots = model.slots(self.start)
+        letters = [letter for letter, _ in self.slots]
+        self.keys = {at: key_of(at[0], letters[:i].count(at[0])) for i, at in enumerate(self.slots)}
+        self._keys = [*self.keys.values(), *(key_of("a", i) for i in range(0 if is_exact else len(model.A)))]
         self.graph = gtsam.NonlinearFactorGraph()
         self._add_priors()
-        images: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for s, stack in enumerate(model.stacks):
-            self._add_pair(s)
-            for v, instant in enumerate(stack.instant.tolist() if model.A_noise is not None else ()):
-                images[instant].append((s, v))
-        for instant, of_instant in images.items():
-            for first in range(0, len(of_instant), AT_ONCE):
-                self._add_images(instant, of_instant[first : first + AT_ONCE])
+        self._add_together()
+        there = np.zeros((len(model.A), max(at.stop for at in self.slots.values())), dtype=bool)
+        for stack in () if is_exact else model.stacks:
+            there[stack.instant[:, None], stack.each(model.columns(stack, self.slots))] = True
+        for instant in np.flatnonzero(there.any(axis=1)).tolist():
+            self._add_instant(instant, [at for at, columns in self.slots.items() if there[instant, columns.start]])
 
     def values(self, point: Point) -> gtsam.Values:
         """A point as GTSAM's values."""
@@ -144,70 +138,45 @@ class CornerGraph:
                 noise = gtsam.noiseModel.Gaussian.SqrtInformation(rows)
                 self.graph.add(gtsam.PriorFactorVector(self.keys[at], prior.mean, noise))
 
-    def _variables_of(self, s: int) -> dict[str, tuple[str, str]]:
-        """The letters and names of a stack's variables by their names in `Model`, without A."""
-        stack = self.model.stacks[s]
-        names = {
-            "X": ("x", stack.target),
-            "Y": ("y", stack.sensor),
-            "camera": ("k", self.model.camera_of[stack.sensor]),
-            "shape": ("b", stack.target),
-            "time": ("t", stack.sensor),
-            "corners": ("p", stack.target),
-        }
-        return {name: names[name] for name in self.model.variables_of(stack) if name != "A"}
-
-    def _add_pair(self, s: int) -> None:
-        """What a stack's rows say without A. Where A is free, its images' factors have the cost."""
-        variables = self._variables_of(s)
-        size = sum(self._widths[at] for at in variables.values()) + 1
-        exact = self.model.A_noise is None
+    def _add_together(self) -> None:
+        """What all rows say without A. Where A is free, the instants' factors have the cost."""
+        size = max(at.stop for at in self.slots.values()) + 1
 
         def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
             self._come_to(self._keys, values)
             if jacobians is None:
                 length = np.zeros(size)
-                length[0] = np.sqrt(self._squares[s].sum()) if exact else 0.0
+                length[0] = np.sqrt(self._squares.sum()) if self.model.A_noise is None else 0.0
                 return length
-            rows = self._rows_there()[s]
-            for i, name in enumerate(variables):
-                jacobians[i] = rows.together[:, rows.columns[name]]
-            return np.asarray(rows.together[:, -1])
+            _, _, together = self._rows_there()
+            for i, columns in enumerate(self.slots.values()):
+                jacobians[i] = together[:, columns]
+            return np.asarray(together[:, -1])
 
-        keys = [self.keys[at] for at in variables.values()]
-        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), list(self.keys.values()), error))
 
-    def _add_images(self, instant: int, images: list[tuple[int, int]]) -> None:
-        """One factor for images (s, v) of an instant."""
-        variables = [self._variables_of(s) for s, _ in images]
-        names = list(dict.fromkeys(at for of_image in variables for at in of_image.values()))
-        places = [[(names.index(at), name) for name, at in of_image.items()] for of_image in variables]
-        keys, widths = [*(self.keys[at] for at in names), key_of("a", instant)], [self._widths[at] for at in names]
-        size = 6 * len(images)
+    def _add_instant(self, instant: int, names: list[tuple[str, str]]) -> None:
+        """The rows that have an instant's A, and the variables that its images see."""
+        keys = [*(self.keys[at] for at in names), key_of("a", instant)]
 
         def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
             self._come_to(keys, values)
-            residual = np.zeros(size)
             if jacobians is None:
-                residual[0] = np.sqrt(sum(self._squares[s][v] for s, v in images))
+                residual = np.zeros(6)
+                residual[0] = np.sqrt(self._squares[instant])
                 return residual
-            blocks, by_A = [np.zeros((size, width)) for width in widths], np.zeros((size, 6))
-            for j, (s, v) in enumerate(images):
-                rows, own = self._rows_there()[s], slice(6 * j, 6 * j + 6)
-                of_image = rows.of_images[v]
-                for i, name in places[j]:
-                    blocks[i][own] = of_image[:, rows.columns[name]]
-                by_A[own], residual[own] = rows.by_A[v], of_image[:, -1]
-            for i, block in enumerate([*blocks, by_A]):
-                jacobians[i] = block
-            return residual
+            of_A, R, _ = self._rows_there()
+            for i, at in enumerate(names):
+                jacobians[i] = of_A[instant, :, self.slots[at]]
+            jacobians[len(names)] = R[instant]
+            return np.asarray(of_A[instant, :, -1])
 
-        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error))
 
-    def _rows_there(self) -> list[FewRows]:
+    def _rows_there(self) -> tuple[Array, Array, Array]:
         """The linear rows at the values last visited."""
-        if not self._rows:
-            self._rows = self.model.few_rows(self._point)
+        if self._rows is None:
+            self._rows = self.model.sums(self._point).few_rows()
         return self._rows
 
     def _come_to(self, keys: list[int], values: gtsam.Values) -> None:
@@ -217,7 +186,9 @@ class CornerGraph:
             if key not in at or at[key] != _value(values, key):
                 self._point = self.point(values)
                 self._at = {key: _value(values, key) for key in self._keys}
-                self._squares, self._rows = [(e**2).sum(axis=1) for e in self.model.errors(self._point)], []
+                self._squares, self._rows = np.zeros(len(self.model.A)), None
+                for stack, errors in zip(self.model.stacks, self.model.errors(self._point), strict=True):
+                    np.add.at(self._squares, stack.instant, (errors**2).sum(axis=1))
                 break
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.linalg.lapack import dpstrf
 
-from gtsam_rwhec.fitting.common_errors import whitened
+from gtsam_rwhec.fitting.common_errors import whitened, whitener
 from gtsam_rwhec.fitting.corner_residuals import Linear, Seen, Stack, linearised, pixel_errors, seen
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior
 from gtsam_rwhec.geometry.poses import Array
 
+#: An instant's row that is shorter than this share of its longest is rounding.
+NO_ROW = 1e-8
 #: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
 BEHIND = 1e6
 
@@ -63,7 +67,7 @@ class Model:
     corner_priors: dict[str, float] = field(default_factory=dict)
     #: Standard deviation of a corner as it was stated: it counts where corners are too few to tell theirs.
     stated_px: float = 0.1
-    #: Of a bias that all corners of a target share, as the detector finds them, pixels.
+    #: Of a bias that all corners of a target share, as the detector finds them, pixels; in the order of the targets.
     bias_px: dict[str, float] = field(default_factory=dict)
     #: (V, 2n, k) each. One deviation of what the corners of an image share, pixels, by stack; empty: nothing.
     common: tuple[Array, ...] = ()
@@ -78,7 +82,8 @@ class Model:
     @property
     def targets(self) -> tuple[str, ...]:
         """Names of the targets."""
-        return tuple(dict.fromkeys(stack.target for stack in self.stacks))
+        there = {target for stack in self.stacks for target in stack.targets}
+        return tuple(name for name in self.bias_px if name in there)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -105,22 +110,35 @@ class Model:
 
     def _whitened(self, s: int, rows: Array) -> Array:
         """Weighted rows (V, 2n, m) of a stack, of unit noise."""
-        return whitened(rows, self.common[s] * self._roots[s][..., None]) if self.common else rows
+        return whitened(rows, self._whiteners[s]) if self.common else rows
+
+    @cached_property
+    def _whiteners(self) -> list[Array]:
+        return [whitener(common * root[..., None]) for common, root in zip(self.common, self._roots, strict=True)]
 
     def linearised(self, stack: Stack, point: Point) -> Linear:
-        """Rows of a stack, in pixels; by the numbers of the board's shape that are free."""
+        """Rows of a stack, in pixels; by the numbers of the boards' shapes that are free."""
         rows = linearised(stack, *self._arguments(stack, point))
-        return replace(rows, shapes=rows.shapes[..., self.free_shape(stack.target)])
+        return replace(rows, shapes=rows.shapes[..., self.free_shape(stack.targets[0])])
 
-    def by_unknown(self, stack: Stack, rows: Linear) -> dict[tuple[str, str], Array]:
-        """Derivatives (V, 2n, m) of a stack's rows by letter and name of each unknown but A and single corners."""
-        found = {("x", stack.target): rows.by_X, ("y", stack.sensor): rows.by_Y}
-        found["k", self.camera_of[stack.sensor]] = rows.by_camera
-        if stack.target in self.shape_priors:
-            found["b", stack.target] = rows.by_shape
+    def by_unknown(self, stack: Stack, rows: Linear) -> dict[str, Array]:
+        """Derivatives (V, 2n, m) of a stack's rows by the letter of each unknown but A and single corners."""
+        found = {"x": rows.by_X, "y": rows.by_Y, "k": rows.by_camera}
+        if stack.targets[0] in self.shape_priors:
+            found["b"] = rows.by_shape
         if stack.sensor in self.offset_priors:
-            found["t", stack.sensor] = rows.by_time
+            found["t"] = rows.by_time
         return found
+
+    def columns(self, stack: Stack, slots: Mapping[tuple[str, str], slice]) -> np.ndarray:
+        """Where in the slots the unknowns of each target are (T, m): those of `by_unknown`, then single corners."""
+        of_sensor, found = {"y": stack.sensor, "k": self.camera_of[stack.sensor], "t": stack.sensor}, []
+        for letter in "xykbtp":
+            names = [(letter, of_sensor.get(letter, target)) for target in stack.targets]
+            if names[0] in slots:
+                width = slots[names[0]].stop - slots[names[0]].start
+                found.append(np.array([slots[name].start for name in names])[:, None] + np.arange(width))
+        return np.concatenate(found, axis=1)
 
     def seen(self, stack: Stack, point: Point) -> Seen:
         """A stack's corners on their way to the camera."""
@@ -129,31 +147,33 @@ class Model:
 
     def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float, Array | None]:
         camera = point.cameras[self.camera_of[stack.sensor]]
-        poses = point.X[stack.target], point.Y[stack.sensor], point.A
-        of_board = point.shapes[stack.target], point.offsets_s.get(stack.sensor, 0.0), point.corners.get(stack.target)
-        return *poses, camera, *of_board
+        X, shapes = (np.array([of[target] for target in stack.targets]) for of in (point.X, point.shapes))
+        at_s, corners = point.offsets_s.get(stack.sensor, 0.0), point.corners.get(stack.targets[0])
+        return X, point.Y[stack.sensor], point.A, camera, shapes, at_s, corners
 
     @cached_property
     def _roots(self) -> list[Array]:
         return [np.repeat(np.sqrt(weights), 2, axis=1) / self.corner_px for weights in self.weights]
 
-    def few_rows(self, point: Point) -> list[FewRows]:
-        """Rows of every stack with the same cost and the same information as all of them, by stack."""
-        result = []
+    def sums(self, point: Point) -> Sums:
+        """Of all rows, weighted and of unit noise, by the model's `slots`; without A where it is exact."""
+        slots = self.slots(point)
+        result = Sums.zeros(len(self.A), slots)
         for s, (stack, root) in enumerate(zip(self.stacks, self._roots, strict=True)):
             rows = self.linearised(stack, point)
-            variables = self.variables_of(stack)
-            blocks = {name: getattr(rows, f"by_{name}") for name in variables if name not in ("corners", "A")}
-            has = {name: name in variables for name in ("corners", "A")}
-            number = [block.shape[2] for block in blocks.values()] + [3 * len(stack.points)] * has["corners"]
-            ends = np.cumsum(number).tolist()
-            columns = {name: slice(a, b) for name, a, b in zip(variables, [0, *ends], ends, strict=False)}
-            J = self._whitened(s, np.concatenate(list(blocks.values()), axis=2) * root[..., None])
-            B = rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if has["corners"] else None
-            J_A = self._whitened(s, rows.by_A * root[..., None]) if has["A"] else None
-            r = self._whitened(s, _finite(rows.residual, root)[..., None])[..., 0]
-            result.append(FewRows(*few_rows(Rows(J, B, r), J_A), columns))
+            J = np.concatenate([*self.by_unknown(stack, rows).values(), rows.by_A], axis=2) * root[..., None]
+            every = self._whitened(s, np.concatenate([J, _finite(rows.residual, root)[..., None]], axis=2))
+            B = rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if stack.targets[0] in point.corners else None
+            of_A = None if self.A_noise is None else every[..., -7:-1]
+            result.add(stack, self.columns(stack, slots), Rows(every[..., :-7], B, every[..., -1]), of_A)
         return result
+
+    def slots(self, point: Point) -> dict[tuple[str, str], slice]:
+        """The rows of every unknown but A, by letter and name: "x" targets, "y" sensors, and the `vectors`."""
+        widths = {("x", name): 6 for name in self.targets} | {("y", name): 6 for name in self.sensors}
+        widths |= {at: len(vector) for at, vector in self.vectors(point).items()}
+        ends = np.cumsum(list(widths.values())).tolist()
+        return {at: slice(end - width, end) for (at, width), end in zip(widths.items(), ends, strict=True)}
 
     def vectors(self, point: Point) -> dict[tuple[str, str], Array]:
         """What is not known besides poses, by letter and name: "k" cameras, "b" shapes, "t" clocks, "p" corners."""
@@ -176,33 +196,13 @@ class Model:
             found[at] = CameraPrior(np.zeros(len(vectors[at])), of * np.ones(len(vectors[at])))
         return {at: found[at] for at in vectors}
 
+    def kind_of(self, target: str) -> object:
+        """What targets have alike that share a stack: which numbers of their shapes are free; single corners, none."""
+        return target if target in self.corner_priors else tuple(self.free_shape(target))
+
     def free_shape(self, target: str) -> np.ndarray:
         """Which of the four numbers of a board's shape are free."""
         return np.flatnonzero(self.shape_priors.get(target, ()))
-
-    def variables_of(self, stack: Stack) -> tuple[str, ...]:
-        """X, Y, camera, and shape, time, corners and A where they are free, in this order."""
-        free = [
-            ("shape", stack.target in self.shape_priors),
-            ("time", stack.sensor in self.offset_priors),
-            ("corners", stack.target in self.corner_priors),
-            ("A", self.A_noise is not None),
-        ]
-        return ("X", "Y", "camera", *(name for name, is_free in free if is_free))
-
-
-@dataclass(frozen=True, eq=False)
-class FewRows:
-    """The rows of a stack's images that have A, and one triangle of the rest for all of them."""
-
-    #: (V, 6, columns): Of each image, by all unknowns but A; the last column is the residual. V = 0 where A is exact.
-    of_images: Array
-    #: (V, 6, 6)
-    by_A: Array
-    #: (columns, columns): Of all images.
-    together: Array
-    #: Of each variable but A.
-    columns: dict[str, slice]
 
 
 def _finite(error: Array, root: Array) -> Array:
@@ -218,12 +218,14 @@ class Rows:
     B: Array | None
     r: Array
 
-    def squares(self) -> Array:
-        """The sum over all images of [J, corners, r]' [J, corners, r]."""
+    def squares(self, stack: Stack) -> Array:
+        """Sums (T, columns, columns) over the images of each target of [J, corners, r]' [J, corners, r]."""
         others = np.concatenate([self.J, self.r[..., None]], axis=2)
+        if len(stack.targets) > 1:
+            return stack.sums(others.transpose(0, 2, 1) @ others)
         flat = others.reshape(-1, others.shape[2])
         if self.B is None:
-            return np.asarray(flat.T @ flat)
+            return np.asarray(flat.T @ flat)[None]
         n, m = self.B.shape[1], self.J.shape[2]
         Bt = _by_corner(self.B, n).transpose(0, 2, 1)
         own = np.zeros((n, 3, n, 3))
@@ -234,7 +236,7 @@ class Rows:
             [of_others[:m, :m], both.T, of_others[:m, m:]],
             [both, own.reshape(3 * n, 3 * n), mixed[:, m:]],
             [of_others[m:, :m], mixed[:, m:].T, of_others[m:, m:]],
-        ])  # fmt: skip
+        ])[None]  # fmt: skip
 
     def times(self, Q: Array) -> Array:
         """Q' [J, corners, r] of each image (V, q, columns), with Q (V, 2n, q)."""
@@ -247,23 +249,63 @@ class Rows:
         return np.concatenate(parts, axis=2)
 
 
-def few_rows(rows: Rows, J_A: Array | None) -> tuple[Array, Array, Array]:
-    """Rows with the same squares and products as those of all images, A's columns J_A (V, 2n, 6) among them.
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Sums over all rows, by the d columns of all unknowns but A, and the residual's, which is the last.
 
-    With J_A = Q R of each image, Q'[J_A, J, corners, r] are all rows in which A is. What the other rows add to the sums
-    has no A: one triangle for all images together. Returned are Q'[J, corners, r] (V, 6, columns), R (V, 6, 6), both
-    with V = 0 where A is none of the unknowns, and the triangle (columns, columns).
+    squares (d + 1, d + 1) are those of all columns; of_A (I, 6, d + 1) the products of A's columns with them, by
+    instant, and M (I, 6, 6) those of A's with A's.
     """
-    total = rows.squares()
-    columns = len(total)
-    Q, R = (np.zeros((0, 6, columns)), np.zeros((0, 6, 6))) if J_A is None else np.linalg.qr(J_A)
-    of_A = rows.times(Q) if J_A is not None else Q
-    flat = of_A.reshape(-1, columns)
-    # a column of zeros stays one
-    size = np.sqrt(np.maximum(np.diagonal(total), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh((total - flat.T @ flat) / size[:, None] / size)
-    together: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * size
-    return of_A, R, together
+
+    squares: Array
+    of_A: Array
+    M: Array
+
+    @staticmethod
+    def zeros(instants: int, slots: Mapping[tuple[str, str], slice]) -> Sums:
+        """Sums of no rows."""
+        d = max(at.stop for at in slots.values())
+        return Sums(np.zeros((d + 1, d + 1)), np.zeros((instants, 6, d + 1)), np.zeros((instants, 6, 6)))
+
+    def copy(self) -> Sums:
+        """The same sums, to add to."""
+        return Sums(self.squares.copy(), self.of_A.copy(), self.M.copy())
+
+    def add(self, stack: Stack, columns: np.ndarray, rows: Rows, J_A: Array | None, sign: float = 1.0) -> None:
+        """Add a stack's rows, whose unknowns are in columns (T, m), with those by A, J_A (V, 2n, 6), or without."""
+        at = np.pad(columns, ((0, 0), (0, 1)), constant_values=len(self.squares) - 1)
+        _add(self.squares, (at[:, :, None], at[:, None, :]), sign * rows.squares(stack))
+        if J_A is None:
+            return
+        instant = stack.instant[:, None, None]
+        _add(self.of_A, (instant, np.arange(6)[:, None], stack.each(at)[:, None]), sign * rows.times(J_A))
+        _add(self.M, (instant, np.arange(6)[:, None], np.arange(6)), sign * (J_A.transpose(0, 2, 1) @ J_A))
+
+    def few_rows(self) -> tuple[Array, Array, Array]:
+        """Rows with these sums: Q'[J, r] (I, 6, d + 1) and Q'J_A (I, 6, 6) of each instant, and one triangle for all.
+
+        With J_A = Q R of an instant's rows, Q'[J_A, J, r] are all rows in which A is. What the other rows add has no A.
+        """
+        values, vectors = np.linalg.eigh(self.M)
+        root = np.sqrt(np.maximum(values, 0.0))
+        there = root > NO_ROW * root[:, -1:]
+        R = np.where(there, root, 0.0)[..., None] * vectors.transpose(0, 2, 1)
+        of_A = (vectors / np.where(there, root, np.inf)[:, None]).transpose(0, 2, 1) @ self.of_A
+        flat = of_A.reshape(-1, len(self.squares))
+        # a column of zeros stays one
+        size = np.sqrt(np.maximum(np.diagonal(self.squares), np.finfo(float).tiny))
+        triangle, order, rank, _ = dpstrf(
+            (self.squares - flat.T @ flat) / size[:, None] / size, tol=np.finfo(float).eps
+        )
+        together = np.zeros_like(self.squares)
+        together[:rank, order - 1] = np.triu(triangle)[:rank]
+        return of_A, R, together * size
+
+
+def _add(sums: Array, at: tuple[np.ndarray, ...], values: Array) -> None:
+    """Add values to sums at indices that may be there twice."""
+    flat = np.ravel_multi_index(np.broadcast_arrays(*at), sums.shape)
+    np.add.at(sums.reshape(-1), np.broadcast_to(flat, values.shape).ravel(), values.ravel())
 
 
 def _by_corner(rows: Array, n: int) -> Array:

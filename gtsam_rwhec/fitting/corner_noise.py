@@ -19,8 +19,9 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
-from gtsam_rwhec.fitting.corner_model import Model, Point, Rows
+from gtsam_rwhec.fitting.corner_model import Model, Point, Rows, Sums
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
+from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -82,14 +83,8 @@ class Reduced:
 
     #: "x", "y", "k", "b", "t", "p" with the frame's name: its rows in theta.
     slots: Mapping[tuple[str, str], slice]
-    #: (d, d) and (d,)
-    G: Array
-    g: Array
-    #: (I, 6, d)
-    C: Array
-    M: Array
-    b: Array
-    rr: float
+    #: Of all rows.
+    sums: Sums
     #: Number of residuals, weights counted.
     count: float
     #: (d, d): The precision of the prior on theta, and `prior_off` (d,) how far the point is from its mean.
@@ -104,49 +99,61 @@ class Reduced:
 
         The errors of the point's A are taken off the residuals, to first order.
         """
-        vectors = model.vectors(point)
-        if slots is None:
-            widths = {("x", name): 6 for name in model.targets} | {("y", name): 6 for name in model.sensors}
-            widths |= {at: len(vector) for at, vector in vectors.items()}
-            ends = np.cumsum(list(widths.values())).tolist()
-            slots = {at: slice(end - width, end) for (at, width), end in zip(widths.items(), ends, strict=True)}
-        size = max(at.stop for at in slots.values())
-        count = len(model.A)
-        G, g = np.zeros((size, size)), np.zeros(size)
-        C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
-        rr, number, common = 0.0, 0.0, []
+        vectors, slots = model.vectors(point), slots or model.slots(point)
+        sums, number, common = Sums.zeros(len(model.A), slots), 0.0, []
         to_right = model.to_right
         off_A = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
         for stack, weights in zip(model.stacks, model.weights, strict=True):
-            rows = model.linearised(stack, point)
-            parts = model.by_unknown(stack, rows)
-            names = list(parts) + [("p", stack.target)] * (("p", stack.target) in slots)
-            where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in names])
+            rows, where = model.linearised(stack, point), model.columns(stack, slots)
             root = np.repeat(np.sqrt(weights), 2, axis=1)
             by_A = rows.by_A @ to_right[stack.instant]
             of_stack = Rows(
-                np.concatenate(list(parts.values()), axis=2) * root[..., None],
-                rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if len(names) > len(parts) else None,
+                np.concatenate(list(model.by_unknown(stack, rows).values()), axis=2) * root[..., None],
+                rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if stack.targets[0] in point.corners else None,
                 (rows.residual - np.einsum("vni,vi->vn", by_A, off_A[stack.instant])) * root,
             )
             J_A = by_A * root[..., None]
-            squares, of_A = of_stack.squares(), of_stack.times(J_A)
-            G[np.ix_(where, where)] += squares[:-1, :-1]
-            g[where] += squares[:-1, -1]
-            rr += float(squares[-1, -1])
+            sums.add(stack, where, of_stack, J_A)
             number += 2.0 * float(weights[stack.known].sum())
             P = patterns(model, stack, point) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
-            shared = OfStack(stack.instant, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P)
-            shared.add_columns(C, of_A[..., :-1])
-            shared.add(M, J_A.transpose(0, 2, 1) @ J_A)
-            shared.add(b, of_A[..., -1])
-            common.append(shared)
+            common.append(OfStack(stack, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
+        size = len(sums.squares) - 1
         prior, off = np.zeros((size, size)), np.zeros(size)
         for at, of in model.priors(point).items():
             prior[slots[at], slots[at]] = of.precision
             off[slots[at]] = vectors[at] - of.mean
-        return Reduced(slots, G, g, C, M, b, rr, number, prior, off, CommonErrors(tuple(common)))
+        return Reduced(slots, sums, number, prior, off, CommonErrors(tuple(common)))
+
+    @property
+    def G(self) -> Array:
+        """(d, d): By the unknowns."""
+        return self.sums.squares[:-1, :-1]
+
+    @property
+    def g(self) -> Array:
+        """(d,): By the unknowns and the residual."""
+        return self.sums.squares[:-1, -1]
+
+    @property
+    def rr(self) -> float:
+        """Of the residual."""
+        return float(self.sums.squares[-1, -1])
+
+    @property
+    def C(self) -> Array:
+        """(I, 6, d): By A and the unknowns."""
+        return self.sums.of_A[..., :-1]
+
+    @property
+    def b(self) -> Array:
+        """(I, 6): By A and the residual."""
+        return self.sums.of_A[..., -1]
+
+    @property
+    def M(self) -> Array:
+        """(I, 6, 6): By A."""
+        return self.sums.M
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
         """Restricted: theta integrated out; and its derivatives by the logarithms of the deviations.
@@ -162,14 +169,13 @@ class Reduced:
         sums, log_det = self.without_common(noise)
         at = sums.eliminated(noise, log_det)
         H, h, K, KC, Kb = at.H + self.prior, at.h + self.prior @ self.prior_off, at.K, at.KC, at.Kb
-        size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-        sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
-        if sign <= 0.0:
+        try:
+            inverse, log_H = _inverse(H)
+        except np.linalg.LinAlgError:
             return np.inf, np.zeros(4)
-        inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
         theta = -inverse @ h
         off = float(self.prior_off @ self.prior @ self.prior_off)
-        value = at.rr + off + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
+        value = at.rr + off + float(h @ theta) + at.log_det + log_H
         free = len(H) - float((self.prior * inverse).sum())
         squares = sums.rr + 2.0 * float(sums.g @ theta) + float(theta @ sums.G @ theta)
         gradient, a = np.zeros(4), -(Kb + KC @ theta)
@@ -200,17 +206,13 @@ class Reduced:
             return self, 0.0
         of, s2 = self.common, noise.corner_px**2
         inverses, log_det = of.inverse(noise.common_px, s2)
-        G, g, C, M, b, rr = self.G.copy(), self.g.copy(), self.C.copy(), self.M.copy(), self.b.copy(), self.rr
-        for stack, K in zip(of.stacks, inverses, strict=True):
-            KJ, KA, Kr = K @ stack.of_unknowns / s2, K @ stack.of_A / s2, K @ stack.of_residual[..., None] / s2
-            to_A, flat = stack.of_A.transpose(0, 2, 1), stack.of_unknowns.reshape(-1, len(stack.columns))
-            stack.add_columns(C, -to_A @ KJ)
-            stack.add(M, -to_A @ KA)
-            stack.add(b, -(to_A @ Kr)[..., 0])
-            G[np.ix_(stack.columns, stack.columns)] -= flat.T @ KJ.reshape(flat.shape)
-            g[stack.columns] -= flat.T @ Kr.ravel()
-            rr -= float((stack.of_residual * Kr[..., 0]).sum())
-        return replace(self, G=G, g=g, C=C, M=M, b=b, rr=rr), log_det
+        sums = self.sums.copy()
+        for of_stack, K in zip(of.stacks, inverses, strict=True):
+            root = np.linalg.cholesky(K).transpose(0, 2, 1) / noise.corner_px  # R'P K P'R / s^2 is a sum of squares
+            r = (root @ of_stack.of_residual[..., None])[..., 0]
+            rows = Rows(root @ of_stack.of_unknowns, None, r)
+            sums.add(of_stack.stack, of_stack.columns, rows, root @ of_stack.of_A, sign=-1.0)
+        return replace(self, sums=sums), log_det
 
     def without_carriers(self, noise: Noise) -> WithoutCarriers:
         """The sums of the measurements under a noise, the carriers' errors eliminated."""
@@ -271,6 +273,14 @@ class Reduced:
         return [0, *((1, 2) if carrier else ()), *((3,) if shares else ())]
 
 
+def _inverse(H: Array) -> tuple[Array, float]:
+    """The inverse and log |H|; LinAlgError if it is not positive definite."""
+    size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+    scaled = H / size[:, None] / size
+    inverse, log_det = EliminationOrder.of(scaled).inverse(scaled)
+    return inverse / size[:, None] / size, log_det + 2.0 * float(np.log(size).sum())
+
+
 def deviations_of(noise: Noise) -> Array:
     """All of them (4,)."""
     return np.array([getattr(noise, field.name) for field in fields(noise)])
@@ -301,7 +311,7 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     hessian = np.array(gradients) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
     V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
-    above, below = ([np.linalg.inv(reduced.information(at(sign * step))) for step in steps] for sign in (1.0, -1.0))
+    above, below = ([_inverse(reduced.information(at(sign * step)))[0] for step in steps] for sign in (1.0, -1.0))
     result = {}
     for name, rows in reduced.slots.items():
         size = rows.stop - rows.start

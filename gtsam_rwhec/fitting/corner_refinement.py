@@ -156,8 +156,8 @@ def refine_corners(
         },
         shapes=point.shapes,
         corners={
-            stack.target: shaped(stack.points, point.shapes[stack.target])[0] + point.corners.get(stack.target, 0.0)
-            for stack in model.stacks
+            name: shaped(observations.corners[name], point.shapes[name])[0] + point.corners.get(name, 0.0)
+            for name in model.targets
         },
         time_offsets_s={name: point.offsets_s[name] for name in settled.model.offset_priors},
         noise=settled.noise,
@@ -165,8 +165,9 @@ def refine_corners(
         slots=settled.slots,
         freedom=settled.freedom,
         left_out={
-            (stack.target, stack.sensor): stack.known & (weights == 0.0)
+            pair: stack.known[at] & (weights[at] == 0.0)
             for stack, weights in zip(model.stacks, settled.model.weights, strict=True)
+            for pair, at in stack.pairs
         },
         graph=settled.graph,
         point=point,
@@ -187,17 +188,20 @@ def _stated(
         name: free_model(observations.cameras[first[name]], stated[name], lens[name]) for name in observations.sensors
     }
     priors = {first[name]: prior_of(camera, stated[name], lens[name]) for name, camera in cameras.items()}
-    stacks, A = stacks_of(replace(observations, cameras=cameras))
+    shapes = {
+        name: np.append(options.size_share_of(name), np.full(len(WARPS), options.warp_m_of(name)))
+        for name in observations.targets
+    }
+    # single corners are told of one target at a time
+    stacks, A = stacks_of(
+        replace(observations, cameras=cameras), lambda name: name if options.corners_m else tuple(shapes[name] > 0.0)
+    )
     given = options.carrier_noise
     noise, about = ROUGH, options.about
     if isinstance(given, CarrierNoise):
         noise, about = Noise(ROUGH.corner_px, given.rotation_rad, given.translation_m), given.about
     elif given == "exact":
         noise = Noise(ROUGH.corner_px, 0.0, 0.0)
-    shapes = {
-        name: np.append(options.size_share_of(name), np.full(len(WARPS), options.warp_m_of(name)))
-        for name in observations.targets
-    }
     model = Model(
         stacks, A, noise.carrier, about, first, priors,
         {name: shape for name, shape in shapes.items() if shape.any()},
@@ -275,12 +279,13 @@ def optimum(
 def _check_start(model: Model, point: Point) -> None:
     for stack, error in zip(model.stacks, model.errors(point), strict=True):
         behind = np.asarray(~(np.abs(error) < BEHIND).reshape(*stack.known.shape, 2).all(axis=2))
-        if behind.any():
-            raise CameraError(
-                f"the start puts {behind.sum()} of {stack.known.sum()} corners of {stack.target} behind "
-                f"{stack.sensor}, which saw them ({first_of(behind, stack.pixels)}); start at the certified answer's "
-                "poses"
-            )
+        for (target, sensor), at in stack.pairs:
+            if behind[at].any():
+                raise CameraError(
+                    f"the start puts {behind[at].sum()} of {stack.known[at].sum()} corners of {target} behind "
+                    f"{sensor}, which saw them ({first_of(behind[at], stack.pixels[at])}); start at the certified "
+                    "answer's poses"
+                )
 
 
 def _block(settled: _Settled, name: tuple[str, str]) -> Array:

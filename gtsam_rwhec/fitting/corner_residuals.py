@@ -11,7 +11,9 @@ is off by t seconds, it is the pose at that time: A Expmap(t twist), with the ca
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from rwhec_factors import se3
@@ -29,13 +31,15 @@ NEAREST_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """All images of one target by one sensor."""
+    """All images by one sensor of targets that are alike: they have as many corners, and as many unknowns."""
 
-    target: str
+    targets: tuple[str, ...]
     sensor: str
-    #: Which pose of the carriers each image has.
+    #: (V,): Which of the targets each image has, in their order; each has some.
+    target: np.ndarray
+    #: (V,): Which pose of the carriers each image has.
     instant: np.ndarray
-    #: (n, 3): Corners in the target's frame, metres.
+    #: (T, n, 3): Each target's corners in its frame, metres.
     points: Array
     #: (V, n, 2): Zero where a corner was not seen.
     pixels: Array
@@ -46,11 +50,33 @@ class Stack:
     twist: Array | None = None
 
     def selected(self, which: np.ndarray) -> Stack:
-        """The images that a mask or an index array selects."""
+        """The images that a mask or an index array selects, in their order, and the targets that are in them."""
         twist = None if self.twist is None else self.twist[which]
+        there, target = np.unique(self.target[which], return_inverse=True)
         return replace(
-            self, instant=self.instant[which], pixels=self.pixels[which], known=self.known[which], twist=twist
-        )
+            self, targets=tuple(self.targets[t] for t in there), target=target, instant=self.instant[which],
+            points=self.points[there], pixels=self.pixels[which], known=self.known[which], twist=twist,
+        )  # fmt: skip
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """The first image (T,) of each target."""
+        return np.flatnonzero(np.diff(self.target, prepend=-1))
+
+    @property
+    def pairs(self) -> Iterator[tuple[tuple[str, str], slice]]:
+        """Each target with the sensor, and its images."""
+        ends = [*self.first[1:].tolist(), len(self.target)]
+        for target, begin, end in zip(self.targets, self.first.tolist(), ends, strict=True):
+            yield (target, self.sensor), slice(begin, end)
+
+    def each(self, values: Array) -> Array:
+        """Values of the targets (T, ...) as values of the images (V, ...); as they are where there is one target."""
+        return values if len(self.targets) == 1 else np.asarray(values[self.target])
+
+    def sums(self, values: Array) -> Array:
+        """Sums (T, ...) by target of values of the images (V, ...)."""
+        return np.add.reduceat(values, self.first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +96,9 @@ class Linear:
     by_camera: Array
     #: (V, 4, 4)
     B: Array
-    #: (4, 4)
+    #: (V, 4, 4), or (1, 4, 4) where the stack has one target.
     X: Array
-    #: (n, 3, k): Derivatives of the corners' places by the numbers of the shape.
+    #: (V, n, 3, k), or (1, n, 3, k): Derivatives of the corners' places by the numbers of the shape.
     shapes: Array
     #: (V, 6)
     twist: Array | None
@@ -106,8 +132,7 @@ class Linear:
     @property
     def by_corners(self) -> Array:
         """Each corner's residuals by its own place (V, n, 2, 3)."""
-        V, n = len(self.residual), len(self.shapes)
-        return self.by_B[..., 3:].reshape(V, n, 2, 3)
+        return self.by_B[..., 3:].reshape(len(self.residual), -1, 2, 3)
 
     @property
     def by_shape(self) -> Array:
@@ -117,52 +142,65 @@ class Linear:
     @property
     def _by_later_A(self) -> Array:
         """By A at the image's own time."""
-        return self.by_B @ se3.adjoint(se3.inverse(self.X)[None])
+        return self.by_B @ se3.adjoint(se3.inverse(self.X))
 
 
-def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
-    """The stacks of observations, and the carriers' poses A (I, 4, 4) at all instants: equal poses are one instant."""
+def stacks_of(
+    observations: Observations, kind: Callable[[str], object] = lambda target: None
+) -> tuple[tuple[Stack, ...], Array]:
+    """The stacks of observations, and the carriers' poses A (I, 4, 4) at all instants: equal poses are one instant.
+
+    Targets of one `kind` with as many corners share a stack.
+    """
     every = np.concatenate([view.A for view in observations.views.values()])
+    ends = np.cumsum([0, *(len(view.A) for view in observations.views.values())])
     _, first, index = np.unique(every.reshape(len(every), 16), axis=0, return_index=True, return_inverse=True)
     # in the order of first appearance
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     instant = rank[index.ravel()]
-    result, begin = [], 0
-    for (target, sensor), view in observations.views.items():
-        end = begin + len(view.A)
-        known = view.known
+    alike: dict[tuple[str, int, bool, object], dict[str, np.ndarray]] = {}
+    for number, ((target, sensor), view) in enumerate(observations.views.items()):
+        key = sensor, view.pixels.shape[1], view.twist is None, kind(target)
+        alike.setdefault(key, {})[target] = instant[ends[number] : ends[number + 1]]
+    result = []
+    for key, instants in alike.items():
+        sensor = key[0]
+        views = [observations.views[target, sensor] for target in instants]
+        pixels = np.concatenate([view.pixels for view in views])
+        known = np.asarray(np.isfinite(pixels).all(axis=2))
         result.append(
             Stack(
-                target,
+                tuple(instants),
                 sensor,
-                instant[begin:end],
-                observations.corners[target],
-                np.where(known[:, :, None], view.pixels, 0.0),
+                np.repeat(np.arange(len(views)), [len(view.A) for view in views]),
+                np.concatenate(list(instants.values())),
+                np.array([observations.corners[target] for target in instants]),
+                np.where(known[:, :, None], pixels, 0.0),
                 known,
                 observations.cameras[sensor],
-                view.twist,
+                np.concatenate(twists) if (twists := [v.twist for v in views if v.twist is not None]) else None,
             )
         )
-        begin = end
     return tuple(result), every[first[order]]
 
 
 def shaped(points: Array, shape: Array) -> tuple[Array, Array]:
-    """The corners (n, 3) of a board with a shape (4,), and their derivatives (n, 3, 4) by it."""
-    x, y = (points[:, :2] / np.linalg.norm(points, axis=1).max()).T
-    by_shape = np.zeros((len(points), 3, SHAPE))
-    by_shape[:, :, 0] = points
-    by_shape[:, 2, 1:] = np.stack([x * x, y * y, x * y], axis=1)
-    return points + by_shape @ shape, by_shape
+    """The corners (..., n, 3) of boards with shapes (..., 4), and their derivatives (..., n, 3, 4) by them."""
+    size = np.linalg.norm(points, axis=-1).max(axis=-1)[..., None]
+    x, y = points[..., 0] / size, points[..., 1] / size
+    by_shape = np.zeros((*points.shape, SHAPE))
+    by_shape[..., 0] = points
+    by_shape[..., 2, 1:] = np.stack([x * x, y * y, x * y], axis=-1)
+    return points + (by_shape @ shape[..., None, :, None])[..., 0], by_shape
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
     """A stack's corners on their way to the camera."""
 
-    #: (n, 3): In the target's frame, shaped; `by_shape` (n, 3, 4) are its derivatives.
+    #: (V, n, 3), or (1, n, 3) of one target: In its frame, shaped; `by_shape` (V, n, 3, 4) are its derivatives.
     p: Array
     by_shape: Array
     #: (V, 4, 4): Poses T_sensor_target.
@@ -189,13 +227,13 @@ class Seen:
 
 def seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float, moved: Array | None) -> Seen:
     """A stack's corners on their way to the camera, at a point; `linearised` says what its numbers are."""
-    p, by_shape = shaped(stack.points, shape)
+    p, by_shape = map(stack.each, shaped(stack.points, shape))
     if moved is not None:
         p = p + moved
     B = se3.inverse(Y) @ A[stack.instant]
     if stack.twist is not None and offset_s != 0.0:
         B = B @ se3.expmap(offset_s * stack.twist)
-    B = B @ X
+    B = B @ stack.each(X)
     P = p @ B[:, :3, :3].transpose(0, 2, 1) + B[:, None, :3, 3]
     behind = stack.known & (P[..., 2] < NEAREST_M)
     z = np.where(stack.known & ~behind, P[..., 2], 1.0)
@@ -229,10 +267,10 @@ def linearised(
     offset_s: float = 0.0,
     moved: Array | None = None,
 ) -> Linear:
-    """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape.
+    """Residuals and derivatives of a stack at X (T, 4, 4), Y (4, 4), A (I, 4, 4), a camera and shapes (T, 4).
 
-    `moved` (n, 3) is how far corners are off their places on the board, metres. The images were taken `offset_s` after
-    their instants.
+    Of one target they may be (4, 4) and (4,). `moved` (n, 3) is how far its corners are off their places, metres. The
+    images were taken `offset_s` after their instants.
     """
     V, n = stack.known.shape
     at = seen(stack, X, Y, A, shape, offset_s, moved)
@@ -245,7 +283,7 @@ def linearised(
     by_B = np.empty((V, n, 2, 6))
     by_p = (by_P.reshape(V, 2 * n, 3) @ at.B[:, :3, :3]).reshape(V, n, 2, 3)
     by_B[..., 3:] = by_p
-    p = at.p[:, None]  # row' (omega x p) = omega' (p x row)
+    p = at.p[..., None, :]  # row' (omega x p) = omega' (p x row)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         by_B[..., i] = p[..., j] * by_p[..., k] - p[..., k] * by_p[..., j]
     by_parameters *= stack.known[..., None, None]
@@ -254,7 +292,7 @@ def linearised(
         by_B.reshape(V, 2 * n, 6),
         by_parameters.reshape(V, 2 * n, -1),
         at.B,
-        X,
+        stack.each(X).reshape(-1, 4, 4),
         at.by_shape,
         stack.twist,
         offset_s,

@@ -37,12 +37,15 @@ def covariance_of_bias(refined: CornersRefined) -> Array:
 def gradients_of_bias(model: Model, reduced: Reduced, noise: Noise) -> Array:
     """h (patterns, d) of one standard deviation of each pattern, of all targets together, in place of the residuals."""
     every, found = reduced.patterns, []
-    px = [model.bias_px[stack.target] for stack in model.stacks]
+    px = [s.each(np.array([model.bias_px[target] for target in s.targets])) for s in model.stacks]
     for k in range(len(PATTERNS)):
-        g, b, of_bias = np.zeros_like(reduced.g), np.zeros_like(reduced.b), []
-        for stack, of in zip(every.stacks, px, strict=True):
-            stack.add(b, of * stack.of_A[:, k])
-            g[stack.columns] += of * stack.of_unknowns[:, k].sum(axis=0)
-            of_bias.append(replace(stack, of_residual=of * stack.P[..., k]))
-        found.append(replace(reduced, g=g, b=b, patterns=CommonErrors(tuple(of_bias))).without_carriers(noise).h)
+        sums, of_bias = reduced.sums.copy(), []
+        sums.squares[:, -1], sums.of_A[..., -1] = 0.0, 0.0
+        for each, of in zip(every.stacks, px, strict=True):
+            of_unknowns = each.stack.sums(of[:, None] * each.of_unknowns[:, k])
+            np.add.at(sums.squares[:, -1], each.columns, of_unknowns)
+            np.add.at(sums.of_A[..., -1], each.stack.instant, of[:, None] * each.of_A[:, k])
+            of_bias.append(replace(each, of_residual=of[:, None] * each.P[..., k]))
+        biased = replace(reduced, sums=sums, patterns=CommonErrors(tuple(of_bias)))
+        found.append(biased.without_carriers(noise).h)
     return np.array(found)

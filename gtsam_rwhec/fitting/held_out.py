@@ -132,14 +132,13 @@ def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, 
     rows = model.linearised(seen, point)
     length = np.linalg.norm(rows.residual.reshape(*known.shape, 2), axis=2)[known]
     on_target = length * model.seen(seen, point).z[known] / camera.focal_px
-    there = model.by_unknown(stack, rows)
-    J = np.concatenate(list(there.values()), axis=2)
-    index = np.concatenate([np.arange(refined.slots[name].start, refined.slots[name].stop) for name in there])
-    squares = np.einsum("vri,ij,vrj->vr", J, refined.joint[np.ix_(index, index)], J, optimize=True)
-    if ("p", stack.target) in refined.slots:  # each corner's own place, which the target's pose goes with
-        at, n, by_corners = refined.slots["p", stack.target], known.shape[1], rows.by_corners
+    J = np.concatenate(list(model.by_unknown(stack, rows).values()), axis=2)
+    index = model.columns(stack, refined.slots)[:, : J.shape[2]]
+    squares = ((J @ stack.each(refined.joint[index[:, :, None], index[:, None]])) * J).sum(axis=2)
+    if ("p", stack.targets[0]) in refined.slots:  # each corner's own place, which the target's pose goes with
+        at, n, by_corners = refined.slots["p", stack.targets[0]], known.shape[1], rows.by_corners
         own = refined.joint[at, at].reshape(n, 3, n, 3)[range(n), :, range(n)]
-        mixed = refined.joint[index, at].reshape(-1, n, 3)
+        mixed = refined.joint[index[0], at].reshape(-1, n, 3)
         of_corner = np.einsum("vnri,nij,vnrj->vnr", by_corners, own, by_corners, optimize=True)
         J_of_corner = J.reshape(*by_corners.shape[:3], -1)
         of_corner += 2.0 * np.einsum("vnrm,mni,vnri->vnr", J_of_corner, mixed, by_corners, optimize=True)
@@ -160,8 +159,8 @@ def blocks_of(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarra
     a part of every pair."""
     place, count = np.zeros(instants), np.zeros(instants)
     for stack in stacks:
-        number = len(stack.instant)
-        np.add.at(place, stack.instant, (np.arange(number) + 0.5) / number)
+        number, first = np.bincount(stack.target)[stack.target], stack.first[stack.target]
+        np.add.at(place, stack.instant, (np.arange(len(number)) - first + 0.5) / number)
         np.add.at(count, stack.instant, 1.0)
     return np.minimum((folds * place / count).astype(np.int64), folds - 1)
 

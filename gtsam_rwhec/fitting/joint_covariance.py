@@ -11,6 +11,7 @@ Marginals raise an error or return 1e18.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +90,12 @@ class JointCovariance:
                 there = ", ".join(map(str, self.slots))
                 raise FrameError(f"{str(unknown)!r} is not among the unknowns; they are {there}")
         return rows_of(self.slots, unknowns)
+
+    def without(self, others: Collection[Unknown]) -> JointCovariance:
+        """The covariance of the unknowns beside some others."""
+        kept = tuple(unknown for unknown in self.slots if unknown not in others)
+        rows = self.rows(kept)
+        return JointCovariance(slots_of(kept), self.finite[np.ix_(rows, rows)], self.free[rows], self.unit[rows])
 
     def selector(self, unknowns: tuple[Unknown, ...]) -> Array:
         """The matrix (m, d) that selects the rows of some unknowns."""

@@ -3,6 +3,7 @@
 Every effect has the unit of its own standard deviation, so that its prior is of unit noise:
 
     x, y, s, d   frames, scales and time offsets, as in every refinement
+    c            how much more than in the estimate a clock's rate is off
     w            the drift at each instant: 7 numbers for each track (rotation, translation, logarithm of the scale)
     u            the coefficients of the systematic errors: 6 for each feature of the configuration
     e            the twist of A at an instant, where several measurements share it
@@ -22,6 +23,7 @@ import numpy as np
 from rwhec_factors.batch import Together, robot_world_hand_eye_effects_factors
 
 from gtsam_rwhec.errors import NotConvergedWarning
+from gtsam_rwhec.fitting.clock_rates import RATE
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, drift_columns
 from gtsam_rwhec.fitting.fit_options import C, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -29,11 +31,11 @@ from gtsam_rwhec.fitting.noise_likelihood import Estimate, NoiseModel
 from gtsam_rwhec.fitting.noise_rows import prior_terms
 from gtsam_rwhec.fitting.noise_search import Settled, Task, moved
 from gtsam_rwhec.fitting.pair_data import PairData, square_root_information
-from gtsam_rwhec.fitting.pose_fit import residuals
+from gtsam_rwhec.fitting.pose_fit import by_clock, linearized, residuals
 from gtsam_rwhec.fitting.pose_graph import add_knowledge, optimise
 from gtsam_rwhec.fitting.refined import FactorGraph, PairNoise, Refined
 from gtsam_rwhec.fitting.refinement_from_poses import movements, scale_of
-from gtsam_rwhec.fitting.unknowns import State, Variables
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -54,6 +56,12 @@ SYSTEMATIC_KEY: int = gtsam.symbol("u", 0)
 def drift_key(instant: int) -> int:
     """Key of the tracks' drift at an instant."""
     key: int = gtsam.symbol("w", instant)
+    return key
+
+
+def rate_key(variables: Variables, sensor: str) -> int:
+    """Key of the change of a clock's rate."""
+    key: int = gtsam.symbol("c", list(variables.rates).index(sensor))
     return key
 
 
@@ -123,6 +131,10 @@ def graph_of(
     effects = _Effects.of(model, sigma)
     graph, values, keys = gtsam.NonlinearFactorGraph(), variables.values(state), {}
     _add_measurements(graph, model, effects, data, variables, state)
+    for name, rate in state.rates.items():
+        key = keys[str(Unknown(UnknownKind.CLOCK_RATE, name))] = rate_key(variables, name)
+        values.insert(key, np.zeros(1))
+        graph.add(gtsam.PriorFactorVector(key, np.array([-rate / RATE]), gtsam.noiseModel.Unit.Create(1)))
     if model.drift is not None:
         walk = gtsam.Values()
         for instant in range(model.rows.instants.count):
@@ -154,13 +166,17 @@ def _add_measurements(
     instants, span = model.rows.instants, effects.span
     first = np.cumsum([0] + [item.count for item in data])
     pair = np.searchsorted(first, instants.order, side="right") - 1
-    together = Together()
+    together, at = Together(), linearized(data, variables, state) if variables.rates else {}
     for i, item in enumerate(data):
-        residuals = item.at(state.offsets_s.get(item.pair.sensor, 0.0))
+        residuals, stretched = by_clock(item, variables, state), dict[int, Array]()
         rows = np.flatnonzero(pair == i)
         block = instants.index[rows] // span if span is not None else np.zeros(len(rows), dtype=np.int64)
         target, sensor = variables.ends(item.pair)
         place = instants.order[rows] - first[i]
+        if item.pair.sensor in variables.rates:
+            since_s = item.since_s(variables.rates[item.pair.sensor])[:, None]
+            by_rate = -RATE * (at[item.pair].offset * since_s)[place, :, None]
+            stretched = {rate_key(variables, item.pair.sensor): by_rate}
         bounds = np.r_[0, np.flatnonzero(np.diff(block)) + 1, len(rows)]
         factors = robot_world_hand_eye_effects_factors(
             target,
@@ -168,7 +184,13 @@ def _add_measurements(
             residuals.A[place],
             residuals.B[place],
             effects.root[rows],
-            [(slice(a, b), effects.at(rows[a:b], instants.index[rows[a:b]])) for a, b in pairwise(bounds.tolist())],
+            [
+                (
+                    slice(a, b),
+                    effects.at(rows[a:b], instants.index[rows[a:b]]) | {k: e[a:b] for k, e in stretched.items()},
+                )
+                for a, b in pairwise(bounds.tolist())
+            ],
             scale_key=variables.scale_key(item.pair),
             time_offset_key=variables.offset_key(item.pair),
             twists=None if residuals.twists is None else residuals.twists[place],
@@ -242,7 +264,8 @@ def refined_of(
     @cache
     def factor_graph() -> FactorGraph:
         made = graph_of(model, sigma, task.data, variables, state, task.problem)
-        held = {variables.keys[u]: u.dimension for u in variables.unknowns} if task.layout.free.shape[1] else {}
+        is_free = task.layout.free.shape[1] > 0
+        held = {key: u.dimension for u, key in variables.keys.items() if is_free and u in task.layout.slots}
         optimum = optimise(made.graph, made.values, options.max_iterations, held)
         return FactorGraph(made.graph, optimum.values, {str(u): key for u, key in variables.keys.items()} | made.keys)
 

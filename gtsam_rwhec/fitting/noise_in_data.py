@@ -13,6 +13,7 @@ from scipy.special import expit
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.block_agreement import Scatter
+from gtsam_rwhec.fitting.clock_rates import ClockRate
 from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
@@ -28,6 +29,7 @@ from gtsam_rwhec.fitting.noise_search import (
     with_drift,
 )
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind
+from gtsam_rwhec.fitting.view_errors import ViewErrors
 from gtsam_rwhec.geometry.poses import Array
 
 C = Component
@@ -35,6 +37,8 @@ C = Component
 EVIDENCE = 5.0
 #: Twice the log likelihood's rise that systematic errors of rotation and of translation must exceed.
 MOST_BY_CHANCE = EVIDENCE * len(SYSTEMATIC)
+#: Errors of the view are told where they make variances larger by this factor.
+TOLD_RATIO = 1.1
 _UNITS = {
     C.JITTER: ("ms", 1e3), C.DRIFT_SCALE: ("%", 1e2),
     **dict.fromkeys((C.ROTATION, C.CARRIER_ROTATION, C.DRIFT_ROTATION, C.SYSTEMATIC_ROTATION), ("°", 180.0 / math.pi)),
@@ -96,8 +100,12 @@ class NoiseInData:
     scatter: tuple[Scatter, ...] = ()
     #: The one by which the covariance is larger; None where blocks agree.
     worst: Scatter | None = None
+    #: What errors do that last as long as the view; None where no errors fade in time.
+    by_view: ViewErrors | None = None
     #: How often the errors of a track jump: it was cut there.
     jumps: int = 0
+    #: What is known of the rates of clocks along a path.
+    clocks: tuple[ClockRate, ...] = ()
 
     @property
     def has_systematic(self) -> bool:
@@ -163,8 +171,15 @@ class NoiseInData:
                 f"({ratio_words(self.systematic_evidence)}): {100.0 * self.systematic_probability:.0f} % probable. "
                 "Their constant part, which residuals do not show, is assumed to be twice as large."
             )
+        said += [f"{clock}, which is taken off." for clock in self.clocks if clock.is_sure]
         if self.jumps:
             said.append(f"The errors jump {self.jumps} times, as where loops are closed; the track is cut there.")
+        if self.by_view is not None and self.by_view.ratio > TOLD_RATIO:
+            said.append(
+                f"These errors depend on the view ({ratio_words(self.by_view.evidence)}): views that differ by "
+                f"{rounded(math.degrees(self.by_view.reach_rad))}° err differently. Seen again, they err again, and do "
+                f"not average out: standard deviations are {rounded(math.sqrt(self.by_view.ratio))} times as large."
+            )
         if self.worst is not None:
             times = rounded(math.sqrt(self.worst.ratio))
             said.append(f"Blocks disagree: {self.worst}; so all standard deviations are {times} times as large.")
@@ -248,6 +263,7 @@ def noise_in(
     constant: tuple[Array, Array],
     scatter: tuple[Scatter, ...],
     worst: Scatter | None,
+    by_view: ViewErrors | None,
 ) -> NoiseInData:
     """What the data say of their noise; `constant` are the variances of `constant_variances`."""
     white = found.white or found
@@ -282,21 +298,22 @@ def noise_in(
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
         scatter=scatter,
         worst=worst,
+        by_view=by_view,
         jumps=len(task.jumps),
     )
 
 
-def mixed(task: Task, found: Settled, worst: Scatter | None) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
+def mixed(task: Task, found: Settled, larger: float = 1.0) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
     """The covariance, with the components' uncertainty mixed in, and the arm's constant error added; and its parts.
 
-    Where blocks of the log scatter more than the noise allows (``worst``), it is as much larger.
+    It is ``larger`` where blocks of the log, or errors of the view, say so.
     """
     is_dense = task.instants.count > INSTANTS
     mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     constant = constant_variances(task, found, state, mixture)
-    finite = basis @ mixture.covariance @ basis.T * (1.0 if worst is None else worst.ratio)
+    finite = basis @ mixture.covariance @ basis.T * larger
     for poses, variances in zip((state.X, state.Y), constant, strict=True):
         shift = _shifts(task, poses)
         finite += (shift * variances) @ shift.T

@@ -10,6 +10,7 @@ from scipy.special import fdtri
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
+from gtsam_rwhec.fitting.clock_rates import clocks_with_rate, rates_found
 from gtsam_rwhec.fitting.component_posterior import FEWEST
 from gtsam_rwhec.fitting.drift import drift_columns
 from gtsam_rwhec.fitting.fit_options import C, NoiseOptions, RefineOptions
@@ -21,6 +22,7 @@ from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables
+from gtsam_rwhec.fitting.view_errors import errors_of_view
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -58,8 +60,12 @@ class UnderNoise:
         task.tell("covariances: with the uncertainty of the noise itself")
         scatter = scatter_of_blocks(task, found)
         worst = too_much(scatter, is_drift_untried=is_drift_untried(task, found))
-        joint, mixture, constant = mixed(task, found, worst)
+        by_view = errors_of_view(task, found)
+        larger = max(1.0 if one is None else one.ratio for one in (worst, by_view))
+        joint, mixture, constant = mixed(task, found, larger)
         layout = task.layout
+        best = moved(found.state, task.variables, layout, found.model.basis @ mixture.step)
+        clocks = rates_found(joint, best)
         frames = [
             layout.slots[unknown]
             for unknown in layout.slots
@@ -71,8 +77,10 @@ class UnderNoise:
         freedom = min(freedom, max(0.5 * spare, FEWEST))
         freedom = freedom if worst is None else min(freedom, worst.freedom)
         task.tell("covariances: the graph of the answer")
-        refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
-        noise = noise_in(task, found, mixture, constant, scatter, worst)
+        refined = refined_of(task, found, joint.without(clocks), freedom, inliers or {}, self.solution, self.how)
+        noise = replace(
+            noise_in(task, found, mixture, constant, scatter, worst, by_view), clocks=tuple(clocks.values())
+        )
         return replace(refined, noise_sentences=noise.sentences), noise
 
 
@@ -105,7 +113,8 @@ def under_noise(
     """
     how, options, tell = how or RefineOptions(noise="estimate"), options or NoiseOptions(), progress or silent
     check_inputs(problem, solution, how)
-    variables = Variables.of(problem, sensors_with_offset(problem, how))
+    offsets = sensors_with_offset(problem, how)
+    variables = Variables.of(problem, offsets, clocks_with_rate(problem, offsets, how.carrier_path))
     unknowns = sum(unknown.dimension for unknown in variables.unknowns)
     equations = 6 * problem.number_of_measurements
     if equations - unknowns < SPARE_EQUATIONS:
@@ -168,7 +177,7 @@ def agreeing(
     judged = whole.with_measurements({pair: whole.measurements(*pair) for pair in pairs})
     sigma, there, state, data = found.fit.sizes.values(found.fit.logs), found.model, found.state, task.data
     if not all(inliers[pair].all() for pair in whole.pairs):
-        variables = Variables.of(judged, tuple(task.variables.offsets))
+        variables = Variables.of(judged, tuple(task.variables.offsets), task.variables.rates)
         data = [
             replace(
                 item, covariance=np.where(inliers[item.pair][:, None, None], 1.0, 1.0 / WEIGHTLESS) * item.covariance

@@ -18,12 +18,13 @@ import numpy as np
 from rwhec_factors import se3
 from rwhec_factors.batch import Linearization
 
+from gtsam_rwhec.fitting.clock_rates import RATE
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.pair_data import PairData
 from gtsam_rwhec.fitting.pose_fit import linearized
 from gtsam_rwhec.fitting.pose_graph import add_priors, normal_equations_of
-from gtsam_rwhec.fitting.unknowns import State, Variables
+from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables, slots_of
 from gtsam_rwhec.fitting.variance_components import jacobian_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
@@ -244,36 +245,30 @@ class Rows:
         ``white`` (N, 6), in the order of the instants, is the residuals' white noise: derivatives are then without it.
         """
         at = linearized(data, variables, state)
+        every = [at[item.pair] for item in data]
+        counts = [item.count for item in data]
+        residual, right = (np.concatenate([getattr(of, part) for of in every]) for part in ("residual", "carrier"))
         if white is not None:
             of_data = np.empty_like(white)
             of_data[instants.order] = white
-            ends = np.cumsum([item.count for item in data])[:-1]
-            for item, own in zip(data, np.split(of_data, ends), strict=True):
-                at[item.pair] = _without_noise(at[item.pair], own)
+            every = _without_noise(every, residual, of_data)
+        jacobians = [jacobian_of(item, linear, variables, layout) for item, linear in zip(data, every, strict=True)]
         frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
-        jacobians = []
-        blocks: list[list[Array]] = [[] for _ in range(9)]
-        for item in data:
-            linear = at[item.pair]
-            X, Y = frames[item.pair.target], frames[item.pair.sensor]
-            jacobians.append(jacobian_of(item.pair, linear, variables, layout))
-            A, B = item.residuals.A, item.residuals.B
-            inverse = se3.inverse(A)
-            predicted = np.linalg.inv(Y) @ A @ X
-            scale = variables.scale_of_pair.get(item.pair)
-            predicted[:, :3, 3] *= 1.0 if scale is None else state.scales[scale]
-            # A Expmap(e) on the target carrier's side; Expmap(e) A = A Expmap(Ad(A^-1) e) on the sensor carrier's.
-            right = linear.carrier
-            parts = [
-                linear.residual, item.covariance, B[:, 2, :3], right, right @ se3.adjoint(inverse),
-                _configuration(A), _configuration(inverse), predicted, se3.inverse(predicted)[:, :3, 3],
-            ]  # fmt: skip
-            for block, part in zip(blocks, parts, strict=True):
-                block.append(part)
-        stacked = [np.concatenate(block)[instants.order] for block in blocks]
-        residual, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
+        X, Y = (np.repeat([frames[item.pair[i]] for item in data], counts, axis=0) for i in (0, 1))
+        scales = [variables.scale_of_pair.get(item.pair) for item in data]
+        A, B = (np.concatenate([getattr(item.residuals, letter) for item in data]) for letter in "AB")
+        inverse, predicted = se3.inverse(A), np.linalg.inv(Y) @ A @ X
+        alpha = [1.0 if scale is None else state.scales[scale] for scale in scales]
+        predicted[:, :3, 3] *= np.repeat(alpha, counts)[:, None]
+        given = np.concatenate([item.covariance for item in data])
+        # A Expmap(e) on the target carrier's side; Expmap(e) A = A Expmap(Ad(A^-1) e) on the sensor carrier's.
+        parts = [
+            residual, given, B[:, 2, :3], right, right @ se3.adjoint(inverse), _configuration(A),
+            _configuration(inverse), predicted, se3.inverse(predicted)[:, :3, 3], A,
+        ]  # fmt: skip
+        stacked = [part[instants.order] for part in parts]
+        residual, given, axis, right, left, moving_target, moving_sensor, predicted, length, A = stacked
         by_unknowns = SparseColumns.of(jacobians, len(layout.unit))[instants.order]
-        A = np.concatenate([item.residuals.A for item in data])[instants.order]
         rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
         return Rows(
             instants, residual, by_unknowns, given, axis, {"targetcarrier": right, "sensorcarrier": left},
@@ -323,16 +318,19 @@ class Rows:
         return found
 
 
-def _without_noise(linear: Linearization, white: Array) -> Linearization:
-    """The derivatives by X and Y where residuals are nothing, and at poses that are less noisy.
+def _without_noise(every: list[Linearization], residual: Array, white: Array) -> list[Linearization]:
+    """The derivatives by X and Y where residuals (N, 6) are nothing, and at poses that are less noisy.
 
     With r = Log(B^-1 S), S = Y^-1 A X, they are Jr^-1(r) and -Jr^-1(r) Ad(S^-1). Noise of A is in S, and in r: together
     they say that Y is where it is taken to be. At S Expmap(-white) it would be B's. Nobody knows whose it is: in the
     middle both weigh the same, with opposite signs.
     """
-    straight = np.linalg.inv(se3.right_jacobian_inverse(linear.residual))
-    back = se3.adjoint(se3.expmap(0.5 * white)) @ straight
-    return replace(linear, target=straight @ linear.target, sensor=back @ linear.sensor)
+    straight = np.linalg.inv(se3.right_jacobian_inverse(residual))
+    target = straight @ np.concatenate([linear.target for linear in every])
+    sensor = se3.adjoint(se3.expmap(0.5 * white)) @ straight @ np.concatenate([linear.sensor for linear in every])
+    ends = np.cumsum([len(linear.residual) for linear in every])[:-1]
+    parts = zip(every, np.split(target, ends), np.split(sensor, ends), strict=True)
+    return [replace(linear, target=by_X, sensor=by_Y) for linear, by_X, by_Y in parts]
 
 
 def _taken(part: Any, rows: np.ndarray) -> Any:
@@ -441,9 +439,18 @@ def summed(values: Array, places: np.ndarray, shape: tuple[int, ...]) -> Array:
 
 
 def prior_terms(problem: Problem, variables: Variables, state: State, basis: Array) -> tuple[Array, Array, float]:
-    """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis."""
+    """Information (p, p), gradient (p,) and value of kappa_0 theta^2 + |t - t_0|^2 / 2 sigma_0^2, by the basis.
+
+    And those of the clocks' rates.
+    """
     graph, values = gtsam.NonlinearFactorGraph(), variables.values(state)
     add_priors(graph, variables, problem, "geodesic")
     information, gradient = normal_equations_of(graph, values, variables)
     cost = graph.error(values)
+    slots = slots_of(variables.unknowns)
+    for name, rate in state.rates.items():
+        place = slots[Unknown(UnknownKind.CLOCK_RATE, name)]
+        information[place, place] += RATE**-2
+        gradient[place] += rate / RATE**2
+        cost += 0.5 * (rate / RATE) ** 2
     return basis.T @ information @ basis, basis.T @ gradient, cost

@@ -151,8 +151,8 @@ class Task:
 
     def without_false_jumps(self, found: Settled) -> tuple[Task, Settled]:
         """The task with whole tracks and its optimum, where that is as likely as one that is cut at jumps."""
-        if not self.jumps or found.model.drift is None:
-            return self, found
+        if not self.jumps or found.model.drift is None:  # without a drift a cut changes nothing
+            return replace(self, jumps=()), found
         whole = replace(self, instants=Instants.of(self.data), jumps=())
         walk, systematic = found.model.drift.walk, found.model.features.shape[1] > 0
         again = whole.settle(found.state, found.model.side, walk, systematic=systematic, near=found.fit)
@@ -241,7 +241,8 @@ def thinned(model: NoiseModel) -> NoiseModel:
 
 def moved(state: State, variables: Variables, layout: JointCovariance, d: Array) -> State:
     """The estimate after a change (d,) of the unknowns: frames by right perturbations, scales by their logarithms."""
-    X, Y, scales, offsets = dict(state.X), dict(state.Y), dict(state.scales), dict(state.offsets_s)
+    X, Y, scales = dict(state.X), dict(state.Y), dict(state.scales)
+    clocks = {UnknownKind.TIME_OFFSET: dict(state.offsets_s), UnknownKind.CLOCK_RATE: dict(state.rates)}
     for unknown, place in layout.slots.items():
         change, owner = d[place], unknown.owner
         if unknown.kind is UnknownKind.FRAME:
@@ -252,8 +253,8 @@ def moved(state: State, variables: Variables, layout: JointCovariance, d: Array)
         elif unknown.kind is UnknownKind.SCALE:
             scales[unknown] *= float(np.exp(np.clip(change[0] / scales[unknown], -1.0, 1.0)))
         else:
-            offsets[owner] += float(change[0])
-    return State(X, Y, scales, offsets)
+            clocks[unknown.kind][owner] += float(change[0])
+    return State(X, Y, scales, clocks[UnknownKind.TIME_OFFSET], clocks[UnknownKind.CLOCK_RATE])
 
 
 #: A track has at least this many instants for a drift.

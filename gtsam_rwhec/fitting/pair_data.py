@@ -65,13 +65,23 @@ class PairData:
             paths,
         )
 
-    def at(self, offset_s: float) -> BatchResiduals:
-        """Residuals linearised at a time offset: exact at this offset, with the twists of that instant."""
-        if self.paths is None or offset_s == 0.0:
+    def at(self, offset_s: float, more_s: Array | float = 0.0) -> BatchResiduals:
+        """Residuals linearised at a time offset: exact at this offset, with the twists of that instant.
+
+        By ``more_s`` (N,) A is later beside that.
+        """
+        late_s = offset_s + more_s
+        if self.paths is None or not np.any(late_s):
             return self.residuals
-        twists = self.paths.twists(offset_s)
-        there = self.residuals.A @ self.paths.motion(offset_s)
+        twists = self.paths.twists(late_s)
+        there = self.residuals.A @ self.paths.motion(late_s)
         return BatchResiduals(there @ se3.expmap(-offset_s * twists), self.residuals.B, twists=twists)
+
+    def since_s(self, stamp_ns: int) -> Array:
+        """The time (N,) since a stamp, at which the offset of a clock holds that has a rate."""
+        assert self.stamps_ns is not None
+        found: Array = (self.stamps_ns - stamp_ns) * 1e-9
+        return found
 
     def selected(self, mask: np.ndarray) -> PairData:
         """The measurements that the mask marks, with their twists."""
@@ -103,7 +113,7 @@ def local_paths(
     CountError
         If measurements have no stamps, or their poses determine no motion at most of them.
     OptionError
-        If a sensor has motions of its own.
+        If a sensor has motions of its own, or the logged path is that of the inverse of A.
     """
     stamps_of: dict[Pair, np.ndarray] = {}
     for pair in [pair for pair in problem.pairs if pair.sensor in sensors]:
@@ -119,6 +129,8 @@ def local_paths(
     if not stamps_of:
         return {}
     if carrier_path is not None:
+        for pair, own in stamps_of.items():
+            _check_side(carrier_path, problem.measurements(*pair).A, own, pair)
         return {pair: LocalPaths.along(carrier_path, own) for pair, own in stamps_of.items()}
     stamped = [problem.measurements(*pair) for pair in problem.pairs if not pair.is_motion]
     stamped = [raw for raw in stamped if raw.stamps_ns is not None]
@@ -131,6 +143,21 @@ def local_paths(
     unique, first = np.unique(stamps, return_index=True)
     paths = LocalPaths.of(A[first], unique, "the carriers")
     return {pair: paths.selected(np.searchsorted(unique, own)) for pair, own in stamps_of.items()}
+
+
+#: A path is that of the inverse of A where A's median distance from that is less than this share of its own.
+INVERSE = 0.1
+
+
+def _check_side(path: Trajectory, A: Array, stamps_ns: np.ndarray, pair: Pair) -> None:
+    """Refuse a path of the inverse of A: velocities along it are others, and hide a clock's offset."""
+    there = path.at(stamps_ns)[0]
+    own, other = (float(np.median(np.abs(A - T).max(axis=(1, 2)))) for T in (there, se3.inverse(there)))
+    if other < INVERSE * own:
+        raise OptionError(
+            f"carrier_path has the inverse of A of {pair} (median differences {other:.2g}, and {own:.2g} from A "
+            "itself); give T_sensorcarrier_targetcarrier over time, the inverse of each of its poses"
+        )
 
 
 def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from rwhec_factors.batch import Linearization, Placed, linearized_together, residuals_together
+from rwhec_factors.batch import BatchResiduals, Linearization, Placed, linearized_together, residuals_together
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import NoiseError, NotConvergedWarning, WeightsWarning
@@ -241,8 +241,16 @@ def _placed(data: list[PairData], variables: Variables, state: State) -> list[Pl
         scale = variables.scale_of_pair.get(item.pair)
         offset_s = state.offsets_s.get(item.pair.sensor, 0.0)
         alpha = 1.0 if scale is None else state.scales[scale]
-        found.append(Placed(item.at(offset_s), frames[item.pair.target], frames[item.pair.sensor], alpha, offset_s))
+        X, Y = frames[item.pair.target], frames[item.pair.sensor]
+        found.append(Placed(by_clock(item, variables, state), X, Y, alpha, offset_s))
     return found
+
+
+def by_clock(item: PairData, variables: Variables, state: State) -> BatchResiduals:
+    """A pair's residuals linearised where an estimate has its sensor's clock."""
+    sensor = item.pair.sensor
+    more_s = state.rates[sensor] * item.since_s(variables.rates[sensor]) if sensor in variables.rates else 0.0
+    return item.at(state.offsets_s.get(sensor, 0.0), more_s)
 
 
 @dataclass(frozen=True)

@@ -342,7 +342,7 @@ def normal_equations_of(
                 "(CarrierNoise.about), or take a world origin near the measurements"
             ) from error
     slots = slots_of(variables.unknowns)
-    seen = [unknown for unknown in slots if keys[unknown] in present]
+    seen = [unknown for unknown in slots if keys.get(unknown) in present]
     size = sum(unknown.dimension for unknown in slots)
     information, gradient = np.zeros((size, size)), np.zeros(size)
     if seen:

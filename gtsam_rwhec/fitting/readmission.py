@@ -45,14 +45,15 @@ def agreeing_by_corners(
     """
     cameras = {name: refined.intrinsics[name].camera for name in observations.sensors if name in refined.Y}
     views = {at: v for at, v in observations.views.items() if at[0] in refined.X and at[1] in cameras}
-    stacks, A = stacks_of(replace(observations, cameras=cameras, views=views))
+    stacks, A = stacks_of(replace(observations, cameras=cameras, views=views), refined.graph.model.kind_of)
     found = dict(kept)
     for stack in stacks:
-        pair = Pair(stack.target, stack.sensor)
-        squares, size = _squares(stack, A, refined), 2 * stack.known.sum(axis=1)
-        share = squares / np.maximum(size, 1)
-        limit = np.maximum(chdtri(size, BY_CHANCE) / np.maximum(size, 1), share[kept[pair]].max(initial=0.0))
-        found[pair] = kept[pair] | (share <= limit)
+        size = 2 * stack.known.sum(axis=1)
+        share, chance = _squares(stack, A, refined) / np.maximum(size, 1), chdtri(size, BY_CHANCE) / np.maximum(size, 1)
+        for name, at in stack.pairs:
+            pair = Pair(*name)
+            limit = np.maximum(chance[at], share[at][kept[pair]].max(initial=0.0))
+            found[pair] = kept[pair] | (share[at] <= limit)
     return found
 
 
@@ -61,10 +62,10 @@ def _squares(stack: Stack, A: Array, refined: CornersRefined) -> Array:
     model = replace(refined.graph.model, stacks=(stack,), A=A)
     point = replace(refined.point, A=A)
     rows = model.linearised(stack, point)
-    there = model.by_unknown(stack, rows)
-    index = np.concatenate([np.arange(refined.slots[at].start, refined.slots[at].stop) for at in there])
-    values, vectors = np.linalg.eigh(refined.joint[np.ix_(index, index)])
-    M = np.concatenate(list(there.values()), axis=2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    J = np.concatenate(list(model.by_unknown(stack, rows).values()), axis=2)
+    index = model.columns(stack, refined.slots)[:, : J.shape[2]]
+    values, vectors = np.linalg.eigh(refined.joint[index[:, :, None], index[:, None]])
+    M = J @ stack.each(vectors * np.sqrt(np.maximum(values, 0.0))[:, None])
     if refined.noise.carrier is not None:
         M = np.concatenate([M, rows.by_A @ model.to_right[stack.instant] * refined.noise.carrier], axis=2)
     common = refined.noise.common_px * patterns(model, stack, point, OF_AN_IMAGE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
 
@@ -23,6 +23,8 @@ class UnknownKind(Enum):
     FRAME = "frame"
     SCALE = "scale"
     TIME_OFFSET = "time_offset"
+    #: Of a clock, by how much it is too slow; a nuisance, which no result has.
+    CLOCK_RATE = "clock_rate"
     #: Of a camera: as many parameters as its lens has.
     INTRINSICS = "intrinsics"
     #: Of a board: what is free of its warp.
@@ -86,12 +88,13 @@ def rows_of(slots: Mapping[Unknown, slice], unknowns: Iterable[Unknown]) -> np.n
 
 @dataclass(frozen=True)
 class State:
-    """An estimate: poses by frame, scales (measured / true length), time offsets in seconds by sensor."""
+    """An estimate: poses by frame, scales (measured / true length), time offsets in seconds and rates by sensor."""
 
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
     scales: dict[Unknown, float]
     offsets_s: dict[str, float]
+    rates: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -109,10 +112,12 @@ class Variables:
     fixed: frozenset[str]
     #: The scale of a pair's translations; pairs of known scale are absent.
     scale_of_pair: dict[Pair, Unknown]
+    #: Sensors whose clock has a rate, which is no variable of a graph; and the stamp (ns) at which its offset holds.
+    rates: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
-    def of(problem: Problem, time_offsets: tuple[str, ...]) -> Variables:
-        """The variables of a problem, with time offsets of the named sensors."""
+    def of(problem: Problem, time_offsets: tuple[str, ...], rates: Mapping[str, int] | None = None) -> Variables:
+        """The variables of a problem, with time offsets of the named sensors, and rates of some of these."""
         for name in problem.targets + problem.sensors:
             if Unknown.of(name).kind is not UnknownKind.FRAME:
                 raise FrameError(
@@ -132,6 +137,7 @@ class Variables:
             offsets={name: gtsam.symbol("d", i) for i, name in enumerate(time_offsets)},
             fixed=frozenset(problem.fixed),
             scale_of_pair=scale_of_pair,
+            rates=rates or {},
         )
 
     @property
@@ -148,8 +154,9 @@ class Variables:
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """The unknowns, in the order of ``keys``."""
-        return tuple(u for u in self.keys if u.kind is not UnknownKind.FRAME or u.owner not in self.fixed)
+        """The unknowns, in the order of ``keys``, and the rates."""
+        in_graph = (u for u in self.keys if u.kind is not UnknownKind.FRAME or u.owner not in self.fixed)
+        return (*in_graph, *(Unknown(UnknownKind.CLOCK_RATE, name) for name in self.rates))
 
     def ends(self, pair: Pair) -> tuple[int, int]:
         """Keys of a pair's target and sensor; for motions the sensor's key twice."""
@@ -188,7 +195,8 @@ class Variables:
         """The certified solution as an estimate."""
         of = solution.scale
         scales = {u: of[u.owner] if isinstance(of, dict) else float(of) for u in self.scales}
-        return State(dict(solution.X), dict(solution.Y), scales, dict.fromkeys(self.offsets, 0.0))
+        offsets, rates = (dict.fromkeys(each, 0.0) for each in (self.offsets, self.rates))
+        return State(dict(solution.X), dict(solution.Y), scales, offsets, rates)
 
 
 def carrier_key(index: int) -> int:

@@ -55,9 +55,9 @@ class _Sums:
     fisher: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
-def jacobian_of(pair: Pair, at: Linearization, variables: Variables, joint: JointCovariance) -> tuple[Array, Array]:
+def jacobian_of(item: PairData, at: Linearization, variables: Variables, joint: JointCovariance) -> tuple[Array, Array]:
     """A pair's Jacobian (N, m, u) by the unknowns in its residuals, and their rows in ``joint``."""
-    blocks: dict[Unknown, Array] = {}
+    pair, blocks = item.pair, dict[Unknown, Array]()
     for name, block in ((pair.target, at.target), (pair.sensor, at.sensor)):
         frame = Unknown(UnknownKind.FRAME, name)
         if frame in joint.slots:
@@ -67,6 +67,9 @@ def jacobian_of(pair: Pair, at: Linearization, variables: Variables, joint: Join
         blocks[scale] = at.scale[:, :, None]
     if pair.sensor in variables.offsets:
         blocks[Unknown(UnknownKind.TIME_OFFSET, pair.sensor)] = at.offset[:, :, None]
+    if pair.sensor in variables.rates:
+        since_s = item.since_s(variables.rates[pair.sensor])
+        blocks[Unknown(UnknownKind.CLOCK_RATE, pair.sensor)] = at.offset[:, :, None] * since_s[:, None, None]
     if not blocks:
         return np.zeros((len(at.residual), at.residual.shape[1], 0)), np.zeros(0, dtype=np.int64)
     return np.concatenate(list(blocks.values()), axis=2), joint.rows(tuple(blocks))
@@ -91,7 +94,7 @@ def from_measurements(
         pair, linear = item.pair, at[item.pair]
         C = residual_covariance(item, linear, factors[pair])
         inverse = np.linalg.inv(C)
-        J, rows = jacobian_of(pair, linear, variables, joint)
+        J, rows = jacobian_of(item, linear, variables, joint)
         left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # the expectation of r r'
         whole = measurement_covariance(item, factors[pair])
         whitened = np.einsum("nij,nj->ni", inverse, linear.residual)

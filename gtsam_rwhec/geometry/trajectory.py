@@ -287,14 +287,14 @@ class LocalPaths:
     velocity_variance: Array  #: (6,): mean square error of c_1
     known: np.ndarray  #: (N,): whether the motion is known
 
-    def motion(self, offset_s: float) -> Array:
-        """Expmap(c_1 d + c_2 d^2 + c_3 d^3), (N, 4, 4); d is limited to the window of the fit."""
-        powers = float(np.clip(offset_s, -WINDOW_S, WINDOW_S)) ** np.arange(1, 4)
-        return se3.expmap(np.einsum("k,nki->ni", powers, self.coefficients))
+    def motion(self, offset_s: float | Array) -> Array:
+        """Expmap(c_1 d + c_2 d^2 + c_3 d^3), (N, 4, 4); d (one, or N) is limited to the window of the fit."""
+        powers = np.clip(np.reshape(offset_s, (-1, 1)), -WINDOW_S, WINDOW_S) ** np.arange(1, 4)
+        return se3.expmap((powers[:, :, None] * self.coefficients).sum(axis=1))
 
-    def twists(self, offset_s: float = 0.0) -> Array:
+    def twists(self, offset_s: float | Array = 0.0) -> Array:
         """Velocities (N, 6) at the stamps plus an offset, [omega rad/s, v m/s], in the moved carrier's own axes."""
-        if offset_s == 0.0:
+        if not np.any(offset_s):
             return self.coefficients[:, 0]
         h = 1e-4
         return se3.logmap(se3.inverse(self.motion(offset_s - h)) @ self.motion(offset_s + h)) / (2.0 * h)

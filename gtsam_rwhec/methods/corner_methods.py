@@ -25,7 +25,7 @@ FLAT = np.zeros(SHAPE)
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Observations as stacks, with the carriers' poses A (I, 4, 4) of all instants.
+    """Observations as stacks of one target each, with the carriers' poses A (I, 4, 4) of all instants.
 
     Frames are numbered: targets first, then sensors; `frames` (n, 4, 4) below are their poses X and Y in that order.
     """
@@ -39,7 +39,7 @@ class Corners:
     @staticmethod
     def of(observations: Observations) -> Corners:
         """The corners of observations."""
-        stacks, A = stacks_of(observations)
+        stacks, A = stacks_of(observations, str)
         return Corners(observations.targets, observations.sensors, stacks, A, observations.corner_px)
 
     @property
@@ -54,7 +54,7 @@ class Corners:
 
     def frames_of(self, stack: Stack) -> tuple[int, int]:
         """The numbers of a stack's target and sensor."""
-        return self.targets.index(stack.target), len(self.targets) + self.sensors.index(stack.sensor)
+        return self.targets.index(stack.targets[0]), len(self.targets) + self.sensors.index(stack.sensor)
 
     def rows(self, stack: Stack, frames: Array) -> Linear:
         """Errors of a stack in pixels, with derivatives, by the measured A; infinite behind the camera."""

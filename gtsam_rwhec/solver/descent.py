@@ -111,11 +111,13 @@ def spectral_start(part: Part, rotation: BlockMatrix) -> list[Array]:
     if is_anchored:
         r = _smallest(factor, weight, np.ones(matrix.size))
         return [so3_nearest(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
-    # Components that only the shared scale joins each have an eigenvector and a sign.
+    # Components that only the shared scale joins each have an eigenvector and a sign; those of known frames have none.
     r = np.zeros(9 * n)
     place = {name: i for i, name in enumerate(part.free)}
     for names in connected_components(part.pairs) if part.scale == "shared" else [list(part.free)]:
         members = np.array([place[name] for name in names if name in place], dtype=int)
+        if not members.size:
+            continue
         begin = np.zeros((n, 9))
         begin[members] = np.random.default_rng(0).standard_normal((len(members), 9))
         v = _smallest(factor, weight, np.append(begin.ravel(), 0.0))[:-1]

@@ -6,11 +6,15 @@ import gtsam
 import numpy as np
 import pytest
 from rwhec_factors import se3
+from said import choice
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.clock_offsets import FEWEST_STAMPS, Clock, offsets_worth_estimating
+from gtsam_rwhec.fitting import clock_rates
+from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.geometry import Trajectory
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
@@ -214,3 +218,63 @@ def test_the_clock_of_a_sensor_that_the_option_leaves_out_is_not_passed_over() -
     assert "the clock of cam" not in found.verdict_reason
     assert list(found.time_offsets_s) == ["cam"]
     assert rw.Ground.LATE_CLOCK not in rw.calibrate(problem, rw.CalibrateOptions(time_offsets=True)).judgement.grounds
+
+
+def stream_with(rate: float, seed: int) -> rw.Problem:
+    """A stream of half a minute, whose clock is 5 ms late in its middle, and too slow by a rate."""
+    seconds = np.arange(300) / 10.0 + 0.5
+    late_s = 0.005 + rate * (seconds - seconds.mean())
+    stamps = np.round(seconds * 1e9).astype(np.int64)
+    true = np.linalg.inv(Y) @ road(seconds + late_s) @ X
+    B = perturb(true, Noise(0.001, 0.5 / np.radians(0.1) ** 2), np.random.default_rng(seed))
+    problem = rw.Problem()
+    problem.add("tag", "cam", logged().at(stamps)[0], B, stamps_ns=stamps)
+    return problem
+
+
+def rate_found(found: rw.Calibration) -> clock_rates.ClockRate:
+    assert found.noise.model is not None
+    (clock,) = found.noise.model.clocks
+    return clock
+
+
+ALONG = rw.CalibrateOptions(carrier_path=logged(), time_offsets=True)
+
+
+@pytest.mark.parametrize("rate", [4e-4, -1e-4])
+def test_a_stretched_clock_is_found_and_taken_off(rate: float) -> None:
+    found = rw.calibrate(stream_with(rate, 1), ALONG)
+    clock = rate_found(found)
+    assert clock.is_sure
+    assert clock.rate == pytest.approx(rate, abs=4.0 * clock.deviation)
+    assert found.time_offsets_s["cam"] == pytest.approx(0.005, abs=2e-4)
+    assert found.verdict is rw.Verdict.USE
+    assert found.contains("cam", Y)
+    assert choice(found, "rate of the clock of cam").evidence == str(clock)
+
+
+def test_a_right_clock_is_not_accused() -> None:
+    found = rw.calibrate(stream_with(0.0, 2), ALONG)
+    assert not rate_found(found).is_sure
+    assert found.outliers.number == 0
+    assert found.contains("cam", Y)
+
+
+def test_a_rate_that_is_an_unknown_costs_nothing() -> None:
+    """The deviations are at most 2 % larger than with a rate that is known."""
+    problem = stream_with(0.0, 3)
+    found = under_noise(problem, rw.solve(problem), ALONG.refinement(time_offsets=True)).settled
+    C = found.model.evaluate(found.fit.sizes.values(found.fit.logs)).covariance  # the rate is its last direction
+    known = C[:-1, :-1] - np.outer(C[:-1, -1], C[:-1, -1]) / C[-1, -1]
+    assert (np.diagonal(C)[:-1] <= 1.02**2 * np.diagonal(known)).all()
+
+
+def test_without_a_path_or_with_few_stamps_no_rate_is_an_unknown() -> None:
+    seconds = np.arange(200) / 10.0
+    problem = rw.Problem()
+    problem.add("tag", "cam", road(seconds), road(seconds), stamps_ns=np.round(seconds * 1e9).astype(np.int64))
+    assert clock_rates.clocks_with_rate(problem, ("cam",), logged()) == {"cam": 9_950_000_000}
+    assert clock_rates.clocks_with_rate(problem, ("cam",), None) == {}
+    assert clock_rates.clocks_with_rate(problem, (), logged()) == {}
+    few = selected(problem, {problem.pairs[0]: np.arange(200) < 99})
+    assert clock_rates.clocks_with_rate(few, ("cam",), logged()) == {}

@@ -138,6 +138,12 @@ def test_it_is_named_and_repaired_on_request() -> None:
     np.testing.assert_allclose(repaired.Y["cam"].matrix(), Y, atol=0.01)
 
 
+def test_where_nothing_slipped_the_choices_say_so() -> None:
+    asked = rw.calibrate(slipped(stations(24, 9), ()), rw.CalibrateOptions(repair=True))
+    assert [one.chosen for one in asked.choices if one.what == "rows of A and B"] == ["as they are"]
+    assert rw.Ground.ROWS_REPAIRED not in asked.judgement.grounds
+
+
 def test_rows_that_are_all_shifted_are_repaired_too() -> None:
     A = stations(25, 10)
     problem = rw.Problem()

@@ -137,6 +137,8 @@ def test_rows_that_slipped_are_repaired_on_request(tmp_path: Path) -> None:
     assert status == 0, said
     assert (tmp_path / "report.html").is_file()  # of the rows where they belong, one fewer than were read
     assert "Use these poses with care: 10 rows were shifted and 1 left out" in " ".join(said.split())
+    status, said = command("calibrate", DEMO, "--repair")
+    assert (status, "--repair: no rows slipped" in said) == (0, True)
     status, said = command("calibrate", folder, "--repair", "--as-read")
     assert (status, "give one" in said) == (2, True)
 

@@ -44,7 +44,7 @@ class NativeGraph:
         }
         self.y = {name: key_of("y", i) for i, name in enumerate(model.sensors)}
         self.k = {name: key_of("k", i) for i, name in enumerate(model.camera_priors)}
-        self.points = model.stacks[0].points
+        (self.points,) = model.stacks[0].points
         self.graph = gtsam.NonlinearFactorGraph()
         self._add_priors()
         pixel_noise = gtsam.noiseModel.Isotropic.Sigma(2, model.corner_px)

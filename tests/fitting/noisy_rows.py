@@ -62,8 +62,10 @@ SIGMA = {
 }  # fmt: skip
 
 
-def task_of(problem: rw.Problem, solution: rw.Solution, offsets: tuple[str, ...] = ()) -> Task:
-    variables = Variables.of(problem, offsets)
+def task_of(
+    problem: rw.Problem, solution: rw.Solution, offsets: tuple[str, ...] = (), rates: dict[str, int] | None = None
+) -> Task:
+    variables = Variables.of(problem, offsets, rates)
     paths = local_paths(problem, offsets)
     data = [PairData.of(problem, pair, RefineOptions(), paths.get(pair)) for pair in problem.pairs]
     space = free_space_of(parts_of(problem), variables, variables.start(solution), data)

@@ -238,10 +238,10 @@ def moving(
     twist = np.random.default_rng(seed).normal(size=(1 if alike else len(A), 6)) * speed
     views = {}
     for stack in stacks:
-        view = given.observations.views[stack.target, stack.sensor]
+        view = given.observations.views[stack.targets[0], stack.sensor]
         of_view = np.broadcast_to(twist, (len(A), 6))[stack.instant]
         before = view.A @ se3.expmap(-offsets_s.get(stack.sensor, 0.0) * of_view)
-        views[stack.target, stack.sensor] = replace(view, A=before, twist=of_view)
+        views[stack.targets[0], stack.sensor] = replace(view, A=before, twist=of_view)
     return replace(given, observations=replace(given.observations, views=views))
 
 
@@ -256,7 +256,7 @@ def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = 
     model = Model(
         stacks, A, None if exact else A_NOISE, about, {name: name for name in names},  # type: ignore[arg-type]
         {name: prior_of(cameras[name], "nominal") for name in names}, {"board": np.full(4, 1e-3)}, CORNER_PX,
-        tuple(stack.known.astype(float) for stack in stacks),
+        tuple(stack.known.astype(float) for stack in stacks), bias_px={"board": 0.0},
     )  # fmt: skip
     rng = np.random.default_rng(7)
     moved = A if exact else A @ se3.expmap(rng.normal(size=(len(A), 6)) * A_NOISE)

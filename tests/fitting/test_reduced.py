@@ -12,7 +12,7 @@ from simulated_cells import Placement, cell, model_and_point
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.fitting.common_errors import whitened
+from gtsam_rwhec.fitting.common_errors import whitened, whitener
 from gtsam_rwhec.fitting.corner_checks import GROWS, farthest, grows_by_noise
 from gtsam_rwhec.fitting.corner_model import Point
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced
@@ -59,9 +59,9 @@ def test_change_is_a_share() -> None:
 
 def test_whitened_rows_have_the_inverse_of_the_variance() -> None:
     P, rows = np.random.default_rng(0).normal(size=(2, 1, 8, 3))
-    W = whitened(np.eye(8)[None], P)[0]
+    W = whitened(np.eye(8)[None], whitener(P))[0]
     np.testing.assert_allclose(W @ W, np.linalg.inv(np.eye(8) + P[0] @ P[0].T), atol=1e-12)
-    np.testing.assert_allclose(whitened(rows, P)[0], W @ rows[0], atol=1e-12)
+    np.testing.assert_allclose(whitened(rows, whitener(P))[0], W @ rows[0], atol=1e-12)
 
 
 def test_what_the_corners_of_an_image_share_is_found_and_widens_the_covariance() -> None:
@@ -69,9 +69,9 @@ def test_what_the_corners_of_an_image_share_is_found_and_widens_the_covariance()
     without = rw.refine_corners(given.observations, given.X, given.Y)
     model, rng, views = without.graph.model, np.random.default_rng(0), dict(given.observations.views)
     for stack in model.stacks:
-        P, view = patterns(model, stack, without.point, OF_AN_IMAGE), views[stack.target, stack.sensor]
+        P, view = patterns(model, stack, without.point, OF_AN_IMAGE), views[stack.targets[0], stack.sensor]
         shared = P @ rng.normal(0.0, 0.05, (len(P), P.shape[2], 1))
-        views[stack.target, stack.sensor] = Views(view.A, view.pixels + shared.reshape(view.pixels.shape))
+        views[stack.targets[0], stack.sensor] = Views(view.A, view.pixels + shared.reshape(view.pixels.shape))
     shared = replace(given.observations, views=views)
     found = rw.refine_corners(shared, given.X, given.Y)
     assert "all corners of an image are off together by 0.0" in str(numbers_of(shared, found, rw.CornerOptions()))

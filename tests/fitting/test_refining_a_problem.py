@@ -149,12 +149,12 @@ def test_clocks_are_unknowns_of_the_corners_too() -> None:
     twist, near_s = np.zeros((len(A), 6)), 0.05 * np.arange(-6, 7)
     problem = rw.Problem()
     for stack in stacks:
-        view, sensor = moved.observations.views[stack.target, stack.sensor], stack.sensor
+        view, sensor = moved.observations.views[stack.targets[0], stack.sensor], stack.sensor
         assert view.twist is not None
         twist[stack.instant] = view.twist
         stamps = at_ns[stack.instant] - round(1e9 * late_s[sensor])
         camera = given.observations.cameras[sensor]
-        problem.add_corners(stack.target, sensor, view.A, view.pixels, stack.points, camera, stamps_ns=stamps)
+        problem.add_corners(stack.targets[0], sensor, view.A, view.pixels, stack.points[0], camera, stamps_ns=stamps)
     steps = np.einsum("k,ni->nki", near_s, twist).reshape(-1, 6)
     poses = np.repeat(A, len(near_s), axis=0) @ se3.expmap(steps)
     path = Trajectory.of((at_ns[:, None] + np.round(1e9 * near_s).astype(int)).ravel(), poses, "the arm")

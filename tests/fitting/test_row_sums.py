@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gtsam_rwhec.fitting.corner_model import Rows, few_rows
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.fitting.corner_model import Rows, Sums
+from gtsam_rwhec.fitting.corner_residuals import Stack
 
 
 @settings(max_examples=15, deadline=None)
@@ -28,13 +30,26 @@ def test_few_rows_have_the_sums_of_all_rows(V: int, n: int, free: bool, hidden: 
     of_all = Rows(J, B if free else None, r)
     expected = np.einsum("vri,vrj->ij", every, every)
     size = np.sqrt(np.maximum(np.diagonal(expected), 1e-300))
-    assert of_all.squares() / size / size[:, None] == pytest.approx(expected / size / size[:, None], abs=1e-12)
+    stack = images_of(V, n)
+    assert of_all.squares(stack)[0] / size / size[:, None] == pytest.approx(expected / size / size[:, None], abs=1e-12)
     assert of_all.times(J_A) / size == pytest.approx(J_A.transpose(0, 2, 1) @ every / size, abs=1e-9)
-    of_A, R, together = few_rows(of_all, J_A)
+    columns, slots = np.arange(len(size) - 1)[None], {("x", "board"): slice(0, len(size) - 1)}
+    with_A, without = Sums.zeros(V, slots), Sums.zeros(V, slots)
+    with_A.add(stack, columns, of_all, J_A)
+    of_A, R, together = with_A.few_rows()
     sums = together.T @ together + np.einsum("vri,vrj->ij", of_A, of_A)
     assert sums / size / size[:, None] == pytest.approx(expected / size / size[:, None], abs=1e-12)
     assert R.transpose(0, 2, 1) @ of_A / size == pytest.approx(J_A.transpose(0, 2, 1) @ every / size, abs=1e-9)
     assert R.transpose(0, 2, 1) @ R == pytest.approx(J_A.transpose(0, 2, 1) @ J_A, abs=1e-9)
-    none, _, alone = few_rows(of_all, None)
-    assert len(none) == 0
+    without.add(stack, columns, of_all, None)
+    none, _, alone = without.few_rows()
+    assert not none.any()
     assert alone.T @ alone / size / size[:, None] == pytest.approx(expected / size / size[:, None], abs=1e-12)
+
+
+def images_of(V: int, n: int) -> Stack:
+    """Images of one target, each at an instant of its own."""
+    none, camera = np.zeros((V, n, 2)), Camera(2, 2, "pinhole", np.eye(3), np.zeros(0))
+    return Stack(
+        ("board",), "camera", np.zeros(V, int), np.arange(V), np.zeros((1, n, 3)), none, none[..., 0] > 0, camera
+    )

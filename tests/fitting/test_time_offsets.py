@@ -239,6 +239,15 @@ def test_twists_along_a_path_are_its_velocity() -> None:
         LocalPaths.along(fast_path(), np.array([90_000_000_000]))
 
 
+def test_a_path_of_the_inverse_is_refused() -> None:
+    path = fast_path()
+    with pytest.raises(rw.errors.OptionError, match="inverse of A"):
+        refined(
+            slow_problem(path, 0.004), time_offsets=True,
+            carrier_path=Trajectory.of(path.stamps_ns, np.linalg.inv(path.T)),
+        )  # fmt: skip
+
+
 def test_a_logged_path_determines_the_offset_of_a_slow_camera() -> None:
     problem = slow_problem(fast_path(), 0.004)
     r = refined(problem, time_offsets=True, carrier_path=fast_path())

@@ -404,3 +404,19 @@ def test_parts_are_certified_together() -> None:
     assert worse.status == "gap"
     assert worse.cost > certificate.cost
     assert worse.lower_bound == pytest.approx(certificate.lower_bound, rel=1e-9)
+
+
+def test_a_known_sensor_may_tell_the_scale_of_another_one() -> None:
+    """Of the second sensor every frame is known: only the scale joins it to the first, and no rotation is sought."""
+    poses = random_poses(14, 1.0, np.random.default_rng(5))
+    T_carrier_sensor, scale = {"cam": poses[0], "known": poses[1]}, 0.7
+    problem = rw.Problem("shared")
+    for (name, Y), A in zip(T_carrier_sensor.items(), (poses[2:8], poses[8:]), strict=True):
+        B = np.linalg.inv(Y) @ A @ Y
+        B[:, :3, 3] *= scale
+        problem.add_motion(name, A, B, 0.01, 5e3)
+    problem.fix("known", T_carrier_sensor["known"])
+    solution = rw.solve(problem)
+    assert solution.certificate.is_certified
+    assert solution.scale == pytest.approx(scale, rel=1e-9)
+    np.testing.assert_allclose(solution.Y["cam"].matrix(), T_carrier_sensor["cam"], atol=1e-8)
