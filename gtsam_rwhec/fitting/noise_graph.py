@@ -47,6 +47,8 @@ COLUMNS = 70
 LINEAR = 1e-2
 #: An answer whose next step is longer than this, in standard deviations, has not converged.
 CONVERGED = 0.1
+#: Steps that have become no shorter so often go round in a circle.
+IN_A_CIRCLE = 10
 #: The translation's step in a drift is at least this part of what the rotation's step adds to it by its lever.
 SMALLEST_STEP = 1e-2
 #: The key of the coefficients of the systematic errors.
@@ -301,16 +303,24 @@ def refined_of(
 def _optimum(
     task: Task, settled: Settled, sigma: dict[C, float], max_iterations: int
 ) -> tuple[State, NoiseModel, Estimate, int]:
-    """The optimum of the unknowns and all effects together by Gauss and Newton's steps, and the number of these."""
-    state, model = settled.state, settled.model
+    """The optimum of the unknowns and all effects together by Gauss and Newton's steps, and the number of these.
+
+    Steps that become no shorter go round in a circle: then they end.
+    """
+    state, model, iteration = settled.state, settled.model, 0
     estimate = model.evaluate(sigma)
+    shortest, since = estimate.farthest, 0
     for iteration in range(1, max_iterations + 1):
         state = moved(state, task.variables, task.layout, model.basis @ estimate.step)
         if estimate.farthest < LINEAR:
             return state, model, estimate, iteration
         model = task.model_like(model, state)
         estimate = model.evaluate(sigma)
-    return state, model, estimate, max_iterations
+        since = 0 if estimate.farthest < shortest else since + 1
+        shortest = min(shortest, estimate.farthest)
+        if since == IN_A_CIRCLE:
+            break
+    return state, model, estimate, iteration
 
 
 def _cost_without_effects(task: Task, model: NoiseModel, sigma: dict[C, float], state: State) -> float:
