@@ -154,7 +154,7 @@ def _without_constant_errors(row: RobotRow) -> Array:
         carrier = int(frame.kind == "sensor")
         deviations = np.array(row.constant_errors[carrier])
         shifts[carrier, 6 * i : 6 * i + 6] = se3.adjoint(se3.inverse(frame.T)[None])[0] * deviations
-    rest = less_common_errors(finite, shifts)
+    rest = less_common_errors(finite, np.einsum("kma,kna->mn", shifts, shifts))
     return finite if rest is None else rest
 
 

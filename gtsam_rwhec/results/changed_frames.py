@@ -14,6 +14,7 @@ from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
 from gtsam_rwhec.results.common_quantities import Movement, Quantities, less_common_errors, numbers_of, quantities
 from gtsam_rwhec.results.result_file import Result
@@ -301,11 +302,19 @@ def without_constant_errors(result: Result) -> RefinedPoses:
     if fields is None or not has_constant_errors(result):
         return refined
     joint = refined.joint
-    shifts = np.zeros((2, len(joint.finite), 6))
-    for shift, poses, deviations in zip(shifts, (refined.X, refined.Y), fields.constant_errors, strict=True):
+    rest = less_common_errors(joint.finite, constant_covariance(refined, fields.constant_errors))
+    return refined if rest is None else replace(refined, joint=replace(joint, finite=rest))
+
+
+def constant_covariance(refined: RefinedPoses, constant_errors: tuple[tuple[float, ...], ...]) -> Array:
+    """The part (d, d) of the covariance of all unknowns that a constant error of A makes, by its deviations."""
+    joint = refined.joint
+    total = np.zeros_like(joint.finite)
+    for poses, deviations in zip((refined.X, refined.Y), constant_errors, strict=False):
+        shift = np.zeros((len(total), 6))
         for name, pose in poses.items():
             unknown = Unknown(UnknownKind.FRAME, name)
             if unknown in joint.slots:
                 shift[joint.slots[unknown]] = pose.inverse().AdjointMap() * np.array(deviations)
-    rest = less_common_errors(joint.finite, shifts)
-    return refined if rest is None else replace(refined, joint=replace(joint, finite=rest))
+        total += shift @ shift.T
+    return total

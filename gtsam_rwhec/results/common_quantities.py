@@ -174,13 +174,9 @@ def numbers_of(refined: RefinedPoses, unknown: Unknown) -> Array:
 ROUNDING = 1e-9
 
 
-def less_common_errors(covariance: Array, shifts: Array) -> Array | None:
-    """A covariance (m, m) less those of errors that several estimates share; None where it is smaller than these.
-
-    ``shifts`` (k, m, 6) are how each of k independent errors moves all numbers, for one standard deviation along each
-    of its axes.
-    """
-    rest: Array = covariance - sum(shift @ shift.T for shift in shifts)
+def less_common_errors(covariance: Array, common: Array) -> Array | None:
+    """A covariance (m, m) less that of errors which several estimates share; None where it is smaller than this."""
+    rest: Array = covariance - common
     has = np.diagonal(covariance) > 0.0
     size = np.sqrt(np.maximum(np.diagonal(rest), 0.0))[has]
     if not (size > 0.0).all():
