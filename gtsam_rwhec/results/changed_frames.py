@@ -305,14 +305,7 @@ def without_constant_errors(result: Result) -> RefinedPoses:
     if fields is None or not has_constant_errors(result):
         return refined
     joint = refined.joint
-    finite = joint.finite.copy()
-    for poses, deviations in zip((refined.X, refined.Y), fields.constant_errors, strict=True):
-        shift = np.zeros((len(finite), 6))
-        for name, pose in poses.items():
-            unknown = Unknown(UnknownKind.FRAME, name)
-            if unknown in joint.slots:
-                shift[joint.slots[unknown]] = pose.inverse().AdjointMap() * np.array(deviations)
-        finite -= shift @ shift.T
+    finite = joint.finite - constant_covariance(refined, fields.constant_errors)
     size = np.sqrt(np.maximum(np.diagonal(finite), 0.0))
     has = np.diagonal(joint.finite) > 0.0
     if not (size[has] > 0.0).all():
@@ -321,3 +314,17 @@ def without_constant_errors(result: Result) -> RefinedPoses:
     if np.linalg.eigvalsh(correlations).min(initial=0.0) < -ROUNDING:
         return refined
     return replace(refined, joint=replace(joint, finite=finite))
+
+
+def constant_covariance(refined: RefinedPoses, constant_errors: tuple[tuple[float, ...], ...]) -> Array:
+    """The part (d, d) of the covariance of all unknowns that a constant error of A makes, by its deviations."""
+    joint = refined.joint
+    total = np.zeros_like(joint.finite)
+    for poses, deviations in zip((refined.X, refined.Y), constant_errors, strict=False):
+        shift = np.zeros((len(total), 6))
+        for name, pose in poses.items():
+            unknown = Unknown(UnknownKind.FRAME, name)
+            if unknown in joint.slots:
+                shift[joint.slots[unknown]] = pose.inverse().AdjointMap() * np.array(deviations)
+        total += shift @ shift.T
+    return total
