@@ -1,4 +1,4 @@
-"""Simulated cells that a plan is tried on: an arm's noise, cameras that project boards, and an operator who takes them."""
+"""Simulated cells that plans are tried on: an arm's noise, cameras that project boards, and takes of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gtsam_rwhec.cameras.targets import Charuco, Checkerboard
 
 Array = NDArray[np.float64]
 KINDS = ("hand", "fixed", "two cameras", "three boards")
-#: Of each frame's guess, rad and m about and along each axis.
+#: Of each sensor's guess, rad and m about and along each axis.
 GUESS_RAD, GUESS_M = np.radians(5.0), 0.03
 #: The limits of every pose, planned or random: tilt and turn in degrees, and half of the box about the present pose, m.
 TILT_DEG, TURN_DEG, BOX_M = 60.0, 90.0, 0.4
@@ -51,15 +51,21 @@ class TrueCell:
             moves="targets" if self.kind == "fixed" else "sensors", stated="exact",
         )  # fmt: skip
 
+    def whole(self, target: str, sensor: str, A: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """A board's corners in images at A (N, 4, 4), exact (N, n, 2), and where it is whole in front of the camera."""
+        B = se3.inverse(self.Y[sensor]) @ A @ self.X[target]
+        pixels = self.cameras[sensor].project(self.boards[target] @ B[:, :3, :3].transpose(0, 2, 1) + B[:, None, :3, 3])
+        faces = np.einsum("ni,ni->n", B[:, :3, 2], B[:, :3, 3]) < 0.0
+        return pixels, faces & self.cameras[sensor].inside(pixels).all(axis=1)
+
     def pixels(self, target: str, sensor: str, A: Array) -> Array | None:
         """A board's corners in an image, exact; None where it is not whole in front of the camera."""
-        B = se3.inverse(self.Y[sensor]) @ A @ self.X[target]
-        pixels = self.cameras[sensor].project(self.boards[target] @ B[:3, :3].T + B[:3, 3])
-        return pixels if self.cameras[sensor].inside(pixels).all() and (B[:3, 2] @ B[:3, 3]) < 0.0 else None
+        pixels, is_whole = self.whole(target, sensor, A[None])
+        return pixels[0] if is_whole[0] else None
 
-    def sees(self, A: Array) -> bool:
-        """Whether any camera sees any board."""
-        return any(self.pixels(target, sensor, A) is not None for target in self.X for sensor in self.Y)
+    def sees(self, A: Array) -> NDArray[np.bool_]:
+        """Whether any camera sees any board, at A (N, 4, 4)."""
+        return np.any([self.whole(target, sensor, A)[1] for target in self.X for sensor in self.Y], axis=0)
 
     def take(self, problem: rw.Problem, A: Array, stamp: int) -> int:
         """Measure at a pose; how many boards were seen."""
@@ -84,15 +90,19 @@ class TrueCell:
         return np.asarray(se3.inverse(moved_by(se3.inverse(A[None]), xi))[0])
 
     def random_poses(self, count: int, turn_deg: float) -> Array:
-        """A (n, 4, 4) at random in the box, turned by up to so much: uniform, kept where a camera sees a whole board."""
+        """A (n, 4, 4), uniform in the box and turned by up to so much, where a camera sees a whole board."""
         found: list[Array] = []
         T_now = self._moving(self.present)
         while len(found) < count:
             turns = self.rng.standard_normal((BATCH, 3))
-            turns *= np.radians(turn_deg) * self.rng.random((BATCH, 1)) ** (1.0 / 3.0) / np.linalg.norm(turns, axis=1)[:, None]
+            turns *= (
+                np.radians(turn_deg)
+                * self.rng.random((BATCH, 1)) ** (1.0 / 3.0)
+                / np.linalg.norm(turns, axis=1)[:, None]
+            )
             place = T_now[:3, 3] + self.rng.uniform(-BOX_M, BOX_M, (BATCH, 3))
             T = se3.pose(T_now[:3, :3] @ Rotation.from_rotvec(turns).as_matrix(), place)
-            found += [A for A in self._moving(T) if self.sees(A)]
+            found += [*(A := self._moving(T))[self.sees(A)]]
         return np.array(found[:count])
 
     def _moving(self, T: Array) -> Array:
@@ -104,7 +114,9 @@ def _looking(rng: np.random.Generator, camera: Camera, distance: float, tilt: fl
     pixel = 0.5 * np.array([camera.width, camera.height]) * (1.0 + aside * rng.uniform(-1.0, 1.0, 2))
     ray = np.append((pixel - camera.K[:2, 2]) / camera.K[0, 0], 1.0)
     about, roll = rng.uniform(-np.pi, np.pi, 2)
-    R = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0])).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    R = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0])).as_matrix() @ np.diag(
+        [1.0, -1.0, -1.0]
+    )
     R = R @ Rotation.from_rotvec([0.0, 0.0, roll]).as_matrix()
     return np.asarray(se3.pose(R, distance * ray / np.linalg.norm(ray)))
 
@@ -132,18 +144,14 @@ def cell(kind: str, seed: int) -> TrueCell:
     X = {"board_0": se3.pose(turn[1], place[1])}
     for i in range(1, len(boards)):
         aside = np.array([0.35 * np.cos(2.5 * i), 0.35 * np.sin(2.5 * i), 0.05 * i])
-        X[f"board_{i}"] = X["board_0"] @ moved_by(np.eye(4)[None], np.concatenate([rng.uniform(-0.4, 0.4, 3), aside])[None])[0]
+        X[f"board_{i}"] = (
+            X["board_0"] @ moved_by(np.eye(4)[None], np.concatenate([rng.uniform(-0.4, 0.4, 3), aside])[None])[0]
+        )
     B = _looking(rng, first, rng.uniform(0.5, 0.8), rng.uniform(0.0, 0.3), aside=0.1)
     present = Y["cam_0"] @ B @ se3.inverse(X["board_0"])
     about = "targetcarrier" if kind == "fixed" else "sensorcarrier"
     noise = rw.CarrierNoise(np.radians(rng.uniform(0.01, 0.03)), rng.uniform(5e-5, 2e-4), about=about)
-    guesses = {
-        name: moved_by(T[None], white(1, GUESS_RAD, GUESS_M, rng))[0] for name, T in Y.items()
-    }
-    # what is on the targets' carrier was seen from the present pose, through the guess of the camera
-    for name, T in X.items():
-        guesses[name] = se3.inverse(present) @ guesses["cam_0"] @ se3.inverse(Y["cam_0"]) @ present @ T
-        guesses[name] = moved_by(guesses[name][None], white(1, 0.2 * GUESS_RAD, 0.2 * GUESS_M, rng))[0]
+    guesses = {name: moved_by(T[None], white(1, GUESS_RAD, GUESS_M, rng))[0] for name, T in Y.items()}
     return TrueCell(
         kind, X, Y, cameras, {f"board_{i}": one for i, one in enumerate(boards)}, noise, rng.uniform(0.1, 0.2),
         present, guesses, rng,

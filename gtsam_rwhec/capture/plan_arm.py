@@ -123,7 +123,7 @@ class Arm:
             off = se3.logmap(se3.inverse(T) @ wanted)
             if np.abs(off).max(initial=0.0) < 0.1 * REACHED:
                 break
-            damping = np.minimum(DAMPING, np.linalg.norm(off, axis=1)) ** 2
+            damping = np.clip(np.linalg.norm(off, axis=1), 1e-5, DAMPING) ** 2
             H = J @ J.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
             step = (J.transpose(0, 2, 1) @ np.linalg.solve(H, off[:, :, None]))[:, :, 0]
             step /= np.maximum(np.abs(step).max(axis=1, initial=0.0) / LARGEST_STEP, 1.0)[:, None]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from gtsam_rwhec.capture.plan_cell import Cell, in_front, nearest_m
-from gtsam_rwhec.capture.plan_information import by_corners, predicted
+from gtsam_rwhec.capture.plan_information import by_corners, by_frames, predicted
 from gtsam_rwhec.capture.plan_options import PlanOptions
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.problem.measurements import Pair
@@ -22,7 +22,7 @@ BATCH, MOST_BATCHES = 2000, 10
 #: Without limits of distance, targets are so many times as near or as far as they were.
 AROUND = 1.7
 #: A target is surely seen if its corners stay in the image although the frames are off by so many of their deviations.
-SURELY = 3.0
+SURELY = 4.0
 #: One radian counts as so many metres in the length of a tour.
 METRES_A_RADIAN = 0.3
 
@@ -83,9 +83,7 @@ def moving_pose(A: Array, options: PlanOptions) -> Array:
     return se3.inverse(A) if options.moves == "sensors" else A
 
 
-def drawn_candidates(
-    cell: Cell, options: PlanOptions, covariance: Array, rng: np.random.Generator
-) -> Candidates:
+def drawn_candidates(cell: Cell, options: PlanOptions, covariance: Array, rng: np.random.Generator) -> Candidates:
     """Candidates about the present pose, as many as the options ask for, if there are as many.
 
     ``covariance`` (d, d) is that of the unknowns: what they leave open must not take a target out of an image.
@@ -94,7 +92,11 @@ def drawn_candidates(
     found: list[Candidates] = []
     drawn = visible = within = reached = 0
     for _ in range(MOST_BATCHES if pairs else 0):
-        A = np.concatenate([_drawn(cell, options, pair, present, BATCH // len(pairs), rng) for pair in pairs])
+        if options.arm is not None and len(options.arm.names) < 6:  # other poses it cannot have
+            T = options.arm.hand(rng.uniform(*options.arm.limits, (BATCH, len(options.arm.names))))[0]
+            A = moving_pose(T, options)
+        else:
+            A = np.concatenate([_drawn(cell, options, pair, present, BATCH // len(pairs), rng) for pair in pairs])
         drawn += len(A)
         margins = seen_at(cell, options, A, covariance)
         seen = {pair: probability(margin) for pair, margin in margins.items()}
@@ -138,9 +140,7 @@ def spacing_m(board: Array) -> float:
     return float(np.median(cKDTree(board).query(board, k=2)[0][:, 1]))
 
 
-def _drawn(
-    cell: Cell, options: PlanOptions, pair: Pair, present: Array, count: int, rng: np.random.Generator
-) -> Array:
+def _drawn(cell: Cell, options: PlanOptions, pair: Pair, present: Array, count: int, rng: np.random.Generator) -> Array:
     """A (n, 4, 4) at which a target is before a sensor: anywhere in its image, near and far, tilted and turned."""
     distance = np.exp(rng.uniform(*np.log(_limits_m(cell, options, pair, present)), count))
     if pair.sensor in cell.kit.cameras:
@@ -219,7 +219,7 @@ def seen_at(cell: Cell, options: PlanOptions, A: Array, covariance: Array) -> di
 
 
 def probability(margin: Array) -> Array:
-    """How probably a target is seen, by the margin of its worst corner; 0 where the frames as they are do not say so."""
+    """How probably a target is seen, by the margin of its worst corner; 0 where the frames do not say so."""
     return np.where(margin >= SURELY, 1.0, np.where(margin >= 0.0, ndtr(margin), 0.0))
 
 
@@ -234,13 +234,8 @@ def _margins(cell: Cell, pair: Pair, A: Array, covariance: Array, size: Array) -
     board = cell.kit.boards[pair.target]
     outer = np.unique([pick(board @ way) for way in _WAYS for pick in (np.argmin, np.argmax)])
     pixels, by_B, *_ = by_corners(cell, pair, A, board[outer])
-    by_frames = np.zeros((len(A), by_B.shape[1], len(covariance)))
-    B = predicted(cell, pair, A)
-    if pair.target in cell.slots:
-        by_frames[:, :, cell.slots[pair.target]] = by_B
-    if pair.sensor in cell.slots:
-        by_frames[:, :, cell.slots[pair.sensor]] = -(by_B @ se3.adjoint(se3.inverse(B)))
-    variance = np.einsum("nij,nij->ni", by_frames @ covariance, by_frames)
+    J = by_frames(cell, pair, predicted(cell, pair, A), by_B)
+    variance = np.einsum("nij,nij->ni", J @ covariance, J)
     deviation = np.sqrt(np.maximum(variance, 1e-12)).reshape(pixels.shape)
     inside = np.minimum(pixels + 0.5, size - 0.5 - pixels)
     return np.asarray((inside / deviation).min(axis=(1, 2)))

@@ -52,7 +52,7 @@ class Cell:
     degrees_of_freedom: float
     measured: Array  #: (N, 4, 4): A of the measurements so far
     views: dict[str, View]
-    is_rough: bool  #: Whether a sensor's pose is neither measured nor guessed: poses are as rough as that
+    is_rough: bool  #: Whether a pose that counts is neither measured nor guessed: planned poses are as rough
     share: float = 1.0  #: A measurement counts for this share of its information, as those there are did
 
     @property

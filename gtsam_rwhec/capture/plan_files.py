@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.capture.plan_poses import Plan, PlannedPose
 from gtsam_rwhec.detect.pictures import Picture, draw, jpeg_of
+from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.poses import Array
@@ -40,8 +41,8 @@ def write_plan(plan: Plan, folder: str | Path) -> tuple[Path, ...]:
 
     ``plan.yaml`` and ``plan.csv`` have T_parent_child of the carrier that the robot moves, metres and quaternions with
     x first, and the joints where an arm was given; the best pose is first, and ``tour`` is its place on a short way.
-    ``plan.mcap`` has the same poses as one geometry_msgs/PoseArray in the frame of the parent. ``pictures`` has a JPEG for
-    each pose and camera that should see something there.
+    ``plan.mcap`` has the same poses as one geometry_msgs/PoseArray in the frame of the parent. ``pictures`` has a JPEG
+    for each pose and camera that should see something there.
 
     Raises
     ------
@@ -49,11 +50,17 @@ def write_plan(plan: Plan, folder: str | Path) -> tuple[Path, ...]:
         The folder cannot be written.
     """
     folder = Path(folder)
+    try:
+        (folder / "pictures").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder} cannot be written: {error.strerror or error}.") from error
     rows = [_row(plan, i) for i in range(len(plan.poses))]
     text = io.StringIO()
     table = csv.DictWriter(text, [*rows[0]] if rows else ["pose"], lineterminator="\n")
     table.writeheader()
-    table.writerows({name: " ".join(cell) if isinstance(cell, list) else cell for name, cell in row.items()} for row in rows)
+    table.writerows(
+        {name: " ".join(cell) if isinstance(cell, list) else cell for name, cell in row.items()} for row in rows
+    )
     files = [folder / name for name in FILES]
     write_atomically(files[0], _yaml(plan, rows).encode())
     write_atomically(files[1], text.getvalue().encode())
@@ -75,9 +82,15 @@ def print_plan(plan: Plan) -> None:
     for i, pose in enumerate(plan.poses):
         T = pose.T_parent_child
         turn = Rotation.from_matrix(T[:3, :3]).as_rotvec(degrees=True)
-        sees = ", ".join(f"{shown(pair.sensor)} {shown(pair.target)}" for pair in pose.sees)
+        seen: dict[str, list[str]] = {}
+        for pair in pose.sees:
+            seen.setdefault(shown(pair.sensor), []).append(shown(pair.target))
+        sees = ", ".join(f"{name} {of[0] if len(of) == 1 else f'{len(of)} targets'}" for name, of in seen.items())
         left = f"{pose.deviation_mm:.3f}" if np.isfinite(pose.deviation_mm) else "free"
-        cells = (*(f"{value:.3f}" for value in T[:3, 3]), *(f"{value:.1f}" for value in turn))
+        cells = (
+            *(f"{value:.3f}" for value in T[:3, 3].round(3) + 0.0),
+            *(f"{value:.1f}" for value in turn.round(1) + 0.0),
+        )
         rows[str(i + 1)] = (str(plan.tour.index(i) + 1), *cells, f"{pose.bits:.1f}", left, sees)
     console = report_console()
     print_blocks(console, [Paragraph(str(plan), "good" if outlook.can_be_reached else "bad")])
@@ -103,7 +116,7 @@ def _row(plan: Plan, i: int) -> dict[str, Any]:
         "tour": plan.tour.index(i) + 1,
         "parent": pose.parent,
         "child": pose.child,
-        **dict(zip(("x_m", "y_m", "z_m"), T[:3, 3].tolist(), strict=True)),
+        **dict(zip(("x_m", "y_m", "z_m"), (T[:3, 3] + 0.0).tolist(), strict=True)),
         **dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)),
         **joints,
         "sees": [f"{pair.sensor}:{pair.target}" for pair in pose.sees],

@@ -7,8 +7,8 @@ what is seen is, to first order,
 
 in the axes of the target, with its scale s and the camera's parameters c. H are the derivatives of the corners in
 pixels over their deviation (`corner_residuals`), or, without a camera, the inverse root of B's covariance. All that is
-seen at one pose shares the error a of A, whose deviations are rows of their own: a triangular factor of all rows, with a
-first, leaves W, the rows in which a is not (square-root information, Bierman 1977). So W'W is what the pose adds.
+seen at one pose shares the error a of A, whose deviations are rows of their own: a triangular factor of all rows, with
+a first, leaves W, the rows in which a is not (square-root information, Bierman 1977). So W'W is what the pose adds.
 """
 
 from __future__ import annotations
@@ -67,18 +67,11 @@ def rows_at(cell: Cell, A: Array, seen: Mapping[Pair, np.ndarray]) -> Array:
         where = probability > 0.0
         if not where.any():
             continue
-        by_B, by_scale, by_camera = (
-            _scattered(part, where) for part in _own_rows(cell, pair, A[where])
-        )
+        by_B, by_scale, by_camera = (_scattered(part, where) for part in _own_rows(cell, pair, A[where]))
         B = predicted(cell, pair, A)
-        J = np.zeros((*by_B.shape[:2], cell.dimension))
+        J = by_frames(cell, pair, B, by_B)
         scale = "scale" if "scale" in cell.slots else f"scale:{pair.target}"
-        for name, part in (
-            (pair.target, by_B),
-            (pair.sensor, -(by_B @ se3.adjoint(se3.inverse(B)))),
-            (scale, by_scale),
-            (f"intrinsics:{pair.sensor}", by_camera),
-        ):
+        for name, part in ((scale, by_scale), (f"intrinsics:{pair.sensor}", by_camera)):
             if name in cell.slots:
                 J[:, :, cell.slots[name]] += part
         parts.append(J)
@@ -98,6 +91,16 @@ def rows_at(cell: Cell, A: Array, seen: Mapping[Pair, np.ndarray]) -> Array:
     return np.asarray(np.sqrt(cell.share) * rows)
 
 
+def by_frames(cell: Cell, pair: Pair, B: Array, by_B: Array) -> Array:
+    """Derivatives (N, q, d) by all unknowns of what has the derivatives (N, q, 6) by B: those by its two frames."""
+    J = np.zeros((*by_B.shape[:2], cell.dimension))
+    if pair.target in cell.slots:
+        J[:, :, cell.slots[pair.target]] = by_B
+    if pair.sensor in cell.slots:
+        J[:, :, cell.slots[pair.sensor]] = -(by_B @ se3.adjoint(se3.inverse(B)))
+    return J
+
+
 def _scattered(part: Array, where: np.ndarray) -> Array:
     """Rows of the poses that a mask marks, among zeros."""
     full = np.zeros((len(where), *part.shape[1:]))
@@ -108,8 +111,7 @@ def _scattered(part: Array, where: np.ndarray) -> Array:
 def measured_information(cell: Cell, problem: Problem) -> Array:
     """The information (d, d) of measurements, as a plan would have predicted it: at the poses of the answer.
 
-    Measurements of one stamp share A's error, as in the answer. Where the residuals are larger than the noise allows,
-    they tell less.
+    Measurements of one stamp share A's error, as in the answer.
     """
     pairs = [pair for pair in problem.pairs if not pair.is_motion]
     raw = [problem.measurements(*pair) for pair in pairs]

@@ -29,8 +29,8 @@ class PlanOptions:
     #: So many poses are proposed, out of so many candidates that are seen and can be reached.
     poses: int = 12
     candidates: int = 200
-    #: The wanted accuracy: with the probability ``level`` a point at ``point_m`` before a sensor is within this distance
-    #: of its true place (mm). Without it the plan says what each pose leaves.
+    #: The wanted accuracy: with the probability ``level`` a point at ``point_m`` before a sensor is within this
+    #: distance of its true place (mm). Without it the plan says what each pose leaves.
     wanted_mm: float | None = None
     #: The distance of that point, m; None: where the sensor sees its targets.
     point_m: float | None = None
@@ -45,8 +45,8 @@ class PlanOptions:
     tilt_deg: float = 55.0
     spacing_px: float = 12.0
     border: float = 0.03
-    #: The carrier that the robot moves, which may turn so far from its present pose (degrees), and whose origin stays in
-    #: a box: its least and its largest x, y, z in the other carrier's frame (m).
+    #: The carrier that the robot moves, which may turn so far from its present pose (degrees), and whose origin stays
+    #: in a box: its least and its largest x, y, z in the other carrier's frame (m).
     moves: Moving = "sensors"
     turn_deg: float = 90.0
     box_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
@@ -75,7 +75,11 @@ class PlanOptions:
         for one in fields(self):
             value = getattr(self, one.name)
             is_length = one.name in optional or one.type == "float"
-            if is_length and not (value is None and one.name in optional) and not (is_real(value) and 0.0 < value < 1e6):
+            if (
+                is_length
+                and not (value is None and one.name in optional)
+                and not (is_real(value) and 0.0 < value < 1e6)
+            ):
                 raise OptionError(f"PlanOptions.{one.name}={brief(value)}; give a positive number")
         for name, most_deg in (("tilt_deg", 90.0), ("turn_deg", 180.0)):
             if getattr(self, name) > most_deg:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -11,14 +12,7 @@ import numpy as np
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.point_uncertainty import ball_radius
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.capture.plan_candidates import (
-    Candidates,
-    drawn_candidates,
-    moving_pose,
-    present_pose,
-    seen_at,
-    tour,
-)
+from gtsam_rwhec.capture.plan_candidates import Candidates, drawn_candidates, moving_pose, present_pose, seen_at, tour
 from gtsam_rwhec.capture.plan_cell import Cell, Kit
 from gtsam_rwhec.capture.plan_information import predicted, rows_at
 from gtsam_rwhec.capture.plan_options import PlanOptions
@@ -55,6 +49,27 @@ class Reason(StrEnum):
     TOO_MANY = "too many measurements"
 
 
+PLANNED = "the planned poses leave {point} within {planned} mm {chance}"
+#: What an `Outlook` says.
+WORDS = {
+    Reason.OPEN: f"T{PLANNED[1:]}.",
+    Reason.REACHED: "{wanted} is reached: {point} is within {now} mm {chance}.",
+    Reason.ENOUGH: f"{{needed}} {{wanted}}: {PLANNED}.",
+    Reason.NOT_SEEN: "There is no pose to go to: of all that were drawn, a sensor sees a whole target at none. Bring a "
+    "target nearer, turn the robot so that one is in the image, or correct the guesses.",
+    Reason.NOT_WITHIN: "There is no pose to go to: all at which a target is seen are outside the box, or turned too "
+    "far from the present pose. Widen the box or the turn, or move the target.",
+    Reason.OUT_OF_REACH: "There is no pose to go to: the arm reaches none at which a target is seen. Move the target, "
+    "or begin with other joints.",
+    Reason.FREE: "No number of such measurements determines {free}: a direction stays free, because no candidate turns "
+    "far enough about a second axis, or sees it. Let the robot turn further.",
+    Reason.CONSTANT: "{wanted} cannot be reached: constant errors of the carriers' poses, which no measurement here "
+    "shows, alone leave {point} within {least} mm {chance}. Calibrate the arm.",
+    Reason.TOO_MANY: f"{{wanted}} would take more than {{most}} measurements: {PLANNED}. Use more exact poses, a "
+    "larger board, or a better known camera.",
+}
+
+
 @dataclass(frozen=True)
 class Outlook:
     """What more measurements lead to; ``str()`` is one sentence."""
@@ -76,35 +91,18 @@ class Outlook:
         return self.reason in (Reason.OPEN, Reason.REACHED, Reason.ENOUGH)
 
     def __str__(self) -> str:
-        point = f"a point {self.distance_m:.2f} m before {self.sensor}"
-        wanted = "" if self.wanted_mm is None else f"{rounded(self.wanted_mm)} mm at {self.distance_m:.2f} m"
-        probability = f"with {100.0 * self.level:g} % probability"
-        if self.reason is Reason.NOT_SEEN:
-            return "No pose is proposed: of all that were drawn, a sensor sees a whole target at none. Bring a target "\
-                "nearer, turn the robot so that one is in the image, or correct the guesses."
-        if self.reason is Reason.NOT_WITHIN:
-            return "No pose is proposed: all at which a target is seen are outside the box, or turned too far from the "\
-                "present pose. Widen the box or the turn, or move the target."
-        if self.reason is Reason.OUT_OF_REACH:
-            return "No pose is proposed: the arm reaches none at which a target is seen. Move the target, or begin "\
-                "with other joints."
-        if self.reason is Reason.FREE:
-            return f"No number of such measurements determines {', '.join(self.free)}: a direction stays free, because "\
-                "no candidate turns far enough about a second axis, or sees it. Let the robot turn further."
-        if self.reason is Reason.CONSTANT:
-            return f"{wanted} cannot be reached: constant errors of the carriers' poses, which no measurement here "\
-                f"shows, alone leave {point} within {rounded(self.least_mm)} mm {probability}. Calibrate the arm."
-        if self.reason is Reason.TOO_MANY:
-            return f"{wanted} would take more than {MOST_MEASUREMENTS} measurements: the planned ones leave {point} "\
-                f"within {rounded(self.planned_mm)} mm {probability}. Use more exact poses, a larger board, or a "\
-                "better known camera."
-        if self.reason is Reason.REACHED:
-            return f"{wanted} is reached: {point} is within {rounded(self.now_mm)} mm {probability}."
-        planned = f"the planned poses leave {point} within {rounded(self.planned_mm)} mm {probability}"
-        if self.reason is Reason.OPEN:
-            return f"{planned[0].upper()}{planned[1:]}."
         more = "measurement reaches" if self.needed == 1 else "measurements reach"
-        return f"{self.needed} more {more} {wanted}: {planned}."
+        return WORDS[self.reason].format(
+            point=f"a point {self.distance_m:.2f} m before {self.sensor}",
+            wanted="" if self.wanted_mm is None else f"{rounded(self.wanted_mm)} mm at {self.distance_m:.2f} m",
+            chance=f"with {100.0 * self.level:g} % probability",
+            now=rounded(self.now_mm),
+            planned=rounded(self.planned_mm),
+            least=rounded(self.least_mm),
+            free=", ".join(self.free),
+            needed=f"{self.needed} more {more}",
+            most=MOST_MEASUREMENTS,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +195,8 @@ def plan(
     cell = cell_of(source, options, rig, cameras or {}, boards or {})
     if not cell.pairs:
         raise OptionError(
-            "there is nothing to plan with: no measurement, and no camera with a board; give cameras= and boards=, or a "
-            "rig file with intrinsics in numbers or files"
+            "there is nothing to plan with: no measurement, and no camera with a board; give cameras= and boards=, or "
+            "a rig file with intrinsics in numbers or files"
         )
     task = _task(cell, options)
     first, covariance = _first(cell, options)
@@ -211,11 +209,15 @@ def plan(
         first=None if first is None else 0,
     )  # fmt: skip
     poses = _poses(cell, options, candidates, ranking)
-    way = tour(np.array([one.T_parent_child for one in poses]), moving_pose(present_pose(cell, options), options)) if poses else []
+    way = (
+        tour(np.array([one.T_parent_child for one in poses]), moving_pose(present_pose(cell, options), options))
+        if poses
+        else []
+    )
     return Plan(
         poses,
         tuple(way),
-        _outlook(cell, options, task, candidates, ranking, len(W)),
+        _outlook(cell, options, task, candidates, ranking, len(W) - (first is not None)),
         cell.is_rough,
         bound_of(W, ranking) if poses else 0.0,
         candidates.drawn, candidates.visible, candidates.within, candidates.reached,
@@ -228,7 +230,9 @@ def _task(cell: Cell, options: PlanOptions) -> Task:
     sensors = [name for name in cell.Y if any(pair.sensor == name for pair in cell.pairs)]
     if options.sensor is not None:
         if options.sensor not in sensors:
-            raise FrameError(f"sensor={brief(options.sensor)} is none that sees a target; there are {', '.join(sensors)}")
+            raise FrameError(
+                f"sensor={brief(options.sensor)} is none that sees a target; there are {', '.join(sensors)}"
+            )
         sensors = [options.sensor]
     distances = []
     for name in sensors:
@@ -242,7 +246,7 @@ def _task(cell: Cell, options: PlanOptions) -> Task:
 def _first(cell: Cell, options: PlanOptions) -> tuple[Candidates | None, Array]:
     """Where nothing was measured, the present pose comes first; and the covariance that counts for the others.
 
-    At the present pose a target is taken to be seen: what it then tells counts for whether the others see theirs.
+    At the present pose a target is taken to be seen where the guesses have it.
     """
     if len(cell.measured):
         return None, np.zeros_like(cell.floor) if cell.is_rough else cell.covariance
@@ -269,7 +273,7 @@ def _poses(cell: Cell, options: PlanOptions, candidates: Candidates, ranking: Ra
             T_parent_child=moving_pose(A, options),
             joints=None if chosen.joints is None else chosen.joints[i],
             B={pair: B[pair][i] for pair, seen in chosen.seen.items() if seen[i] > 0.0},
-            bits=ranking.nats[i] / np.log(2.0),
+            bits=ranking.nats[i] / math.log(2.0),
             deviation_mm=ranking.radii_mm[i],
         )
         for i, A in enumerate(chosen.A)

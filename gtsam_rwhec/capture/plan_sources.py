@@ -1,4 +1,4 @@
-"""The cell of a plan, from a calibration, from measurements alone, or from a rough rig: guesses, or only what is there."""
+"""The cell of a plan: from a calibration, from measurements, or from a rough rig: guesses, or only what is there."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ from dataclasses import replace
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.special import chdtri
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.capture.plan_cell import Cell, Kit, View, in_front
-from gtsam_rwhec.capture.plan_information import measured_information
+from gtsam_rwhec.capture.plan_information import measured_information, predicted
 from gtsam_rwhec.capture.plan_options import PlanOptions
+from gtsam_rwhec.capture.plan_ranking import free_frames
 from gtsam_rwhec.errors import FrameError, OptionError, RwhecWarning
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, Stated
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.stated_intrinsics import prior_of
-from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.changed_frames import constant_covariance
+from gtsam_rwhec.results.linear_model import noise_of_A
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.sensor_intrinsics import stated_camera
@@ -36,8 +39,8 @@ UNKNOWN_RAD, UNKNOWN_M = np.radians(60.0), 0.15
 ARM_RAD, ARM_M = np.radians(0.02), 1e-4
 #: The noise of a measured pose without corners, where nobody states it: rad and m.
 POSE_RAD, POSE_M = np.radians(0.3), 3e-3
-#: Residuals tell how large the noise is from so many equations to spare.
-SPARE = 12
+#: Residuals are larger than the noise allows where chance gives as large ones with less than this probability.
+CHANCE = 0.01
 
 
 def cell_of(
@@ -118,7 +121,9 @@ def _of_refined(
     """A refined calibration: its covariance is that of what is known, less the constant errors of A."""
     kinds = UnknownKind.FRAME, UnknownKind.SCALE, UnknownKind.INTRINSICS
     unknowns = [one for one in refined.unknowns if one.kind in kinds]
-    slots, dimension = _slots({str(one): refined.joint.slots[one].stop - refined.joint.slots[one].start for one in unknowns})
+    slots, dimension = _slots(
+        {str(one): refined.joint.slots[one].stop - refined.joint.slots[one].start for one in unknowns}
+    )
     rows = refined.joint.rows(tuple(unknowns))
     floor = constant_covariance(refined, constant)[np.ix_(rows, rows)]
     known = refined.information(*unknowns)
@@ -135,7 +140,9 @@ def _of_refined(
         kit.cameras.update({name: one.camera for name, one in refined.intrinsics.items()})
         if carrier_noise is None and by_corners.carrier_poses != "exact":
             carrier_noise = CarrierNoise(
-                by_corners.carrier_rotation_rad or 1e-9, by_corners.carrier_translation_m or 1e-9, about=kit.carrier_noise.about
+                by_corners.carrier_rotation_rad or 1e-9,
+                by_corners.carrier_translation_m or 1e-9,
+                about=kit.carrier_noise.about,
             )
     noise: dict[Pair, Array] = {}
     for pair, found in refined.noise.items():
@@ -144,7 +151,9 @@ def _of_refined(
             size = np.ones(2)
             if by_corners is None and problem is not None and pair in problem.pairs:
                 usual = np.einsum("nii->ni", problem.measurements(*pair).covariance_of_B()).reshape(-1, 2, 3)
-                size = np.array([found.rotation_rad, found.translation_m]) / np.sqrt(np.median(usual.mean(axis=2), axis=0))
+                size = np.array([found.rotation_rad, found.translation_m]) / np.sqrt(
+                    np.median(usual.mean(axis=2), axis=0)
+                )
         noise[pair] = size
     of_target = refined.scale if isinstance(refined.scale, dict) else dict.fromkeys(refined.X, float(refined.scale))
     cell = Cell(
@@ -230,9 +239,10 @@ def _of_problem(problem: Problem, kit: Kit, options: PlanOptions) -> Cell:
         found = solution.scale
         scale |= found if isinstance(found, dict) else dict.fromkeys(scale, float(found))
         problem = stated
-    is_rough = not set(sensors) <= guesses.keys() | {pair.sensor for pair in seen} or (bool(seen) and not guesses)
+    is_nominal = False
     if not X and kit.boards and sensors and sensors[0] in kit.cameras:
         name, present = next(iter(kit.boards)), _present(options)
+        is_nominal = True
         X = {name: se3.inverse(present) @ Y[sensors[0]] @ in_front(kit.cameras[sensors[0]], kit.boards[name])}
     sizes = {name: 6 for name in (*X, *Y) if name not in problem.fixed}
     if problem.scale != "known":
@@ -255,9 +265,29 @@ def _of_problem(problem: Problem, kit: Kit, options: PlanOptions) -> Cell:
         noise[pair] = np.ones(2) if has_corners else np.sqrt(np.median(usual, axis=0))
     cell = Cell(
         X, Y, scale, kit, slots, dimension, noise, kit.carrier_noise, known, rough,
-        np.zeros((dimension, dimension)), np.inf, _poses(problem), _views(problem, kit), is_rough,
+        np.zeros((dimension, dimension)), np.inf, _poses(problem), _views(problem, kit), is_rough=False,
     )  # fmt: skip
-    return replace(cell, known=known + measured_information(cell, problem)) if seen else cell
+    if seen:
+        cell = replace(cell, share=1.0 / _excess(cell, problem))
+        cell = replace(cell, known=known + measured_information(cell, problem))
+    free = free_frames(cell, cell.covariance)
+    is_rough = is_nominal or any(name in free and name not in guesses for name in sensors)
+    return replace(cell, is_rough=is_rough)
+
+
+def _excess(cell: Cell, problem: Problem) -> float:
+    """By how much the residuals' squares exceed those that the noise allows, at least 1."""
+    total, spare = 0.0, -6 * len({*cell.X, *cell.Y} & cell.slots.keys())
+    for pair in problem.pairs:
+        if not pair.is_motion:
+            raw, scale = problem.measurements(*pair), cell.scale[pair.target]
+            P = predicted(cell, pair, raw.A)
+            P[:, :3, 3] *= scale
+            residual = se3.logmap(se3.inverse(P) @ raw.B)
+            noise = raw.covariance_of_B() + noise_of_A(cell.carrier_noise, raw.A, cell.X[pair.target], scale)
+            total += float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(noise), residual))
+            spare += residual.size
+    return max(1.0, total / chdtri(spare, CHANCE)) if spare > 0 else 1.0
 
 
 def _present(options: PlanOptions) -> Array:

@@ -79,7 +79,8 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff, verify, accept, plan):
+OF_CALIBRATION = (calibrate, demo, init, plan, convert, detect, clean, solve, export, report, compare)
+for subcommand in (*OF_CALIBRATION, diff, verify, accept):
     add(subcommand, app)
 add(utias, fetch_app)
 add(run, fleet_app)

@@ -127,8 +127,9 @@ class ExitStatus(IntEnum):
 HELP = (
     "Exit status: 0 success, and the poses may be used; 1 diff, verify or fleet watch found a change, accept "
     "rejected, or some of a fleet failed; 2 bad input; 3 the measurements do not determine every frame, or accept "
-    "needs more touches, or plan has no poses that lead to what is wanted; 4 not proven optimal; 5 download failed; 6 the measurements contradict the answer (misread, "
-    "a wrong size, a sensor or a target without an answer); 130 interrupted."
+    "needs more touches, or plan has no poses that lead to what is wanted; 4 not proven optimal; 5 download failed; 6 "
+    "the measurements contradict the answer (misread, a wrong size, a sensor or a target without an answer); 130 "
+    "interrupted."
 )
 
 

@@ -93,18 +93,17 @@ def plan(
         now = inverse(pose[0]) if sensors_move else pose[0]
     arm = None
     if urdf is not None:
-        arm = rw.capture.Arm.read(urdf, base_link or fixed, tip_link or moving, None if joints is None else _numbers(joints))
+        arm = rw.capture.Arm.read(
+            urdf, base_link or fixed, tip_link or moving, None if joints is None else _numbers(joints)
+        )
     options = rw.PlanOptions(
         poses=poses, wanted_mm=wanted_mm, point_m=point_m, sensor=sensor, near_m=near_m, far_m=far_m, tilt_deg=tilt_deg,
         turn_deg=turn_deg, box_m=None if box is None else (box[:3], box[3:]), present=now, arm=arm,
         moves="sensors" if sensors_move else "targets",
     )  # fmt: skip
-    found = rw.plan(
-        None if old is None else old.result, options, rig=file, cameras={} if old is None else old.cameras
-    )
+    found = rw.plan(None if old is None else old.result, options, rig=file, cameras={} if old is None else old.cameras)
     rw.capture.print_plan(found)
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
         rw.capture.write_plan(found, output)
         say(f"Written to {shown_path(output)}.", to_errors=True)
     return ExitStatus.DONE if found.outlook.can_be_reached else ExitStatus.NOT_UNIQUE

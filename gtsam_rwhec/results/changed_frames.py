@@ -14,6 +14,7 @@ from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
 from gtsam_rwhec.results.common_quantities import Movement, Quantities, numbers_of, quantities
 from gtsam_rwhec.results.result_file import Result
