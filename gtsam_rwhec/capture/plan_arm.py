@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rwhec_factors import se3
@@ -61,7 +62,8 @@ class Arm:
         except (ValueError, OSError, SyntaxError, AttributeError, TypeError, KeyError) as error:
             raise FileFormatError(f"{path} cannot be read as a URDF: {shown(str(error))}") from error
         links, above = {link.name for link in robot.robot.links}, {one.child: one for one in robot.robot.joints}
-        chain, link = [], tip
+        chain: list[Any] = []
+        link = tip
         while link in above and link != base and len(chain) <= len(above):
             chain.insert(0, above[link])
             link = above[link].parent

@@ -135,7 +135,7 @@ def _left(cell: Cell, task: Task, T: Array, L: Array, covariance: Array) -> Arra
     root = np.linalg.solve(L, T @ rows.T).reshape(len(T), -1, s, 3)
     before = np.einsum("sij,jk,slk->sil", task.rows, covariance + cell.floor, task.rows)
     after = before - np.einsum("nrsi,nrsj->nsij", root, root)
-    return np.linalg.eigvalsh(after)[:, :, -1].max(axis=1, initial=0.0)
+    return np.asarray(np.linalg.eigvalsh(after)[:, :, -1].max(axis=1, initial=0.0))
 
 
 def bound_of(W: Array, ranking: Ranking) -> float:
