@@ -79,6 +79,13 @@ from . import rig as rig
 from . import detect as detect
 from .runs import calibrate_log as calibrate_log
 
+# While the robot stands there: what to measure next.
+from . import capture as capture
+from .capture import Plan as Plan
+from .capture import PlannedPose as PlannedPose
+from .capture import PlanOptions as PlanOptions
+from .capture import plan as plan
+
 # Other methods, other libraries' calls, and problems whose truth is known.
 from . import datasets as datasets
 from . import methods as methods

@@ -111,7 +111,8 @@ class ExitStatus(IntEnum):
     """An option, a file or a measurement cannot be used; the message says which."""
     NOT_UNIQUE = 3
     """The answer is certified, but the measurements do not determine every frame: do not use the poses. Or a target of
-    the rig file has too few measurements for any to be checked: do not use its pose. ``accept``: not accepted yet."""
+    the rig file has too few measurements for any to be checked: do not use its pose. ``accept``: not accepted yet.
+    ``plan``: no poses lead to the wanted accuracy, or none are seen."""
     NOT_CERTIFIED = 4
     """The answer is not certified: a better answer may exist."""
     DOWNLOAD_FAILED = 5
@@ -126,8 +127,9 @@ class ExitStatus(IntEnum):
 HELP = (
     "Exit status: 0 success, and the poses may be used; 1 diff, verify or fleet watch found a change, accept "
     "rejected, or some of a fleet failed; 2 bad input; 3 the measurements do not determine every frame, or accept "
-    "needs more touches; 4 not proven optimal; 5 download failed; 6 the measurements contradict the answer (misread, "
-    "a wrong size, a sensor or a target without an answer); 130 interrupted."
+    "needs more touches, or plan has no poses that lead to what is wanted; 4 not proven optimal; 5 download failed; 6 "
+    "the measurements contradict the answer (misread, a wrong size, a sensor or a target without an answer); 130 "
+    "interrupted."
 )
 
 

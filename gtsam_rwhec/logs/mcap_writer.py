@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -43,6 +44,20 @@ Images = Literal["copy", "leave_out"]
 _LINE_LOOP = 2
 _GREEN = {"r": 0.0, "g": 1.0, "b": 0.0, "a": 1.0}
 _BLACK = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 0.6}
+
+
+_MESSAGE = f"{'=' * 80}\nMSG: "
+#: The definition of ROS 2's PoseArray, with those of its parts.
+POSE_ARRAY = "\n".join(
+    [
+        "std_msgs/Header header\ngeometry_msgs/Pose[] poses",
+        f"{_MESSAGE}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id",
+        f"{_MESSAGE}builtin_interfaces/Time\nint32 sec\nuint32 nanosec",
+        f"{_MESSAGE}geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+        f"{_MESSAGE}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z",
+        f"{_MESSAGE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    ]
+).encode()
 
 
 class LogWriter:
@@ -122,6 +137,17 @@ class LogWriter:
         """Write a ``foxglove.PosesInFrame`` of (N, 4, 4) poses."""
         message = {"timestamp": _time(stamp_ns), "frame_id": frame, "poses": [_pose(pose) for pose in T]}
         self._write(topic, "foxglove.PosesInFrame", stamp_ns, message)
+
+    def pose_array(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
+        """Write a ``geometry_msgs/msg/PoseArray`` of (N, 4, 4) poses as ROS 2 does: CDR, little endian."""
+        time, name = _time(stamp_ns), frame.encode() + b"\0"
+        head = struct.pack(f"<iII{len(name)}s", time["sec"], time["nsec"], len(name), name)
+        head += bytes(-len(head) % 4) + struct.pack("<I", len(T))
+        poses = [[*part["position"].values(), *part["orientation"].values()] for part in map(_pose, T)]
+        data = b"\0\1\0\0" + head + bytes(-len(head) % 8) + np.array(poses, "<f8").tobytes()
+        channel = self._channel(topic, "cdr", self._schema("geometry_msgs/msg/PoseArray", "ros2msg", POSE_ARRAY), {})
+        with self._saying():
+            self._writer.add_message(channel, stamp_ns, data, stamp_ns)
 
     def pose(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
         """Write a ``foxglove.PoseInFrame`` of one pose (4, 4)."""

@@ -1,6 +1,7 @@
 # All stages in a row.
 from .whole_runs import OUTPUTS as OUTPUTS
 from .whole_runs import calibrate_log as calibrate_log
+from .verified_log import OldCalibration as OldCalibration
 from .verified_log import accept_log as accept_log
 from .verified_log import verify_log as verify_log
 

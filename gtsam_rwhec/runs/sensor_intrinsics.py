@@ -63,7 +63,7 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
         if source.topic is not None:
             cameras[name] = _from_topic(log, source.topic, name)
         else:
-            cameras[name] = _stated(rig, name, source)
+            cameras[name] = stated_camera(rig, name, source)
         _warn_of_a_fold(cameras[name], name)
     return cameras
 
@@ -78,10 +78,10 @@ def check_intrinsics_files(rig: Rig) -> None:
     for name, sensor in rig.sensors.items():
         source = sensor.intrinsics
         if source is not None and source.topic is None and source.estimate is None and source.shared is None:
-            _stated(rig, name, source)
+            stated_camera(rig, name, source)
 
 
-def _stated(rig: Rig, name: str, source: Intrinsics) -> Camera:
+def stated_camera(rig: Rig, name: str, source: Intrinsics) -> Camera:
     """The camera from numbers or from a file: the named one, the only one, or that of the sensor's name."""
     file = source.kalibr or source.file
     if file is None:
