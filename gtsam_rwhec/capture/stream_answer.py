@@ -24,7 +24,7 @@ from gtsam_rwhec.problem.selection import VarianceFactors
 from gtsam_rwhec.solver.answers import PairPoses, costs_of_pairs, rotations_as_variables, scales_of
 from gtsam_rwhec.solver.identification import identify_with_basis, typical_length
 from gtsam_rwhec.solver.information import PartInformation, pair_information, prior_information
-from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.solution import PartSolution
 from gtsam_rwhec.solver.solve_options import SolveOptions

@@ -69,7 +69,7 @@ class Store:
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
         row = self._rows[self._size]
         row["number"], row["pair"], row["counts"], row["judged"] = self.number, self.pairs.index(pair), False, 0
-        row["A"], row["B"], row["sigma"], row["kappa"] = raw.A[0], raw.B[0], raw.sigma, raw.kappa
+        row["A"], row["B"], row["sigma"], row["kappa"] = raw.A[0], raw.B[0], raw.sigma.item(), raw.kappa.item()
         row["stamp_ns"] = 0 if raw.stamps_ns is None else raw.stamps_ns[0]
         if raw.covariances is not None:
             row["covariance"] = raw.covariances[0]
@@ -83,8 +83,8 @@ class Store:
         if self._stated is not None and stated != self._stated:
             first, now = (", ".join(sorted(names)) or "none" for names in (self._stated, stated))
             raise (StampError if stated ^ self._stated == {"stamps_ns"} else NoiseError)(
-                f"this measurement of {pair} states {now} of {', '.join(STATED)}; the first one stated {first}. Give the "
-                "same for every measurement of a stream"
+                f"this measurement of {pair} states {now} of {', '.join(STATED)}; the first one stated {first}. Give "
+                "the same for every measurement of a stream"
             )
 
     def let_count(self, places: np.ndarray, *, counts: bool) -> None:
