@@ -10,8 +10,8 @@ have noise of 0.003 to 0.02 degrees and 0.02 to 0.1 mm, which nobody states at a
 After each take from the fifth on the rule is asked: 0.5 mm at 0.8 m with 95 %. Roads to the answer: "stream", an update
 of ``rw.Stream``; "calibrate", ``rw.calibrate``; "plain", the same that does not allow for errors of the arm that vary
 with its configuration, which these arms do not have. The operator holds the board in poses at random, well spread;
-another may be given to `run` (a planner's). Beside it: the same answers without widening and with a chi-square quantile,
-as who stops when a covariance looks small; and four and eight fixed views.
+another may be given to `run` (a planner's). Beside it: the same answers without widening, by a chi-square quantile, as
+who stops when a covariance looks small; and four and eight fixed views.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 from bars import Row, Share, each_done, keep_line, kept_lines, run_script
-from gtsam_rwhec.calibration.point_uncertainty import ball_radius
 from numpy.typing import NDArray
 from rwhec_factors.se3 import inverse, pose
 from scipy.special import chdtri
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.point_uncertainty import ball_radius
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.simulate.simulated_noise import rotations_of_vectors
 

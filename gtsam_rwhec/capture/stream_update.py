@@ -98,7 +98,8 @@ class StreamUpdate:
 
         The covariance is that of the certified answer under the noise that its residuals show (or that was stated, with
         ``noise="given"``), one factor for all rotations and one for all translations: errors of measurements count as
-        independent. ``Stream.calibrate`` also asks for A's own noise, drift and errors of the configuration.
+        independent, also of those at one stamp, which share the error of A. ``Stream.calibrate`` asks for that noise
+        too, for drift, and for errors of the configuration.
         """
         if self._noise is None or not self._parts:
             return None
