@@ -69,6 +69,15 @@ from .results import write_calibration as write_calibration
 from .results import write_refined as write_refined
 from .results import write_solution as write_solution
 
+# While it is measured: the answer so far, and when it is good enough.
+from . import capture as capture
+from .capture import Accuracy as Accuracy
+from .capture import StopDecision as StopDecision
+from .capture import StoppingRule as StoppingRule
+from .capture import Stream as Stream
+from .capture import StreamOptions as StreamOptions
+from .capture import StreamUpdate as StreamUpdate
+
 # From a log of images to a calibration, at once or step by step.
 from . import fleet as fleet
 from . import geometry as geometry

@@ -5,7 +5,8 @@ A frame that loses its last measurement is not in the new problem (``Problem.wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,8 +17,12 @@ from numpy.typing import ArrayLike
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Accumulator, Row
 from gtsam_rwhec.problem.corners import candidates_of
+from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
+from gtsam_rwhec.problem.moment_stack import MomentStack
+from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.problem import Problem
 
 
@@ -29,6 +34,22 @@ class VarianceFactors(NamedTuple):
 
 
 AS_STATED = VarianceFactors(1.0, 1.0)
+
+
+def of_moments(knowledge: Problem, pairs: Sequence[Pair], moments: MomentStack, gauge: Gauge) -> Problem:
+    """A problem of moments alone, summed about a gauge, with the knowledge that another one has of their frames."""
+    result = copy.copy(knowledge)
+    result.keep_measurements = False
+    result._kind = dict.fromkeys((pair.target for pair in pairs if not pair.is_motion), "target")
+    result._kind |= dict.fromkeys((pair.sensor for pair in pairs), "sensor")
+    result._kept = dict.fromkeys(pairs, KeptMeasurements())
+    result._accumulator = Accumulator(gauge, {pair: Row(moments, e) for e, pair in enumerate(pairs)})
+    result._take_knowledge(
+        knowledge,
+        frames=(knowledge.fixed.keys() | knowledge.priors.keys()) - result._kind.keys(),
+        scales=knowledge.fixed_scales.keys() - {pair.target for pair in pairs},
+    )
+    return result
 
 
 def summed_again(problem: Problem) -> Problem:
