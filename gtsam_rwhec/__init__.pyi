@@ -70,6 +70,7 @@ from .results import write_refined as write_refined
 from .results import write_solution as write_solution
 
 # From a log of images to a calibration, at once or step by step.
+from . import capture as capture
 from . import fleet as fleet
 from . import geometry as geometry
 from . import logs as logs

@@ -21,6 +21,7 @@ from gtsam_rwhec.cli.demo_and_data import demo, utias
 from gtsam_rwhec.cli.failures import HELP, ExitStatus, failures_in_words
 from gtsam_rwhec.cli.fleet_commands import run, watch
 from gtsam_rwhec.cli.init_command import init
+from gtsam_rwhec.cli.live_command import live
 from gtsam_rwhec.cli.report_command import report
 from gtsam_rwhec.cli.stage_commands import clean, detect, export, solve
 from gtsam_rwhec.files.terminal_text import printable, say
@@ -78,7 +79,22 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff, verify, accept):
+for subcommand in (
+    calibrate,
+    live,
+    demo,
+    init,
+    convert,
+    detect,
+    clean,
+    solve,
+    export,
+    report,
+    compare,
+    diff,
+    verify,
+    accept,
+):
     add(subcommand, app)
 add(utias, fetch_app)
 add(run, fleet_app)
