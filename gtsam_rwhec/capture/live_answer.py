@@ -29,6 +29,7 @@ from gtsam_rwhec.runs.detection_stage import detected
 from gtsam_rwhec.runs.run_log import RunLog
 from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.runs.whole_runs import calibrate_log
+from gtsam_rwhec.solver.free_directions import FreeDirection
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,9 @@ _KNOWN: dict[Path, _Known] = {}
 
 def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None, hooks: Hooks) -> Answer:
     """Calibrate from takes, as ``calibrate_log`` would from the log that they make. It raises nothing of ours."""
-    begun_s, cells, pairs = time.monotonic(), {}, ()
+    begun_s = time.monotonic()
+    cells: dict[str, list[list[int]]] = {}
+    pairs: tuple[PairRow, ...] = ()
     known = _KNOWN.setdefault(takes[0].parent, _Known())
     try:
         with warnings.catch_warnings():
@@ -178,7 +181,7 @@ def calibrated(recorded: Path, rig: Rig, out: Path) -> Judgement:
         return calibrate_log(recorded, rig, out).judgement
 
 
-def _free(solved: Calibrated) -> Sequence[object]:
+def _free(solved: Calibrated) -> Sequence[FreeDirection]:
     return solved.refined.free_directions or solved.solution.identifiability.free_directions
 
 

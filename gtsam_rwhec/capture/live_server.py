@@ -169,7 +169,7 @@ class PageServer:
             if text is None or len(text) > LONGEST_ASKED:
                 raise RwhecError("the page sent bytes, or too much, in place of a command")
             said = json.loads(text)
-            if not isinstance(said, dict) or said.get("do") not in COMMANDS:
+            if not isinstance(said, dict) or said.get("do") not in (*COMMANDS,):
                 raise RwhecError(f"the page sent {brief(text)} in place of one of {', '.join(COMMANDS)}")
             await self._session.command(said["do"])
         except (RwhecError, RecursionError) as error:

@@ -272,6 +272,7 @@ class Session:
     async def _look_at(self, stream: SensorStream, number: int, message: Any, work: Callable[[], Seen]) -> None:
         seen = await asyncio.get_running_loop().run_in_executor(self._threads, work)
         self._look_ended(seen)
+        await asyncio.sleep(max(0.0, stream.rests_until_s - time.monotonic()))
         self._look()
 
     def _look_ended(self, seen: Seen) -> None:
@@ -449,6 +450,8 @@ class Session:
 
     async def _stop(self) -> None:
         self._pending, self.when_still = None, False
+        while self._answer_due.is_set():  # that of the last take is shown at the end
+            await asyncio.sleep(TICK_S)
         async with self._saving:
             is_saved = self._saved == self._changes
         if not is_saved:

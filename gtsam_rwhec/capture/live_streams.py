@@ -34,6 +34,8 @@ KEPT_S, AROUND_S = 20.0, 0.5
 FORWARD_S = 5.0
 #: Poses and images whose stamps are this far apart (seconds) are of two clocks.
 APART_S = 1.0
+#: Seconds that a camera's search rests at most, after as long a search.
+LONGEST_REST_S = 0.25
 #: A picture for the page has at most this width, pixels, and bytes; a smaller JPEG or PNG goes as it is.
 PICTURE_PX, PICTURE_BYTES = 960, 250_000
 
@@ -95,6 +97,9 @@ class SensorStream:
     waiting: tuple[int, Message, ImageRecord] | None = None  #: the newest image, which nobody looks at yet
     is_looked_at: bool = False  #: whether one of its images is being searched
     latest: Seen | None = None
+    #: When the search of an image began; until when none begins, so that half of the time is left to others.
+    begun_s: float = -np.inf
+    rests_until_s: float = -np.inf
     skipped: int = 0  #: images in whose place a newer one was searched
     looked: int = 0
     received_s: float = -np.inf  #: when the last message came, by a clock of this process
@@ -180,8 +185,10 @@ class Streams:
     def next_to_look_at(self) -> Iterator[tuple[SensorStream, int, Message, Callable[[], Seen]]]:
         """Images that can be searched now, each with the function that does so, for another thread."""
         for stream in self.sensors.values():
-            if stream.waiting is None or stream.is_looked_at or stream.camera is None:
+            rests = time.monotonic() < stream.rests_until_s
+            if stream.waiting is None or stream.is_looked_at or stream.camera is None or rests:
                 continue
+            stream.begun_s = time.monotonic()
             number, message, image = stream.waiting
             stream.waiting, stream.is_looked_at = None, True
             make = partial(Detector, stream.camera, self._rig.target_list, self._rig.detection_options)
@@ -199,6 +206,8 @@ class Streams:
         stream = self.sensors[seen.sensor]
         stream.latest, stream.is_looked_at, stream.looked = seen, False, stream.looked + 1
         stream.recent.append(seen)
+        now_s = time.monotonic()
+        stream.rests_until_s = now_s + min(now_s - stream.begun_s, LONGEST_REST_S)
 
     def stillness(self, stamp_ns: int | None = None) -> Stillness:
         """Whether the robot stood still for a while up to a stamp; by default up to the last pose."""

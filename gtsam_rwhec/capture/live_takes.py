@@ -7,6 +7,7 @@ take is to remove its file.
 
 from __future__ import annotations
 
+import fcntl
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,8 +54,12 @@ class Takes:
         self.folder = folder
         try:
             (folder / TAKES).mkdir(parents=True, exist_ok=True)
+            self._held = (folder / TAKES / ".session").open("w")
+            fcntl.flock(self._held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             for unfinished in (folder / TAKES).glob(".*.part"):
                 unfinished.unlink()
+        except BlockingIOError as error:
+            raise LogError(f"{folder} is in use by another session; end it, or give another folder (-o)") from error
         except OSError as error:
             raise LogError(f"{folder} cannot be used as the session's folder: {error.strerror}.") from error
         self.all = [_info(path) for path in sorted((folder / TAKES).glob("*.mcap"))]

@@ -12,11 +12,11 @@ from tempfile import TemporaryDirectory
 from gtsam_rwhec.capture.sources import POLL_S, Message, Source, messages_of_block
 from gtsam_rwhec.errors import FileFormatError, LogError, LogWarning
 from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, images_in, match, read_poses
 from gtsam_rwhec.logs.mcap_reader import open_log
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.pose_rows import PoseStatement, stem_of
+from gtsam_rwhec.logs.records import Array
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.recorded_logs import APART_NS, FIRST_NS
 

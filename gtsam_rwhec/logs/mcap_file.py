@@ -331,6 +331,9 @@ class McapFile:
 class GrowingFile(McapFile):
     """An MCAP file that is still being written; errors as of `McapFile`."""
 
+    is_ended = False  #: whether all was read, and the file ends there as one that its recorder has closed
+    _at = len(MAGIC)
+
     def new_blocks(self) -> Iterator[Block]:
         """What was written since it was asked last, as far as records are whole; `is_ended` at the file's end.
 
@@ -355,7 +358,6 @@ class GrowingFile(McapFile):
 
     def _find_blocks(self) -> None:
         self._check_begins()
-        self._at, self.is_ended = len(MAGIC), False
 
 
 def _zstd(content: bytes, most: int) -> bytes:

@@ -61,6 +61,7 @@ class Robot(ServerListener):
         self.subscribed: Counter[str] = Counter()
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
+        self._of_clients: dict[int, Any] = {}
         #: Messages of topics with one message are sent to everyone who subscribes, as ROS does with latched ones.
         of_topic = Counter(message.channel.topic for message in messages)
         self._once = {m.channel.topic: m for m in messages if of_topic[m.channel.topic] == 1}
@@ -78,8 +79,7 @@ class Robot(ServerListener):
             context=self._context,
             server_listener=self,
             capabilities=[Capability.ClientPublish],
-            supported_encodings=["cdr", "json"],
-            **self._options,
+            **{"supported_encodings": ["cdr", "json"], **self._options},
         )
         self.port = self._server.port
         return self
@@ -100,8 +100,12 @@ class Robot(ServerListener):
             # The server knows the subscription once this returns.
             threading.Timer(0.2, lambda: self._channels[channel.topic].log(once.data)).start()
 
-    def on_message_data(self, client: Any, client_channel: Any, data: bytes) -> None:
-        self.received.append(Received(client_channel.topic, client_channel.schema_name, bytes(data)))
+    def on_client_advertise(self, client: Any, channel: Any) -> None:
+        self._of_clients[channel.id] = channel
+
+    def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
+        channel = self._of_clients[client_channel_id]
+        self.received.append(Received(channel.topic, channel.schema_name, bytes(data)))
 
     def wait_for_subscriptions(self, topics: Iterable[str], seconds: float = 20.0) -> None:
         until_s = time.monotonic() + seconds

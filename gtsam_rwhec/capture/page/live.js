@@ -1,7 +1,6 @@
 // The page of a session: it shows what the command sends, and sends what people ask. Text is set as text, never as HTML.
 const $ = (selector, within = document) => within.querySelector(selector);
 const keys = { t: "take", w: "when_still", u: "undo", s: "save", q: "stop" };
-const signs = { true: "■", false: "□", null: "·" };
 const wheres = { use: "good", care: "care", do_not_use: "bad" };
 const views = new Map();
 let socket, hasEnded = false, state = null, heldUntil = 0;
@@ -145,7 +144,7 @@ function showAnswer({ answer, verdict, wanted, takes, is_answering, next_pose })
     name.scope = "row";
     row.append(name, ...sensors.map((sensor) => {
       const { count, is_determined } = pairs.find((pair) => pair.target === target && pair.sensor === sensor);
-      return made("td", count ? `${signs[is_determined]} ${count}` : signs.null);
+      return made("td", count ? `${is_determined ? "■" : "□"} ${count}` : "·");
     }));
     return row;
   })] : []);
@@ -165,7 +164,10 @@ function show(now) {
   chip("#source", `${now.source.name}: ${now.source.state}`, now.source.is_connected ? "" : "bad");
   chip("#still", now.still.is_still ? "■ stands still" : `□ ${now.still.words}`, now.still.is_still ? "good" : "");
   chip("#count", `${now.takes.count} take${now.takes.count === 1 ? "" : "s"}${now.takes.count && now.takes.is_saved ? ", saved" : ""}`, "");
-  for (const camera of now.cameras) showCamera(camera, now.answer);
+  now.cameras.forEach((camera, place) => {
+    showCamera(camera, now.answer);
+    viewOf(camera.name).figure.style.order = place;
+  });
   showAnswer(now);
   fill($("#happened .troubles"), now.troubles.map((words) => made("li", words, "bad")));
   fill($("#happened .said"), now.said.map(([time, kind, words]) => {
