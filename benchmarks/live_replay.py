@@ -24,7 +24,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -117,8 +117,15 @@ class Command:
 
     def kill(self) -> None:
         """SIGKILL to it and to all that it started."""
-        os.killpg(self.process.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
+
+    def __enter__(self) -> Command:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.kill()
 
 
 def looked_at(page: Any, folder: Path | None, name: str) -> None:
@@ -153,8 +160,11 @@ def session(seconds: float, folder: Path, shots: Path | None) -> list[Row]:
     from playwright.sync_api import sync_playwright
 
     out = folder / "session"
-    with running_robot() as (port, its), sync_playwright() as playwright:
-        command = Command(f"ws://127.0.0.1:{port}", out, "--wanted-mm", "1.5")
+    with (
+        running_robot() as (port, its),
+        Command(f"ws://127.0.0.1:{port}", out, "--wanted-mm", "1.5") as command,
+        sync_playwright() as playwright,
+    ):
         browser = playwright.chromium.launch(executable_path=chromium(), args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         complaints: list[str] = []

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.detect.many_images import DetectedImage
@@ -107,7 +106,7 @@ class Answer:
     takes: int
     seconds: float  #: that it took
     verdict: str = ""  #: the value of a `Verdict`; empty where there is no answer
-    sentence: str = ""  #: of the judgement
+    reason: str = ""  #: of the verdict
     why_none: str = ""  #: why there is no answer yet; empty where there is one
     frames: tuple[FrameRow, ...] = ()
     points: tuple[PointRow, ...] = ()
@@ -161,7 +160,7 @@ def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None, hooks: Hoo
                     len(takes),
                     time.monotonic() - begun_s,
                     solved.judgement.verdict.value,
-                    str(solved.judgement),
+                    solved.judgement.reason,
                     frames=_frames(solved),
                     points=_points(solved, wanted),
                     pairs=_pairs(found, solved),
@@ -228,9 +227,3 @@ def _points(solved: Calibrated, wanted: Wanted | None) -> tuple[PointRow, ...]:
         at = [0.0, 0.0, wanted.at_m]
         points = [calibration.uncertainty_at(at, name, level=wanted.level) for name in calibration.points]
     return tuple(PointRow(one.frame, float(np.linalg.norm(one.point_m)), one.radius_mm) for one in points)
-
-
-def pose_of(proposal: Proposal) -> tuple[list[float], list[float]]:
-    """A proposal's position in metres, and its turns about the fixed axes x, y, z in degrees."""
-    T = np.array(proposal.T)
-    return T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True).tolist()

@@ -183,10 +183,10 @@ class PageServer:
         while True:
             await changed.wait()
             changed.clear()
-            for sensor, seen in list(self._session.pictures.items()):
-                if numbers.get(sensor) != seen.number:
-                    numbers[sensor] = seen.number
-                    await page.send_bytes(_picture(seen, self._session.seen_s[sensor]))
+            for sensor, stream in self._session.streams.sensors.items():
+                if stream.latest is not None and numbers.get(sensor) != stream.latest.number:
+                    numbers[sensor] = stream.latest.number
+                    await page.send_bytes(_picture(stream.latest))
             if (wait_s := last_s + STATE_S - time.monotonic()) > 0.0:
                 if not changed.is_set():
                     asyncio.get_running_loop().call_later(wait_s, changed.set)
@@ -210,12 +210,12 @@ def _is_of_this_machine(host: str, told: str) -> bool:
         return False
 
 
-def _picture(seen: Seen, seen_s: float) -> bytes:
+def _picture(seen: Seen) -> bytes:
     """A picture for the page: the length of its head, the head in JSON, and the JPEG or PNG (or none)."""
     head = {
         "sensor": seen.sensor,
         "received_ms": 1e-6 * seen.message.received_ns,
-        "seen_ms": 1e3 * seen_s,
+        "seen_ms": 1e3 * seen.at_s,
         "size": seen.size,
         "targets": [
             {

@@ -22,7 +22,7 @@ from loky import ProcessPoolExecutor, cpu_count
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
-from gtsam_rwhec.capture.live_answer import Answer, Hooks, Wanted, answer_of, calibrated, pose_of
+from gtsam_rwhec.capture.live_answer import Answer, Hooks, Wanted, answer_of, calibrated
 from gtsam_rwhec.capture.live_streams import Seen, SensorStream, Stillness, StillOptions, Streams
 from gtsam_rwhec.capture.live_takes import CALIBRATION, RECORDED, RIG_FILE, TAKES, Takes
 from gtsam_rwhec.capture.sources import FollowedFile, ReplayedLog, Source, is_of_transforms
@@ -87,27 +87,19 @@ def _is_other_pose(T: Array, other: Array) -> bool:
 
 
 class Session:
-    """A session; `run` ends when it is stopped.
-
-    Raises
-    ------
-    LogError
-        The folder cannot be used.
-    """
+    """A session; `run` ends when it is stopped. Raises `LogError` where its folder cannot be used."""
 
     def __init__(self, source: Source, rig: Rig, folder: Path, options: LiveOptions) -> None:
         self.source, self.rig, self.options = source, rig, options
         self.takes = Takes(folder)
-        if source.is_at_rest:
-            self.takes.clear()  # all images are still in the folder, and come again
+        if source.is_at_rest and self.takes.all:
+            raise LogError(f"{folder} has takes, and all images of {source.name} would be taken again; give another -o")
         self.streams = Streams(source, rig, options.still)
         self._still = Stillness(False, "no poses have come yet")
         self.when_still = options.takes_when_still or source.is_at_rest
         self.answer: Answer | None = None
         self.judgement: Judgement | None = None  #: of the last calibration that was saved
         self.ended = False
-        self.pictures: dict[str, Seen] = {}  #: the latest of each sensor
-        self.seen_s: dict[str, float] = {}  #: when its targets were found, seconds since 1970
         self.viewers: set[asyncio.Event] = set()  #: set whenever there is something new to show
         self.said_count = 0  #: things that happened so far
         self._said: deque[tuple[str, str, str]] = deque(maxlen=MOST_SAID)
@@ -191,7 +183,6 @@ class Session:
     def state(self) -> dict[str, Any]:
         """Everything that is shown, but for the pictures."""
         streams, takes = self.streams, self.takes.all
-        proposal = None if self.answer is None else self.answer.proposal
         return {
             "source": {"name": self.source.name, "is_connected": self.source.is_connected, "state": self.source.state},
             "cameras": [self._camera(stream) for stream in streams.sensors.values()],
@@ -203,10 +194,9 @@ class Session:
                 "is_saved": self._saved == self._changes,
             },
             "answer": None if self.answer is None else asdict(self.answer),
-            "verdict": self._verdict(),
+            "verdict": Verdict(self.answer.verdict).words if self.answer is not None and self.answer.verdict else "",
             "is_answering": self._answer_due.is_set(),
             "wanted": None if self.options.wanted is None else asdict(self.options.wanted),
-            "next_pose": None if proposal is None else pose_of(proposal),
             "troubles": [*self._lacking(), *streams.troubles()],
             "counted": [str(trouble) for trouble in self.source.troubles.values()],
             "said": list(self._said)[::-1],
@@ -228,9 +218,6 @@ class Session:
             "fault": stream.fault or ("" if seen is None else seen.fault),
             "is_quiet": time.monotonic() - stream.received_s > QUIET_S,
         }
-
-    def _verdict(self) -> str:
-        return Verdict(self.answer.verdict).words if self.answer is not None and self.answer.verdict else ""
 
     def _lacking(self) -> list[str]:
         """What the source does not have, once it had time to say what it has."""
@@ -266,10 +253,10 @@ class Session:
 
     def _look(self) -> None:
         """Search images that wait, in threads."""
-        for stream, number, message, work in self.streams.next_to_look_at():
-            self._begin(self._look_at(stream, number, message, work))
+        for stream, work in self.streams.next_to_look_at():
+            self._begin(self._look_at(stream, work))
 
-    async def _look_at(self, stream: SensorStream, number: int, message: Any, work: Callable[[], Seen]) -> None:
+    async def _look_at(self, stream: SensorStream, work: Callable[[], Seen]) -> None:
         seen = await asyncio.get_running_loop().run_in_executor(self._threads, work)
         self._look_ended(seen)
         await asyncio.sleep(max(0.0, stream.rests_until_s - time.monotonic()))
@@ -277,7 +264,6 @@ class Session:
 
     def _look_ended(self, seen: Seen) -> None:
         self.streams.looked(seen)
-        self.pictures[seen.sensor], self.seen_s[seen.sensor] = seen, time.time()
         self.touch()
         if self.source.is_at_rest:
             self._ask_for_instant(seen)

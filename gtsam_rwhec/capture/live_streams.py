@@ -72,6 +72,7 @@ class Seen:
     fault: str = ""  #: why the image could not be used
     picture: bytes = b""  #: JPEG or PNG for the page
     size: tuple[int, int] | None = None  #: width, height in which corners are
+    at_s: float = field(default_factory=time.time)  #: when it was seen, seconds since 1970
 
     @property
     def used(self) -> dict[str, Array]:
@@ -182,24 +183,14 @@ class Streams:
                     self._check_clock(message, poses[0])
                     self._take_poses(message, poses)
 
-    def next_to_look_at(self) -> Iterator[tuple[SensorStream, int, Message, Callable[[], Seen]]]:
+    def next_to_look_at(self) -> Iterator[tuple[SensorStream, Callable[[], Seen]]]:
         """Images that can be searched now, each with the function that does so, for another thread."""
         for stream in self.sensors.values():
-            rests = time.monotonic() < stream.rests_until_s
-            if stream.waiting is None or stream.is_looked_at or stream.camera is None or rests:
-                continue
-            stream.begun_s = time.monotonic()
-            number, message, image = stream.waiting
-            stream.waiting, stream.is_looked_at = None, True
-            make = partial(Detector, stream.camera, self._rig.target_list, self._rig.detection_options)
-            frame = self._rig.frame_of(stream.sensor)
-            families = {target.name: target.family for target in self._rig.target_list}
-            yield (
-                stream,
-                number,
-                message,
-                partial(_looked_at, stream.sensor, frame, number, message, image, make, families),
-            )
+            is_free = not stream.is_looked_at and time.monotonic() >= stream.rests_until_s
+            if stream.waiting is not None and stream.camera is not None and is_free:
+                work = partial(_looked_at, self._rig, stream.sensor, stream.camera, *stream.waiting)
+                stream.waiting, stream.is_looked_at, stream.begun_s = None, True, time.monotonic()
+                yield stream, work
 
     def looked(self, seen: Seen) -> None:
         """Take what was seen in an image, or in a driver's message."""
@@ -349,28 +340,20 @@ class Streams:
         return Seen(sensor, records[0].stamp_ns, self.number, message, known, size=size)
 
 
-def _looked_at(
-    sensor: str,
-    frame: str,
-    number: int,
-    message: Message,
-    image: ImageRecord,
-    make: Callable[[], Detector],
-    families: dict[str, str],
-) -> Seen:
+def _looked_at(rig: Rig, sensor: str, camera: Camera, number: int, message: Message, image: ImageRecord) -> Seen:
     """What is seen in an image. Runs in a thread, which keeps its detectors."""
-    (found,) = look([image], make)
+    (found,) = look([image], partial(Detector, camera, rig.target_list, rig.detection_options))
+    stamp, families = image.stamp_ns, {target.name: target.family for target in rig.target_list}
     records = tuple(
         DetectionRecord(
-            image.stamp_ns, image.stamp_ns, image.topic, frame, families[one.target], one.target,
+            stamp, stamp, image.topic, rig.frame_of(sensor), families[one.target], one.target,
             np.asarray(one.corners_px, dtype=np.float64), reason=one.reason(one.rejection),
             corner_indices=tuple(one.indices.tolist()),
         )
         for one in (found.found.detections if found.found is not None else ())
     )  # fmt: skip
-    camera = make.args[0]  # type: ignore[attr-defined]
     size = camera.width, camera.height
-    return Seen(sensor, image.stamp_ns, number, message, records, found.fault, _picture(image), size)
+    return Seen(sensor, stamp, number, message, records, found.fault, _picture(image), size)
 
 
 def _picture(image: ImageRecord) -> bytes:
@@ -386,11 +369,11 @@ def _picture(image: ImageRecord) -> bytes:
 
 def _moved_px(recent: Sequence[Seen], begin_ns: int, end_ns: int) -> float:
     """How far any corner moved in the images between two stamps, pixels."""
-    inside = [seen for seen in recent if begin_ns <= seen.stamp_ns <= end_ns]
-    furthest = 0.0
-    for first, second in zip(inside[:1] * len(inside), inside, strict=True):
-        for name, corners in first.used.items():
-            other = second.used.get(name)
-            if other is not None and other.shape == corners.shape:
-                furthest = max(furthest, float(np.linalg.norm(other - corners, axis=1).max()))
-    return furthest
+    inside = [seen.used for seen in recent if begin_ns <= seen.stamp_ns <= end_ns]
+    moved = [
+        float(np.linalg.norm(other[name] - corners, axis=1).max())
+        for other in inside[1:]
+        for name, corners in inside[0].items()
+        if name in other and other[name].shape == corners.shape
+    ]
+    return max(moved, default=0.0)

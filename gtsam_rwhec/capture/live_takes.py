@@ -97,11 +97,6 @@ class Takes:
             raise LogError(f"{self.all[-1].path} cannot be removed: {error.strerror}.") from error
         return self.all.pop()
 
-    def clear(self) -> None:
-        """Remove all takes."""
-        while self.undo() is not None:
-            pass
-
     @property
     def paths(self) -> list[Path]:
         """The files of the takes, in the order in which they were made."""

@@ -71,7 +71,12 @@ def drawn(state: dict[str, Any]) -> RenderableType:
     words += "; takes when the robot stands still" if takes["when_still"] else ""
     lines.append(Text(f"{words}. {state['busy']}"))
     if answer is not None:
-        lines.append(Text(answer["sentence"] or answer["why_none"], STYLES.get(answer["verdict"], "")))
+        lines.append(
+            Text(
+                ": ".join(filter(None, (state["verdict"], answer["reason"] or answer["why_none"]))),
+                STYLES.get(answer["verdict"], ""),
+            )
+        )
         wanted = f", wanted {state['wanted']['mm']:g} mm" if state["wanted"] else ""
         lines += [
             Text(

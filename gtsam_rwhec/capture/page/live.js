@@ -35,7 +35,7 @@ function viewOf(name) {
 }
 
 function draw(name) {
-  const { canvas, head, image, figure } = viewOf(name);
+  const { canvas, head, image, figure, words } = viewOf(name);
   const [width, height] = head.size ?? (image ? [image.width, image.height] : [640, 480]);
   canvas.width = width; canvas.height = height;
   const pen = canvas.getContext("2d"), unit = width / 640;
@@ -70,8 +70,9 @@ function draw(name) {
     label("bring it here", outline[0][0], outline[0][1]);
   }
   pen.setLineDash([]);
-  const seen = head.targets.filter((each) => !each.reason).map((each) => each.name);
-  canvas.setAttribute("aria-label", `Image of ${name}: ${seen.join(", ") || "no target"}`);
+  const seen = head.targets.map((each) => (each.reason ? `${each.name} (${each.reason})` : each.name)).join(", ");
+  $(".sees", words).textContent = `sees ${seen || "no target"}`;
+  canvas.setAttribute("aria-label", `Image of ${name}: ${seen || "no target"}`);
   figure.dataset.age = Math.round(Date.now() - head.seen_ms);
   figure.dataset.late = Math.round(Date.now() - head.received_ms);
   figure.dataset.drawn = Number(figure.dataset.drawn ?? 0) + 1;
@@ -90,8 +91,7 @@ async function showPicture(buffer) {
 
 function showCamera(camera, answer) {
   const { words, cells } = viewOf(camera.name);
-  const names = Object.entries(camera.targets).map(([name, why]) => (why ? `${name} (${why})` : name));
-  $(".sees", words).textContent = camera.fault || (camera.is_quiet ? "no images now" : `sees ${names.join(", ") || "no target"}`);
+  if (camera.fault || camera.is_quiet) $(".sees", words).textContent = camera.fault || "no images now";
   $(".counts", words).textContent = `${camera.received} came, ${camera.looked} searched, ${camera.skipped} passed over for newer ones`;
   const grid = answer?.cells[camera.name] ?? [];
   cells.hidden = !grid.length;
@@ -102,11 +102,11 @@ function showCamera(camera, answer) {
   cells.setAttribute("aria-label", cells.title = `${share} % of the image has corners of takes`);
 }
 
-function showAnswer({ answer, verdict, wanted, takes, is_answering, next_pose }) {
+function showAnswer({ answer, verdict, wanted, takes, is_answering }) {
   const section = $("#verdict");
   section.className = answer ? wheres[answer.verdict] ?? "" : "";
   $(".word", section).textContent = answer ? verdict || "No answer yet" : takes.count ? "Calibrating" : "Nothing taken yet";
-  $(".why", section).textContent = answer ? answer.sentence || answer.why_none : "";
+  $(".why", section).textContent = answer ? answer.reason || answer.why_none : "";
   $(".age", section).textContent = answer
     ? `From ${answer.takes} take${answer.takes === 1 ? "" : "s"}, in ${answer.seconds.toFixed(1)} s${is_answering ? "; calibrating the newer ones" : ""}.`
     : "";
@@ -151,9 +151,9 @@ function showAnswer({ answer, verdict, wanted, takes, is_answering, next_pose })
   fill($("#determines .free"), (answer?.free ?? []).map((words) => made("li", words)));
   $("#next").hidden = !answer?.proposal;
   if (answer?.proposal) {
-    const [place, turn] = next_pose, join = (numbers, n) => numbers.map((each) => each.toFixed(n)).join(", ");
+    const place = answer.proposal.T.slice(0, 3).map((row) => row[3].toFixed(3)).join(", ");
     $("#next .words").textContent = answer.proposal.words;
-    $("#next .pose").textContent = `In ${answer.proposal.frame}: ${join(place, 3)} m; roll, pitch, yaw ${join(turn, 1)} degrees`;
+    $("#next .pose").textContent = `At ${place} m in ${answer.proposal.frame}`;
   }
 }
 
