@@ -145,6 +145,7 @@ def until(page: Any, condition: str) -> bool:
     until_s = time.monotonic() + PATIENCE_S
     while not page.evaluate(condition):
         if time.monotonic() > until_s:
+            print(f"the page never came to {condition}:\n{page.inner_text('body')}", file=sys.stderr)
             return False
         page.wait_for_timeout(50)
     return True

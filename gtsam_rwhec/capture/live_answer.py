@@ -16,7 +16,6 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import RwhecError, RwhecWarning
-from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.logs import ImageRecord
 from gtsam_rwhec.logs.mcap_reader import open_log
 from gtsam_rwhec.problem.measurements import Pair
@@ -72,15 +71,6 @@ class Hooks:
 
 
 @dataclass(frozen=True)
-class FrameRow:
-    """How well a frame is known: its largest standard deviations about and along its axes."""
-
-    name: str
-    rotation_deg: float
-    translation_mm: float
-
-
-@dataclass(frozen=True)
 class PointRow:
     """How far off a point is that a sensor sees; infinite where a free direction moves it."""
 
@@ -108,7 +98,6 @@ class Answer:
     verdict: str = ""  #: the value of a `Verdict`; empty where there is no answer
     reason: str = ""  #: of the verdict
     why_none: str = ""  #: why there is no answer yet; empty where there is one
-    frames: tuple[FrameRow, ...] = ()
     points: tuple[PointRow, ...] = ()
     pairs: tuple[PairRow, ...] = ()
     free: tuple[str, ...] = ()  #: free directions, each with what settles it
@@ -161,7 +150,6 @@ def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None, hooks: Hoo
                     time.monotonic() - begun_s,
                     solved.judgement.verdict.value,
                     solved.judgement.reason,
-                    frames=_frames(solved),
                     points=_points(solved, wanted),
                     pairs=_pairs(found, solved),
                     free=tuple(f"{one}. {CURES[one.reason]}" for one in _free(solved)),
@@ -208,14 +196,6 @@ def _pairs(found: RunLog, solved: Calibrated | None = None) -> tuple[PairRow, ..
                 count = int(solved.pairs[pair].used.sum())
             determined = alone[pair].is_unique if pair in alone else None
             rows.append(PairRow(target, sensor, count, determined))
-    return tuple(rows)
-
-
-def _frames(solved: Calibrated) -> tuple[FrameRow, ...]:
-    rows = []
-    for name in sorted([*solved.refined.Y, *solved.refined.X], key=natural_key):
-        deg, mm = solved.refined.standard_deviations(name)
-        rows.append(FrameRow(name, float(deg.max()), float(mm.max())))
     return tuple(rows)
 
 

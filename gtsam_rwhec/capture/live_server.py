@@ -52,20 +52,9 @@ LONGEST_ASKED = 1000
 
 
 class PageServer:
-    """Serves the page of a session at `address`.
+    """Serves the page of a session at `address`: a `host` of this machine, and a port, of which 0 is a free one.
 
-    Parameters
-    ----------
-    session : Session
-    host : str
-        The address of this machine to listen on: 127.0.0.1 is reached from this machine alone.
-    port : int
-        0 takes a free one.
-
-    Raises
-    ------
-    LogError
-        The port is taken, or the host is not one of this machine's.
+    Raises `LogError` where the port is taken, or the host is not one of this machine's.
     """
 
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 0) -> None:

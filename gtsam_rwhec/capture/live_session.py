@@ -49,24 +49,13 @@ NEW_M, NEW_RAD = 0.005, 0.01
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of a session.
+    """Options of a session."""
 
-    Attributes
-    ----------
-    wanted : Wanted, optional
-        The accuracy that is wanted.
-    still : StillOptions
-    takes_when_still : bool
-        Whether it takes by itself from the start, wherever the robot stands still at a new pose.
-    publish : str
-        The topic on which poses are proposed; empty for none.
-    hooks : Hooks
-    """
-
-    wanted: Wanted | None = None
+    wanted: Wanted | None = None  #: the accuracy that is wanted
     still: StillOptions = field(default_factory=StillOptions)
+    #: Whether it takes by itself from the start, wherever the robot stands still at a new pose.
     takes_when_still: bool = False
-    publish: str = ""
+    publish: str = ""  #: the topic on which poses are proposed; empty for none
     hooks: Hooks = field(default_factory=Hooks)
 
 

@@ -42,22 +42,12 @@ PICTURE_PX, PICTURE_BYTES = 960, 250_000
 
 @dataclass(frozen=True)
 class StillOptions:
-    """When the robot stands still.
-
-    Attributes
-    ----------
-    seconds : float
-        For so long, by the stamps,
-    mm, deg : float
-        the carriers' pose moves by less than these, millimetres and degrees,
-    px : float
-        and each corner by less than this, pixels.
-    """
+    """When the robot stands still: for some seconds of the stamps, pose and corners move by less than these."""
 
     seconds: float = 0.5
-    mm: float = 0.5
+    mm: float = 0.5  #: of the carriers' pose, with `deg`
     deg: float = 0.05
-    px: float = 0.7
+    px: float = 0.7  #: of each corner
 
 
 @dataclass(frozen=True, eq=False)

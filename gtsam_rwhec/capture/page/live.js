@@ -128,12 +128,6 @@ function showAnswer({ answer, verdict, wanted, takes, is_answering }) {
     }
     return item;
   }));
-  fill($("#accuracy tbody"), (answer?.frames ?? []).map((frame) => {
-    const row = made("tr"), head = made("th", frame.name);
-    head.scope = "row";
-    row.append(head, made("td", digits(frame.rotation_deg)), made("td", digits(frame.translation_mm)));
-    return row;
-  }));
   const pairs = answer?.pairs ?? [], sensors = [...new Set(pairs.map((pair) => pair.sensor))];
   const head = made("tr"), first = made("th", "target");
   head.append(first, ...sensors.map((name) => made("th", name)));
