@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -96,7 +96,8 @@ class SensorStream:
     received_s: float = -np.inf  #: when the last message came, by a clock of this process
     ahead_s: float = 0.0  #: of the last message: its stamp less that of the pose that came before it
     fault: str = ""  #: why there can be no detections
-    recent: deque[Seen] = field(default_factory=lambda: deque(maxlen=100))
+    #: Stamps and corners of the last images, for stillness
+    recent: deque[tuple[int, dict[str, Array]]] = field(default_factory=lambda: deque(maxlen=100))
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class Streams:
         self.sensors = {name: SensorStream(name) for name in rig.sensors}
         self._sensor_of = {s.images or s.detections: name for name, s in rig.sensors.items()}
         self._announced: dict[str, IntrinsicsRecord] = {}
-        self._constant: dict[tuple[str, bytes | None], Message] = {}  # camera infos, static transforms
+        self._constant: dict[tuple[object, ...], Message] = {}  # camera infos, static transforms
         self._static: dict[tuple[str, str], PoseRecord] = {}
         self._poses: deque[tuple[int, Message, PoseRecord]] = deque()
         self._unread_poses: list[Message] = []
@@ -131,20 +132,19 @@ class Streams:
     def take_in(self, message: Message) -> list[Seen]:
         """Take a message; what is seen in it, where a driver says so."""
         self.number += 1
-        topic = message.channel.topic
-        if topic == self._rig.carriers.poses.topic or is_of_transforms(
-            topic, message.schema.name if message.schema else ""
-        ):
+        topic, schema = message.channel.topic, message.schema.name if message.schema else ""
+        if topic == self._rig.carriers.poses.topic or is_of_transforms(topic, schema):
             self._unread_poses.append(message)
             return []
+        self.read_poses()
         sensor = self._sensor_of.get(topic)
         records = next((records for _, records in self._read([message])), ())
         for record in records[:1]:
             self._check_clock(message, record)
-        if sensor is not None:
+        if sensor is not None and records:
             stream = self.sensors[sensor]
             stream.received_s = time.monotonic()
-            if records and self.latest_pose_ns is not None:
+            if self.latest_pose_ns is not None:
                 stream.ahead_s = 1e-9 * (records[0].stamp_ns - self.latest_pose_ns)
         for record in records:
             if isinstance(record, ImageRecord) and sensor is not None:
@@ -152,7 +152,7 @@ class Streams:
                 stream.waiting = self.number, message, record
             elif isinstance(record, IntrinsicsRecord) and record.topic not in self._announced:
                 self._announced[record.topic] = record
-                self._constant[record.topic, None] = message
+                self._constant[record.topic,] = message
                 self._set_cameras()
         driver = [record for record in records if isinstance(record, DetectionRecord)]
         if sensor is not None and driver:
@@ -186,7 +186,7 @@ class Streams:
         """Take what was seen in an image, or in a driver's message."""
         stream = self.sensors[seen.sensor]
         stream.latest, stream.is_looked_at, stream.looked = seen, False, stream.looked + 1
-        stream.recent.append(seen)
+        stream.recent.append((seen.stamp_ns, seen.used))
         now_s = time.monotonic()
         stream.rests_until_s = now_s + min(now_s - stream.begun_s, LONGEST_REST_S)
 
@@ -296,7 +296,7 @@ class Streams:
             poses = [replace(record, parent=parent, child=child) for record in poses]
         if poses[0].is_static:
             self._static.update({(record.parent, record.child): record for record in poses})
-            self._constant[message.channel.topic, message.data] = message
+            self._constant[message.channel.topic, *((record.parent, record.child) for record in poses)] = message
             return
         for record in poses:
             self._poses.append((record.stamp_ns, message, record))
@@ -357,9 +357,9 @@ def _picture(image: ImageRecord) -> bytes:
         return b""
 
 
-def _moved_px(recent: Sequence[Seen], begin_ns: int, end_ns: int) -> float:
+def _moved_px(recent: Iterable[tuple[int, dict[str, Array]]], begin_ns: int, end_ns: int) -> float:
     """How far any corner moved in the images between two stamps, pixels."""
-    inside = [seen.used for seen in recent if begin_ns <= seen.stamp_ns <= end_ns]
+    inside = [used for stamp, used in recent if begin_ns <= stamp <= end_ns]
     moved = [
         float(np.linalg.norm(other[name] - corners, axis=1).max())
         for other in inside[1:]
