@@ -78,12 +78,10 @@ def drawn(state: dict[str, Any]) -> RenderableType:
             )
         )
         wanted = f", wanted {state['wanted']['mm']:g} mm" if state["wanted"] else ""
-        lines += [
-            Text(
-                f"{one['sensor']}: a point {one['distance_m']:.2f} m away within {rounded(one['radius_mm'])} mm{wanted}"
-            )
-            for one in answer["points"]
-        ]
+        for one in answer["points"]:
+            is_known = one["radius_mm"] < float("inf")
+            off = f"within {rounded(one['radius_mm'])} mm" if is_known else "not determined"
+            lines.append(Text(f"{one['sensor']}: a point {one['distance_m']:.2f} m away {off}{wanted}"))
         lines += [Text(words, "bold red") for words in answer["free"]]
         lines += [Text(answer[what]["words"]) for what in ("proposal", "decision") if answer[what]]
     lines += [Text(words, "bold red") for words in state["troubles"]]

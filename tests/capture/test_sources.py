@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import json
 import struct
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from foxglove_robot import Robot, messages_of
-from places import CELL
+from places import CELL, EXAMPLES
 from stations import stations
 from synthetic_logs import rig, write
 from websockets.asyncio.server import ServerConnection, serve
@@ -21,7 +22,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from gtsam_rwhec.capture.live_session import source_of
 from gtsam_rwhec.capture.sources import FollowedFile, Message, Reader, ReplayedLog, Source
 from gtsam_rwhec.capture.sources_folder import FolderSource
-from gtsam_rwhec.capture.sources_foxglove import FoxgloveSource
+from gtsam_rwhec.capture.sources_foxglove import FoxgloveSource, _pose_stamped
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
 from gtsam_rwhec.logs.ros2_messages import ros2_decoder
@@ -261,3 +262,25 @@ def test_images_and_poses_that_fall_into_a_folder(tmp_path: Path) -> None:
     assert {("ImageRecord", stamp) for stamp in source.instants} <= expected
     whole = {(m.channel.topic, m.data) for m in messages_of(tmp_path / "whole.mcap")}
     assert {(m.channel.topic, m.data) for m in found} == whole
+
+
+def test_the_node_s_definitions_are_those_that_the_reader_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES / "ros2_live" / "gtsam_rwhec_live"))
+    definitions = importlib.import_module("definitions")
+    texts = {
+        "geometry_msgs/msg/PoseStamped": "# A pose\nstd_msgs/Header header\nPose pose",
+        "std_msgs/msg/Header": "builtin_interfaces/Time stamp  # when\nstring frame_id",
+        "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+        "geometry_msgs/msg/Pose": "Point position\nQuaternion orientation",
+        "geometry_msgs/msg/Point": "float64 x\nfloat64 y\nfloat64 z",
+        "geometry_msgs/msg/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1",
+    }
+    for name, text in texts.items():
+        (tmp_path / name.replace("/", ".")).write_text(text)
+    found = definitions.definition_of("geometry_msgs/msg/PoseStamped", lambda name: tmp_path / name.replace("/", "."))
+    data = _pose_stamped("base", (1, 2), [0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+    ((pose,),) = ros2_decoder("geometry_msgs/msg/PoseStamped", found, lambda count: None)("/pose", [data], [0])
+    assert isinstance(pose, PoseRecord)
+    assert (pose.parent, pose.stamp_ns, pose.T[0, 3]) == ("base", 1_000_000_002, 0.1)
