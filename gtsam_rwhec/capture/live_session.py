@@ -202,7 +202,6 @@ class Session:
             "received": self.source.received[topic],
             "looked": stream.looked,
             "skipped": stream.skipped,
-            "waiting": int(stream.waiting is not None) + int(stream.is_looked_at),
             "targets": {} if seen is None else {record.id: record.reason for record in seen.records},
             "fault": stream.fault or ("" if seen is None else seen.fault),
             "is_quiet": time.monotonic() - stream.received_s > QUIET_S,

@@ -54,7 +54,6 @@ class FoxgloveSource(Source):
 
     def __init__(self, name: str, rig: Rig) -> None:
         super().__init__(name, rig)
-        self.lost = 0  #: how often a connection was lost
         self._socket: ClientConnection | None = None
         self._channels: dict[int, tuple[Channel, Schema | None]] = {}
         self._encodings: tuple[str, ...] = ()  #: in which the server takes messages
@@ -123,7 +122,8 @@ class FoxgloveSource(Source):
         self.is_connected, self.state = True, f"connected ({socket.subprotocol})"
 
     def _end(self, words: str) -> None:
-        self.lost += self.is_connected
+        if self.is_connected:
+            self.say("connections that were lost", words)
         self._socket, self.is_connected = None, False
         self.state = f"{words}; trying again"
 
