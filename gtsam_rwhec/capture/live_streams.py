@@ -30,6 +30,8 @@ from gtsam_rwhec.runs.sensor_intrinsics import intrinsics_of
 
 #: Seconds of poses that are kept, and those around an image that a take has.
 KEPT_S, AROUND_S = 20.0, 0.5
+#: At most this many poses are kept, whatever their stamps say.
+MOST_POSES = 50_000
 #: A stamp that is this much (seconds) further on than the time that passed was set by somebody.
 FORWARD_S = 5.0
 #: Poses and images whose stamps are this far apart (seconds) are of two clocks.
@@ -122,7 +124,7 @@ class Streams:
         self._announced: dict[str, IntrinsicsRecord] = {}
         self._constant: dict[tuple[object, ...], Message] = {}  # camera infos, static transforms
         self._static: dict[tuple[str, str], PoseRecord] = {}
-        self._poses: deque[tuple[int, Message, PoseRecord]] = deque()
+        self._poses: deque[tuple[int, Message, PoseRecord]] = deque(maxlen=MOST_POSES)
         self._unread_poses: list[Message] = []
         self._clocks: dict[str, tuple[int, int]] = {}  # stamp and time of arrival of a topic's last message
         self.number = 0  #: messages that came
