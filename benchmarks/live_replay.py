@@ -37,6 +37,7 @@ from places import CELL
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from gtsam_rwhec.capture.live_takes import Takes
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import open_log
 
@@ -294,6 +295,38 @@ def killed(number: int, chance: random.Random, folder: Path) -> tuple[int, str]:
         print(f"killed {number + 1}: {shown} takes were shown, {len(takes)} are in the log", file=sys.stderr)
 
 
+def killed_writing(kills: int, chance: random.Random, folder: Path) -> list[Row]:
+    """The writer alone, killed while it writes one take after the other: most kills are in the middle of one."""
+    messages = [(message.received_ns, message) for message in messages_of(CELL / "robot_cell.mcap")[:120]]
+    lost = unread = middle = total = 0
+    for number in range(kills):
+        out, (told, tell) = folder / f"writing-{number}", os.pipe()
+        writer = os.fork()
+        if not writer:
+            takes = Takes(out)
+            while True:
+                takes.add(messages, {}, len(takes.all) + 1, is_still=True)
+                os.write(tell, b"x")
+        os.close(tell)
+        time.sleep(chance.uniform(0.02, 0.4))
+        os.kill(writer, signal.SIGKILL)
+        os.waitpid(writer, 0)
+        told_of = len(os.read(told, 1 << 20))
+        os.close(told)
+        middle += any((out / "takes").glob(".*.part"))
+        left = Takes(out).all
+        lost, total = lost + max(0, told_of - len(left)), total + len(left)
+        for take in left:
+            with open_log(take.path) as log:
+                unread += bool(log.losses) or sum(1 for _ in log.records(on_bad="raise")) < len(messages) // 2
+        shutil.rmtree(out)
+    more = f" of {total}, {kills} kills, {middle} in the middle of a take"
+    return [
+        at_most("takes that were written and are lost", lost, 0, more=more),
+        at_most("takes that cannot be read", unread, 0),
+    ]
+
+
 def full_disk(folder: Path) -> list[Row]:
     """What is said where the disk takes no more."""
     command = Command(str(CELL / "robot_cell.mcap"), folder / "full", "--speed", "2", most_bytes=30_000)
@@ -331,6 +364,7 @@ def rows(seconds: float, kills: int, seed: int, screenshots: str) -> list[Row]:
                 at_most("takes that were shown and are lost", lost, 0, more=f", killed {kills} times"),
                 at_most("recorded logs that cannot be read", len(faults), 0, more=f" {faults[:2]}" if faults else ""),
             ]
+            found += killed_writing(4 * kills, chance, folder)
         return [*found, *full_disk(folder)]
 
 
