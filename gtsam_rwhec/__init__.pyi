@@ -69,15 +69,6 @@ from .results import write_calibration as write_calibration
 from .results import write_refined as write_refined
 from .results import write_solution as write_solution
 
-# While it is measured: the answer so far, and when it is good enough.
-from . import capture as capture
-from .capture import Accuracy as Accuracy
-from .capture import StopDecision as StopDecision
-from .capture import StoppingRule as StoppingRule
-from .capture import Stream as Stream
-from .capture import StreamOptions as StreamOptions
-from .capture import StreamUpdate as StreamUpdate
-
 # From a log of images to a calibration, at once or step by step.
 from . import fleet as fleet
 from . import geometry as geometry
@@ -88,11 +79,17 @@ from . import rig as rig
 from . import detect as detect
 from .runs import calibrate_log as calibrate_log
 
-# While the robot stands there: what to measure next.
+# While the robot stands there: what to measure next, the answer so far, and when it is good enough.
 from . import capture as capture
+from .capture import Accuracy as Accuracy
 from .capture import Plan as Plan
 from .capture import PlannedPose as PlannedPose
 from .capture import PlanOptions as PlanOptions
+from .capture import StopDecision as StopDecision
+from .capture import StoppingRule as StoppingRule
+from .capture import Stream as Stream
+from .capture import StreamOptions as StreamOptions
+from .capture import StreamUpdate as StreamUpdate
 from .capture import plan as plan
 
 # Other methods, other libraries' calls, and problems whose truth is known.

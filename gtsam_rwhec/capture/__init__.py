@@ -1,4 +1,4 @@
-"""While the robot stands there: which poses to measure next, the answer so far, and when it is good enough."""
+"""While the robot stands there: what to measure next, the answer so far, when it is good enough, and a page for it."""
 
 from gtsam_rwhec.files.optional_packages import lazy_names
 

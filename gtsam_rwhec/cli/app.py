@@ -21,6 +21,7 @@ from gtsam_rwhec.cli.demo_and_data import demo, utias
 from gtsam_rwhec.cli.failures import HELP, ExitStatus, failures_in_words
 from gtsam_rwhec.cli.fleet_commands import run, watch
 from gtsam_rwhec.cli.init_command import init
+from gtsam_rwhec.cli.live_command import live
 from gtsam_rwhec.cli.plan_command import plan
 from gtsam_rwhec.cli.report_command import report
 from gtsam_rwhec.cli.stage_commands import clean, detect, export, solve
@@ -79,7 +80,7 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-OF_CALIBRATION = (calibrate, demo, init, plan, convert, detect, clean, solve, export, report, compare)
+OF_CALIBRATION = (calibrate, demo, init, plan, live, convert, detect, clean, solve, export, report, compare)
 for subcommand in (*OF_CALIBRATION, diff, verify, accept):
     add(subcommand, app)
 add(utias, fetch_app)

@@ -32,7 +32,7 @@ FEW = 320
 #: Errors of OpenCV's or of our arithmetic on the pixels of one image. They cost this image, and no other.
 OF_ONE_IMAGE = (cv2.error, ArithmeticError, LookupError, ValueError)
 #: With this environment, linear algebra uses one thread in each process, since each core has its process.
-_ONE_THREAD = dict.fromkeys(
+ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 
@@ -107,7 +107,7 @@ def detect_in_images(
         return of_batch
 
     with _opencv_as_before(), ThreadPoolExecutor(count) as threads, _Processes(count) as processes:
-        _quiet_on_one_thread()
+        quiet_on_one_thread()
         waiting: deque[tuple[int, Future[list[DetectedImage]], bool]] = deque()
         try:
             for number, batch in enumerate(_batches(images)):
@@ -118,7 +118,7 @@ def detect_in_images(
                     if count > 1 and submitted >= few and processes.are_ready():
                         future = processes.submit(batch, make_detector[batch[0].topic])
                     else:
-                        future = threads.submit(_look, batch, make_detector[batch[0].topic])
+                        future = threads.submit(look, batch, make_detector[batch[0].topic])
                     waiting.append((number, future, True))
                     submitted += len(batch)
                 while len(waiting) > count + 1 or (waiting and waiting[0][1].done()):
@@ -148,13 +148,13 @@ class _Processes:
     def are_ready(self) -> bool:
         """Whether the processes can take work at once. They start, and import, while the threads work."""
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.count, env=_ONE_THREAD, initializer=_quiet_on_one_thread)
+            self._pool = ProcessPoolExecutor(self.count, env=ONE_THREAD, initializer=quiet_on_one_thread)
             self._starting = [self._pool.submit(int) for _ in range(self.count)]
         return all(future.done() for future in self._starting)
 
     def submit(self, batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> Future[list[DetectedImage]]:
         assert self._pool is not None
-        future: Future[list[DetectedImage]] = self._pool.submit(_look, batch, make_detector)
+        future: Future[list[DetectedImage]] = self._pool.submit(look, batch, make_detector)
         return future
 
     def __enter__(self) -> _Processes:
@@ -169,7 +169,7 @@ class _Processes:
 _of_thread = threading.local()
 
 
-def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[DetectedImage]:
+def look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[DetectedImage]:
     """Detect in images of one topic, with a detector of this thread."""
     detectors: dict[str, Detector] = _of_thread.__dict__.setdefault("detectors", {})
     topic = batch[0].topic
@@ -239,7 +239,7 @@ def _opencv_as_before() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _quiet_on_one_thread() -> None:
+def quiet_on_one_thread() -> None:
     """Let OpenCV use one thread, since each core has one of ours, and print nothing: we report the faults."""
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

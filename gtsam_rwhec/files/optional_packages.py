@@ -16,6 +16,7 @@ EXTRAS = {
     "requests": "log", "yaml": "log", "zstandard": "log", "rosbags": "rosbags",
     "jinja2": "report", "matplotlib": "report", "plotly": "report", "rich": "report", "typer": "cli",
     "yourdfpy": "plan",
+    "starlette": "live", "uvicorn": "live", "websockets": "live",
     "dask": "fleet", "distributed": "fleet", "fsspec": "fleet", "pyarrow": "fleet", "s3fs": "fleet",
 }  # fmt: skip
 

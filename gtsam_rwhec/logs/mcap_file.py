@@ -158,7 +158,7 @@ class McapFile:
         except OSError as error:
             raise LogError(f"{self.path}, byte {offset}: {error.strerror}") from error
 
-    def _find_blocks(self) -> None:
+    def _check_begins(self) -> None:
         first = self._read(0, len(MAGIC))
         if first != MAGIC:
             begins = f"begins with {first!r}" if first else "is empty"
@@ -166,6 +166,9 @@ class McapFile:
                 f"{self.path} is not an MCAP file (version 0): it {begins}. ROS 1 bags and db3 bags must be converted "
                 "first: gtsam-rwhec convert."
             )
+
+    def _find_blocks(self) -> None:
+        self._check_begins()
         try:
             index = read_index(self._read, self.path, self.size, self.spending)
         except BudgetError:
@@ -190,9 +193,8 @@ class McapFile:
         self.spending.check_opened(sum(self._stated_size(at) for at in chunks))
         self._read_through()
 
-    def _records(self) -> Iterator[tuple[int, int, int]]:
-        """The opcode, place and length of each record, from front to back; the last one may not be whole."""
-        at = len(MAGIC)
+    def _records(self, at: int = len(MAGIC)) -> Iterator[tuple[int, int, int]]:
+        """The opcode, place and length of each record from a place on; the last one may not be whole."""
         while at + RECORD.size <= self.size:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             yield opcode, at, RECORD.size + length
@@ -324,6 +326,38 @@ class McapFile:
             return Messages(data, np.zeros(0, _MESSAGE_HEAD), starts, ends)
         windows = sliding_window_view(np.frombuffer(data, np.uint8), head_bytes)
         return Messages(data, windows[np.array(starts) - head_bytes].view(_MESSAGE_HEAD)[:, 0], starts, ends)
+
+
+class GrowingFile(McapFile):
+    """An MCAP file that is still being written; errors as of `McapFile`."""
+
+    is_ended = False  #: whether all was read, and the file ends there as one that its recorder has closed
+    _at = len(MAGIC)
+
+    def new_blocks(self) -> Iterator[Block]:
+        """What was written since it was asked last, as far as records are whole; `is_ended` at the file's end.
+
+        A file that became shorter raises a LogError: another one took its place.
+        """
+        self.size = os.fstat(self._stream.fileno()).st_size
+        self.spending = Spending(self.path, self.size)
+        if (
+            self.size < self._at
+            or not self.path.exists()
+            or not os.path.samestat(os.fstat(self._stream.fileno()), os.stat(self.path))
+        ):
+            raise LogError(f"{self.path}: another file took its place while it was read")
+        for opcode, at, length in self._records(self._at):
+            if at + length > self.size:
+                return
+            self._at, self.is_ended = at + length, opcode in (Opcode.DATA_END, Opcode.FOOTER)
+            if self.is_ended:
+                return
+            if opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield Block(at, length, is_chunk=opcode == Opcode.CHUNK)
+
+    def _find_blocks(self) -> None:
+        self._check_begins()
 
 
 def _zstd(content: bytes, most: int) -> bytes:

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from scipy.spatial.transform import Rotation
@@ -120,6 +121,13 @@ class LogWriter:
                             self._writer.add_message(target, logged, messages.data[start:end], published, sequence)
                         copied += 1
         return copied
+
+    def message(self, channel: Channel, schema: Schema | None, logged_ns: int, data: bytes) -> None:
+        """Write a message byte for byte, as it came on a channel with a schema."""
+        schema_id = 0 if schema is None else self._schema(schema.name, schema.encoding, schema.data)
+        target = self._channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)
+        with self._saying():
+            self._writer.add_message(target, logged_ns, data, logged_ns)
 
     def transforms(self, topic: str, stamp_ns: int, transforms: Iterable[tuple[str, str, Array]]) -> None:
         """Write a ``foxglove.FrameTransforms`` of (parent, child, T_parent_child)."""

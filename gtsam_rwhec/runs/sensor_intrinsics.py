@@ -81,6 +81,30 @@ def check_intrinsics_files(rig: Rig) -> None:
             stated_camera(rig, name, source)
 
 
+def intrinsics_of(rig: Rig, name: str, announced: Mapping[str, IntrinsicsRecord]) -> Camera | None:
+    """The camera of a sensor while messages still come; `announced` has the records so far by topic.
+
+    None where the rig file states none, or its topic has not said any yet. Raises as `read_intrinsics`, and
+    `CameraError` where they are to be estimated, which needs the images of a whole log.
+    """
+    source = rig.sensors[name].intrinsics
+    if source is None:
+        return None
+    if source.shared is not None:
+        return intrinsics_of(rig, source.shared, announced)
+    if source.estimate is not None:
+        raise CameraError(
+            f"{rig.source.place(('sensors', name, 'intrinsics'))}: they are to be estimated from a whole log. "
+            "Calibrate a log first, and state here what it found (camchain.yaml)"
+        )
+    if source.topic is None:
+        return stated_camera(rig, name, source)
+    said = announced.get(source.topic)
+    if said is None:
+        return None
+    return Camera.of(said.width, said.height, said.model, said.K, said.D, f"topic {source.topic}")
+
+
 def stated_camera(rig: Rig, name: str, source: Intrinsics) -> Camera:
     """The camera from numbers or from a file: the named one, the only one, or that of the sensor's name."""
     file = source.kalibr or source.file

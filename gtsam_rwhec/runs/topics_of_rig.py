@@ -35,7 +35,7 @@ def check_topics(log: Log, rig: Rig) -> None:
     """
     there = {topic.name for topic in log.topics()}
     _check_types(log, rig)
-    for path, topic in _named(rig):
+    for path, topic in named_topics(rig):
         if topic not in there and path[-2:] != (
             "intrinsics",
             "topic",
@@ -44,7 +44,7 @@ def check_topics(log: Log, rig: Rig) -> None:
                 f"{rig.source.place(path)}: {log.files[0].path} has no topic {topic}; it has: {log.topics_in_words()}."
             )
     owners = {frame: name for name in rig.sensors for frame in (name, rig.frame_of(name))}
-    for path, topic in _named(rig):
+    for path, topic in named_topics(rig):
         frame, sensor = _frame_of(log, topic) if topic in there else "", str(path[1])
         if owners.get(frame, sensor) != sensor:
             warnings.warn(
@@ -60,12 +60,12 @@ def wanted_topics(rig: Rig) -> tuple[str, ...]:
     poses = rig.carriers.poses.topic
     own = (poses,) if poses is not None else tuple(f"/{name}" for name in TF_TOPICS)
     of_stage = (topic(sensor) for sensor in rig.sensors for topic in (detections_topic, pairs_topic))
-    return tuple(dict.fromkeys((*own, *(topic for _, topic in _named(rig)), *of_stage)))
+    return tuple(dict.fromkeys((*own, *(topic for _, topic in named_topics(rig)), *of_stage)))
 
 
 def _check_types(log: Log, rig: Rig) -> None:
     """Refuse topics of a type that cannot be read."""
-    named = list(_named(rig))
+    named = list(named_topics(rig))
     if rig.carriers.poses.topic is not None:
         named.append((("carriers", "poses", "topic"), rig.carriers.poses.topic))
     of_topic = {topic.name: topic for topic in log.topics()}
@@ -86,7 +86,7 @@ def _check_types(log: Log, rig: Rig) -> None:
             )
 
 
-def _named(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
+def named_topics(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
     """The topics of sensors and where the rig file names them."""
     for name, sensor in rig.sensors.items():
         for key, topic in (("images", sensor.images), ("detections", sensor.detections)):

@@ -1,0 +1,1 @@
+"""A session of gtsam-rwhec on ROS 2 topics."""

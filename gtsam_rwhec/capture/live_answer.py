@@ -1,0 +1,209 @@
+"""The answer after a take: the stages of ``calibrate_log`` on the takes so far, in a process of their own.
+
+The session asks here, and only here: what the takes determine, where to go next, and whether to stop.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gtsam_rwhec.calibration.verdict import Judgement
+from gtsam_rwhec.detect.many_images import DetectedImage
+from gtsam_rwhec.errors import RwhecError, RwhecWarning
+from gtsam_rwhec.logs import ImageRecord
+from gtsam_rwhec.logs.mcap_reader import open_log
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.report.determined_section import CURES
+from gtsam_rwhec.results.image_errors import cells_with_corners
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.cleaning_stage import cleaned
+from gtsam_rwhec.runs.detection_stage import detected
+from gtsam_rwhec.runs.run_log import RunLog
+from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
+from gtsam_rwhec.runs.whole_runs import calibrate_log
+from gtsam_rwhec.solver.free_directions import FreeDirection
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The accuracy that is wanted: a point `at_m` in front of each sensor within `mm` millimetres of its true place."""
+
+    mm: float
+    at_m: float = 0.8
+    level: float = 0.95
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The pose to take next."""
+
+    frame: str  #: the frame in which the pose is
+    T: tuple[tuple[float, ...], ...]  #: (4, 4): the pose of the carrier that moves, metres
+    words: str  #: what it adds, and how to get there
+    #: Where targets should appear, by sensor: closed outlines (n, 2) in pixels
+    outlines: Mapping[str, Sequence[Sequence[tuple[float, float]]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether to stop."""
+
+    is_enough: bool
+    takes_needed: int | None  #: how many takes are still needed; None if that is not known, or none will do
+    words: str
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """Who proposes the next pose, and who decides when to stop; the page shows neither without one.
+
+    Functions of a module, since they are called in another process, with what was just calibrated.
+    """
+
+    next_pose: Callable[[Calibrated, Wanted | None], Proposal | None] | None = None
+    stop_decision: Callable[[Calibrated, Wanted | None], Decision | None] | None = None
+
+
+@dataclass(frozen=True)
+class PointRow:
+    """How far off a point is that a sensor sees; infinite where a free direction moves it."""
+
+    sensor: str
+    distance_m: float
+    radius_mm: float
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """How often a sensor saw a target, and whether these measurements determine both; None without an answer."""
+
+    target: str
+    sensor: str
+    count: int
+    is_determined: bool | None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the takes determine."""
+
+    takes: int
+    seconds: float  #: that it took
+    verdict: str = ""  #: the value of a `Verdict`; empty where there is no answer
+    reason: str = ""  #: of the verdict
+    why_none: str = ""  #: why there is no answer yet; empty where there is one
+    points: tuple[PointRow, ...] = ()
+    pairs: tuple[PairRow, ...] = ()
+    free: tuple[str, ...] = ()  #: free directions, each with what settles it
+    #: Corners in each cell of a sensor's images, rows from the top
+    cells: Mapping[str, Sequence[Sequence[int]]] = field(default_factory=dict)
+    proposal: Proposal | None = None
+    decision: Decision | None = None
+
+
+class _Known:
+    """Detections of the takes that were searched before, in this process."""
+
+    done, is_whole = 0, False
+
+    def __init__(self) -> None:
+        self._of: dict[tuple[str, int], DetectedImage] = {}
+
+    def known(self, number: int, batch: Sequence[ImageRecord]) -> list[DetectedImage] | None:
+        """The detections of a batch; None if one of its images is new."""
+        found = [self._of.get((image.topic, image.stamp_ns)) for image in batch]
+        return None if None in found else [each for each in found if each is not None]
+
+    def keep(self, number: int, found: list[DetectedImage]) -> None:
+        """Keep the detections of a batch."""
+        self._of.update({(image.topic, image.stamp_ns): image for image in found})
+
+    def finish(self) -> None:
+        """Nothing: the next take has more."""
+
+
+#: By the folder of the takes.
+_KNOWN: dict[Path, _Known] = {}
+
+
+def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None, hooks: Hooks) -> Answer:
+    """Calibrate from takes, as ``calibrate_log`` would from the log that they make. It raises nothing of ours."""
+    begun_s = time.monotonic()
+    cells: dict[str, list[list[int]]] = {}
+    pairs: tuple[PairRow, ...] = ()
+    known = _KNOWN.setdefault(takes[0].parent, _Known())
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)  # the verdict and the report say them
+            with open_log(takes) as log:
+                found = detected(log, rig, workers=1, keep=lambda cameras: known)  # type: ignore[arg-type, return-value]
+                cells, pairs = _cells(found), _pairs(found)
+                solved = solve_log(cleaned(found, rig), None)
+                return Answer(
+                    len(takes),
+                    time.monotonic() - begun_s,
+                    solved.judgement.verdict.value,
+                    solved.judgement.reason,
+                    points=_points(solved, wanted),
+                    pairs=_pairs(found, solved),
+                    free=tuple(f"{one}. {CURES[one.reason]}" for one in _free(solved)),
+                    cells=cells,
+                    proposal=None if hooks.next_pose is None else hooks.next_pose(solved, wanted),
+                    decision=None if hooks.stop_decision is None else hooks.stop_decision(solved, wanted),
+                )
+    except RwhecError as error:
+        return Answer(len(takes), time.monotonic() - begun_s, why_none=str(error), pairs=pairs, cells=cells)
+
+
+def calibrated(recorded: Path, rig: Rig, out: Path) -> Judgement:
+    """Calibrate from the recorded log into a folder, as ``gtsam-rwhec calibrate`` does; in this process."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)  # the report has them
+        return calibrate_log(recorded, rig, out).judgement
+
+
+def _free(solved: Calibrated) -> Sequence[FreeDirection]:
+    return solved.refined.free_directions or solved.solution.identifiability.free_directions
+
+
+def _cells(found: RunLog) -> dict[str, list[list[int]]]:
+    cells = {}
+    for sensor, camera in found.stages.cameras.items():
+        corners = [
+            record.corners_px
+            for record in found.detections.get(sensor, ())
+            if record.corners_px is not None and not record.reason
+        ]
+        pixels = np.concatenate(corners) if corners else np.zeros((0, 2))
+        cells[sensor] = cells_with_corners(pixels, (camera.width, camera.height)).tolist()
+    return cells
+
+
+def _pairs(found: RunLog, solved: Calibrated | None = None) -> tuple[PairRow, ...]:
+    alone = {} if solved is None else solved.solution.identifiability.pairs
+    rows = []
+    for sensor, records in found.detections.items():
+        for target in found.stages.rig.targets:
+            pair = Pair(target, sensor)
+            count = sum(not record.reason and record.id == target for record in records)
+            if solved is not None and pair in solved.pairs:
+                count = int(solved.pairs[pair].used.sum())
+            determined = alone[pair].is_unique if pair in alone else None
+            rows.append(PairRow(target, sensor, count, determined))
+    return tuple(rows)
+
+
+def _points(solved: Calibrated, wanted: Wanted | None) -> tuple[PointRow, ...]:
+    calibration = solved.calibration
+    if wanted is None:
+        points = list(calibration.points.values())
+    else:
+        at = [0.0, 0.0, wanted.at_m]
+        points = [calibration.uncertainty_at(at, name, level=wanted.level) for name in calibration.points]
+    return tuple(PointRow(one.frame, float(np.linalg.norm(one.point_m)), one.radius_mm) for one in points)

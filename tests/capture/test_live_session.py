@@ -1,0 +1,236 @@
+"""A session: takes where the robot stands still, undo, going on with what is there, and the command's own result."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.records import Channel, Schema
+from stations import stations
+from synthetic_logs import BEGIN_NS, Message, detections, rig, tag, transform, write
+
+from gtsam_rwhec.capture import sources
+from gtsam_rwhec.capture.live_answer import Decision, Hooks, Proposal, Wanted
+from gtsam_rwhec.capture.live_session import LiveOptions, Session, source_of
+from gtsam_rwhec.capture.live_takes import TakeInfo, Takes
+from gtsam_rwhec.errors import LogError, RwhecError
+from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs.mcap_writer import json_schema
+from gtsam_rwhec.results.result_file import read_result
+from gtsam_rwhec.rig import Rig, read_rig
+from gtsam_rwhec.runs import solve_log
+from gtsam_rwhec.runs.cleaning_stage import cleaned
+from gtsam_rwhec.runs.detection_stage import detected
+from gtsam_rwhec.runs.solving_stage import Calibrated
+
+
+class Given(sources.Source):
+    """A source of given messages, a block of them at once; it goes on when the test says so."""
+
+    def __init__(self, rig: Rig, *blocks: Sequence[Message]) -> None:
+        super().__init__("given", rig)
+        self.blocks, self.go_on = blocks, asyncio.Event()
+
+    async def messages(self) -> AsyncIterator[sources.Message]:
+        self.is_connected, self.state = True, "given"
+        for block in self.blocks:
+            for one in block:
+                schema = Schema(1, json_schema(one.schema), "jsonschema", one.schema)
+                self.topics[one.topic] = one.schema
+                channel = Channel(1, one.topic, one.encoding, {}, 1)
+                data = json.dumps(one.content).encode() if one.data is None else one.data
+                if self.wants(one.topic, one.schema):
+                    yield sources.Message(channel, schema, one.logged_ns, data)
+                    await asyncio.sleep(0)
+            await self.go_on.wait()
+            self.go_on.clear()
+
+
+async def until(session: Session, condition: Any, seconds: float = 30.0) -> None:
+    end_s = time.monotonic() + seconds
+    while not condition(session):
+        assert time.monotonic() < end_s, session.state()
+        await asyncio.sleep(0.02)
+
+
+def take_count(session: Session) -> int:
+    return len(session.takes.all)
+
+
+def words(session: Session) -> str:
+    return "\n".join(each for _, _, each in session.state()["said"])
+
+
+async def ended(session: Session, running: asyncio.Task[None]) -> None:
+    session._stopping.set()
+    await running
+
+
+def solved(log_path: Path | list[Path], rig_file: Rig) -> Calibrated:
+    with open_log(log_path) as log:
+        return solve_log(cleaned(detected(log, rig_file), rig_file), None)
+
+
+def proposed(found: Calibrated, wanted: Wanted | None) -> Proposal:
+    """A hook as a planner is one."""
+    return Proposal("base", tuple(map(tuple, np.eye(4).tolist())), f"after {found.solution.certificate.status}")
+
+
+def decided(found: Calibrated, wanted: Wanted | None) -> Decision:
+    assert wanted is not None
+    return Decision(False, 3, f"wanted {wanted.mm} mm")
+
+
+def test_it_takes_by_itself_where_the_robot_stands_still_and_saves_what_calibrate_gives(tmp_path: Path) -> None:
+    log = write(tmp_path / "stations.mcap", stations(7))
+    options = LiveOptions(wanted=Wanted(1.0), takes_when_still=True, hooks=Hooks(proposed, decided))
+    rig_file = rig()
+
+    async def run() -> Session:
+        session = Session(source_of(str(log), rig_file, 2.5), rig_file, tmp_path / "out", options)
+        answers = []
+        task = asyncio.create_task(session.run())
+        while not task.done():
+            await asyncio.sleep(0.05)
+            answers.append(session.state())
+        await task
+        assert any(state["answer"] and state["answer"]["verdict"] for state in answers)
+        assert all(state["takes"]["count"] == 0 or state["cameras"][0]["received"] for state in answers)
+        return session
+
+    session = asyncio.run(run())
+    assert 6 <= take_count(session) <= 7
+    assert all(take.is_still for take in session.takes.all)
+    out = tmp_path / "out"
+    answer = solved(out / "recorded.mcap", read_rig(out / "rig.yaml"))
+    saved = read_result(out / "calibration" / "result.json")
+    assert saved.refined is not None
+    for name, T in (answer.refined.X | answer.refined.Y).items():
+        same = (saved.refined.X | saved.refined.Y)[name]
+        assert np.array_equal(T.matrix(), same.matrix())
+    assert (out / "calibration" / "report.html").is_file()
+    assert session.answer is not None
+    assert session.answer.proposal is not None
+    assert session.answer.decision == Decision(False, 3, "wanted 1.0 mm")
+
+
+def test_taken_undone_and_gone_on_with(tmp_path: Path) -> None:
+    rig_file, messages = rig(), stations(2)
+
+    async def first() -> None:
+        source = Given(rig_file, messages[:100], messages[100:])
+        session = Session(source, rig_file, tmp_path, LiveOptions())
+        running = asyncio.create_task(session.run())
+        await until(session, lambda s: s.streams.number == 100)
+        with pytest.raises(RwhecError, match="there is no take to undo"):
+            await session.command("undo")
+        with pytest.raises(RwhecError, match="there is no command 'jump'"):
+            await session.command("jump")
+        await session.command("take")
+        source.go_on.set()
+        await until(session, lambda s: take_count(s) == 1)
+        with pytest.raises(LogError, match="another session"):
+            Takes(tmp_path)
+        (take,) = session.takes.all
+        with open_log(take.path) as log:
+            topics = {topic.name: topic.count for topic in log.topics()}
+            assert topics["/cam_0/tags"] == topics["/cam_1/tags"] == 1
+            assert topics["/live/cam_0/detections"] == 1
+            assert topics["/tf"] >= 25
+            assert log.losses == []
+        await session.command("undo")
+        assert not take.path.exists()
+        assert "take 1 undone" in words(session)
+        await session.command("take")
+        source.go_on.set()  # nothing more comes, so nothing is taken
+        await ended(session, running)
+
+    asyncio.run(first())
+    unfinished = tmp_path / "takes" / ".0001.mcap.1.part"
+    unfinished.write_bytes(b"half")
+    takes = Takes(tmp_path)
+    assert takes.all == []
+    assert not unfinished.exists()
+
+
+def test_a_take_without_targets_and_one_of_another_time_are_refused(tmp_path: Path) -> None:
+    rig_file = rig()
+    stranger = tag(77, np.eye(4))
+
+    def at(t: float, *tags: Any) -> list[Message]:
+        stamp = BEGIN_NS + round(1e9 * t)
+        poses = [transform(stamp + round(1e9 * dt), "base", "hand", np.eye(4)) for dt in (-0.1, 0.1)]
+        return [poses[0], *(detections(f"/{each}/tags", stamp, each, tags) for each in ("cam_0", "cam_1")), poses[1]]
+
+    async def run() -> Session:
+        seen = tag(0, np.eye(4), corners_px=np.array([[0, 0], [9, 0], [9, 9], [0, 9.0]]))
+        source = Given(rig_file, at(10, seen), at(11, stranger), at(12, seen), at(5, seen))
+        session = Session(source, rig_file, tmp_path, LiveOptions())
+        running = asyncio.create_task(session.run())
+        await until(session, lambda s: s.streams.number == 4)
+        for reason in ("no camera sees a target that counts", "take 1", "a clock was set back"):
+            await session.command("take")
+            source.go_on.set()
+            await until(session, lambda s, reason=reason: reason in words(s))
+        assert take_count(session) == 1
+        assert any("clock set back" in each for each in session.state()["counted"])
+        await ended(session, running)
+        return session
+
+    asyncio.run(run())
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    resource = pytest.importorskip("resource")
+    rig_file, messages = rig(), stations(1)
+
+    async def run() -> None:
+        source = Given(rig_file, messages[:60], messages[60:])
+        session = Session(source, rig_file, tmp_path, LiveOptions())
+        running = asyncio.create_task(session.run())
+        await until(session, lambda s: s.streams.number == 60)
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
+        try:
+            await session.command("take")
+            source.go_on.set()
+            await until(session, lambda s: "not taken" in words(s))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert "cannot be written: File too large" in words(session)
+        assert list((tmp_path / "takes").glob("*.mcap")) == []
+        await ended(session, running)
+
+    asyncio.run(run())
+
+
+def test_no_clock_is_looked_for_where_the_robot_stood_still(tmp_path: Path) -> None:
+    waiting = rig(cam_0="detections: /cam_0/tags\n    time_offset: estimate")
+    takes = Takes(tmp_path)
+    takes.all = [TakeInfo(Path("1.mcap"), 1, is_still=True)]
+    assert takes.rig_for(waiting).sensors["cam_0"].time_offset == 0.0
+    takes.all.append(TakeInfo(Path("2.mcap"), 2, is_still=False))
+    assert takes.rig_for(waiting).sensors["cam_0"].time_offset == "estimate"
+
+
+def test_a_rig_file_of_another_robot_is_named(tmp_path: Path) -> None:
+    other = rig(poses="{tf: [base, hand]}\n  noise: {rotation_deg: 1, translation_mm: 1}")
+    stamp = BEGIN_NS
+
+    async def run() -> None:
+        source = Given(other, [transform(stamp, "world", "tool0", np.eye(4))])
+        session = Session(source, other, tmp_path, LiveOptions())
+        running = asyncio.create_task(session.run())
+        await until(session, lambda s: any("is the rig file of this robot?" in each for each in s.state()["troubles"]))
+        session._lacks_since_s -= 10.0
+        lacking = session.state()["troubles"]
+        assert any("no topic /cam_0/tags. Topics there: /tf (foxglove.FrameTransforms)" in each for each in lacking)
+        await ended(session, running)
+
+    asyncio.run(run())
