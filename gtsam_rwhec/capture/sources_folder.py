@@ -15,7 +15,7 @@ from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, images_in, match, read_poses
 from gtsam_rwhec.logs.mcap_reader import open_log
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_rows import PoseStatement, stem_of
+from gtsam_rwhec.logs.pose_tables import PoseStatement, stem_of
 from gtsam_rwhec.logs.records import Array
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.recorded_logs import APART_NS, FIRST_NS
