@@ -29,12 +29,11 @@ from .live_session import source_of as source_of
 from .live_streams import StillOptions as StillOptions
 from .sources import Source as Source
 
-# What it answers after each take, and what it calls for the next pose and the end.
+# What it answers after each take: the calibration so far, the next pose, and whether it is enough.
 from .live_answer import Answer as Answer
-from .live_answer import Decision as Decision
-from .live_answer import Hooks as Hooks
-from .live_answer import Proposal as Proposal
-from .live_answer import Wanted as Wanted
+from .live_advice import Decision as Decision
+from .live_advice import Proposal as Proposal
+from .live_advice import Wanted as Wanted
 
 # Who shows it.
 from .live_server import PageServer as PageServer

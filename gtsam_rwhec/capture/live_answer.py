@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Judgement
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.capture.live_advice import Decision, Proposal, Wanted, next_pose, rule_of, stop_decision
+from gtsam_rwhec.capture.stopping import StoppingRule
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import RwhecError, RwhecWarning
 from gtsam_rwhec.logs import ImageRecord
@@ -28,46 +31,6 @@ from gtsam_rwhec.runs.run_log import RunLog
 from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.runs.whole_runs import calibrate_log
 from gtsam_rwhec.solver.free_directions import FreeDirection
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """The accuracy that is wanted: a point `at_m` in front of each sensor within `mm` millimetres of its true place."""
-
-    mm: float
-    at_m: float = 0.8
-    level: float = 0.95
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """The pose to take next."""
-
-    frame: str  #: the frame in which the pose is
-    T: tuple[tuple[float, ...], ...]  #: (4, 4): the pose of the carrier that moves, metres
-    words: str  #: what it adds, and how to get there
-    #: Where targets should appear, by sensor: closed outlines (n, 2) in pixels
-    outlines: Mapping[str, Sequence[Sequence[tuple[float, float]]]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Whether to stop."""
-
-    is_enough: bool
-    takes_needed: int | None  #: how many takes are still needed; None if that is not known, or none will do
-    words: str
-
-
-@dataclass(frozen=True)
-class Hooks:
-    """Who proposes the next pose, and who decides when to stop; the page shows neither without one.
-
-    Functions of a module, since they are called in another process, with what was just calibrated.
-    """
-
-    next_pose: Callable[[Calibrated, Wanted | None], Proposal | None] | None = None
-    stop_decision: Callable[[Calibrated, Wanted | None], Decision | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -130,21 +93,25 @@ class _Known:
 
 #: By the folder of the takes.
 _KNOWN: dict[Path, _Known] = {}
+_RULES: dict[tuple[Path, Wanted | None], StoppingRule | None] = {}
 
 
-def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None, hooks: Hooks) -> Answer:
+def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None) -> Answer:
     """Calibrate from takes, as ``calibrate_log`` would from the log that they make. It raises nothing of ours."""
     begun_s = time.monotonic()
     cells: dict[str, list[list[int]]] = {}
     pairs: tuple[PairRow, ...] = ()
     known = _KNOWN.setdefault(takes[0].parent, _Known())
+    rule = _RULES.setdefault((takes[0].parent, wanted), rule_of(wanted))
+    cameras: Mapping[str, Camera] = {}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # the verdict and the report say them
             with open_log(takes) as log:
                 found = detected(log, rig, workers=1, keep=lambda cameras: known)  # type: ignore[arg-type, return-value]
-                cells, pairs = _cells(found), _pairs(found)
+                cells, pairs, cameras = _cells(found), _pairs(found), found.stages.cameras
                 solved = solve_log(cleaned(found, rig), None)
+                proposal, outlook = next_pose(solved.calibration, rig, cameras, wanted)
                 return Answer(
                     len(takes),
                     time.monotonic() - begun_s,
@@ -154,11 +121,15 @@ def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None, hooks: Hoo
                     pairs=_pairs(found, solved),
                     free=tuple(f"{one}. {CURES[one.reason]}" for one in _free(solved)),
                     cells=cells,
-                    proposal=None if hooks.next_pose is None else hooks.next_pose(solved, wanted),
-                    decision=None if hooks.stop_decision is None else hooks.stop_decision(solved, wanted),
+                    proposal=proposal,
+                    decision=stop_decision(rule, solved.calibration, len(takes), outlook),
                 )
     except RwhecError as error:
-        return Answer(len(takes), time.monotonic() - begun_s, why_none=str(error), pairs=pairs, cells=cells)
+        proposal, outlook = next_pose(None, rig, cameras, wanted)
+        return Answer(
+            len(takes), time.monotonic() - begun_s, why_none=str(error), pairs=pairs, cells=cells, proposal=proposal,
+            decision=stop_decision(rule, None, len(takes), outlook),
+        )  # fmt: skip
 
 
 def calibrated(recorded: Path, rig: Rig, out: Path) -> Judgement:

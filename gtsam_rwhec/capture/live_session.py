@@ -22,7 +22,8 @@ from loky import ProcessPoolExecutor, cpu_count
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
-from gtsam_rwhec.capture.live_answer import Answer, Hooks, Wanted, answer_of, calibrated
+from gtsam_rwhec.capture.live_advice import Wanted
+from gtsam_rwhec.capture.live_answer import Answer, answer_of, calibrated
 from gtsam_rwhec.capture.live_streams import Seen, SensorStream, Stillness, StillOptions, Streams
 from gtsam_rwhec.capture.live_takes import CALIBRATION, RECORDED, RIG_FILE, TAKES, Takes
 from gtsam_rwhec.capture.sources import FollowedFile, ReplayedLog, Source, is_of_transforms
@@ -56,7 +57,6 @@ class LiveOptions:
     #: Whether it takes by itself from the start, wherever the robot stands still at a new pose.
     takes_when_still: bool = False
     publish: str = ""  #: the topic on which poses are proposed; empty for none
-    hooks: Hooks = field(default_factory=Hooks)
 
 
 @dataclass
@@ -372,11 +372,19 @@ class Session:
             else:
                 rig = self.takes.rig_for(self.rig)
                 with self._said_if_killed():
-                    self.answer = await self._in_process(answer_of, paths, rig, self.options.wanted, self.options.hooks)
+                    self.answer = await self._in_process(answer_of, paths, rig, self.options.wanted)
             if self.takes.paths == paths:
                 self._answer_due.clear()
+            self._end_if_enough()
             self.touch()
             await self._publish()
+
+    def _end_if_enough(self) -> None:
+        """Take no more by itself where the wanted accuracy is reached."""
+        decision = None if self.answer is None else self.answer.decision
+        if decision is not None and decision.is_enough and self.when_still and not self.source.is_at_rest:
+            self.when_still = False
+            self.say(f"{decision.words} It takes no more by itself.", "good")
 
     async def _in_process(self, function: Callable[..., Any], *arguments: Any) -> Any:
         if self._process is None:

@@ -16,7 +16,7 @@ from stations import stations
 from synthetic_logs import BEGIN_NS, Message, detections, rig, tag, transform, write
 
 from gtsam_rwhec.capture import sources
-from gtsam_rwhec.capture.live_answer import Decision, Hooks, Proposal, Wanted
+from gtsam_rwhec.capture.live_advice import Wanted
 from gtsam_rwhec.capture.live_session import LiveOptions, Session, source_of
 from gtsam_rwhec.capture.live_takes import TakeInfo, Takes
 from gtsam_rwhec.errors import LogError, RwhecError
@@ -77,19 +77,9 @@ def solved(log_path: Path | list[Path], rig_file: Rig) -> Calibrated:
         return solve_log(cleaned(detected(log, rig_file), rig_file), None)
 
 
-def proposed(found: Calibrated, wanted: Wanted | None) -> Proposal:
-    """A hook as a planner is one."""
-    return Proposal("base", tuple(map(tuple, np.eye(4).tolist())), f"after {found.solution.certificate.status}")
-
-
-def decided(found: Calibrated, wanted: Wanted | None) -> Decision:
-    assert wanted is not None
-    return Decision(False, 3, f"wanted {wanted.mm} mm")
-
-
 def test_it_takes_by_itself_where_the_robot_stands_still_and_saves_what_calibrate_gives(tmp_path: Path) -> None:
     log = write(tmp_path / "stations.mcap", stations(7))
-    options = LiveOptions(wanted=Wanted(1.0), takes_when_still=True, hooks=Hooks(proposed, decided))
+    options = LiveOptions(wanted=Wanted(0.001), takes_when_still=True)
     rig_file = rig()
 
     async def run() -> Session:
@@ -117,7 +107,27 @@ def test_it_takes_by_itself_where_the_robot_stands_still_and_saves_what_calibrat
     assert (out / "calibration" / "report.html").is_file()
     assert session.answer is not None
     assert session.answer.proposal is not None
-    assert session.answer.decision == Decision(False, 3, "wanted 1.0 mm")
+    outlines = [np.array(one) for of in session.answer.proposal.outlines.values() for one in of]
+    assert outlines
+    assert all((one >= 0.0).all() for one in outlines)
+    assert session.answer.decision is not None
+    assert not session.answer.decision.is_enough
+    assert "0.001 mm at 0.8 m" in session.answer.decision.words
+
+
+def test_it_takes_no_more_by_itself_where_the_wanted_accuracy_is_reached(tmp_path: Path) -> None:
+    log = write(tmp_path / "stations.mcap", stations(8))
+    rig_file = rig()
+    options = LiveOptions(wanted=Wanted(1000.0), takes_when_still=True)
+    session = Session(source_of(str(log), rig_file, 2.5), rig_file, tmp_path / "out", options)
+    asyncio.run(session.run())
+    assert session.answer is not None
+    assert session.answer.decision is not None
+    assert session.answer.decision.is_enough, session.answer.decision.words
+    session.when_still = True  # as it is while more messages come
+    session._end_if_enough()
+    assert not session.when_still
+    assert "takes no more by itself" in words(session)
 
 
 def test_taken_undone_and_gone_on_with(tmp_path: Path) -> None:
