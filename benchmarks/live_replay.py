@@ -241,8 +241,15 @@ def session(seconds: float, folder: Path, shots: Path | None) -> list[Row]:
     return [*rows, same_as_command(out, folder / "again")]
 
 
+def timeless(content: Any) -> Any:
+    """A result without the seconds that its proof took."""
+    if isinstance(content, dict):
+        return {name: timeless(each) for name, each in content.items() if name != "seconds"}
+    return list(map(timeless, content)) if isinstance(content, list) else content
+
+
 def same_as_command(out: Path, again: Path) -> Row:
-    """Whether ``calibrate`` on the recorded log gives the same poses and covariances, to the last bit."""
+    """Whether ``calibrate`` on the recorded log gives the same result file, to the last bit."""
     words = [
         sys.executable,
         "-m",
@@ -255,8 +262,8 @@ def same_as_command(out: Path, again: Path) -> Row:
         again,
     ]
     subprocess.run(list(map(str, words)), capture_output=True, check=False)
-    one, other = (json.loads((each / "result.json").read_text()) for each in (out / "calibration", again))
-    is_same = all(one[part] == other[part] for part in ("certified", "refined"))
+    one, other = (timeless(json.loads((each / "result.json").read_text())) for each in (out / "calibration", again))
+    is_same = one == other
     return Row("the result equals that of calibrate on the recorded log", "yes" if is_same else "no", "yes", is_same)
 
 

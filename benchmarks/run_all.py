@@ -30,6 +30,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "opencv_hand_eye": ("", "--repetitions 1 --problems 5"),
     "few_measurements": ("", "--quick"),
     "outliers": ("", "--seeds 1"),
+    "planned_poses": ("", "--rigs 4 --calibrated 4"),
     "misreadings": ("", None),
     "slipped_rows": ("", "--logs 6 --good 8"),
     "coverage": ("--runs 1000", "--runs 4"),

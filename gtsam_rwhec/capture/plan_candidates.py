@@ -44,12 +44,12 @@ class Candidates:
     @property
     def certainty(self) -> Array:
         """How probably all that is expected is seen, (N,)."""
-        return np.prod([np.where(of > 0.0, of, 1.0) for of in self.seen.values()], axis=0)
+        return np.asarray(np.prod([np.where(of > 0.0, of, 1.0) for of in self.seen.values()], axis=0))
 
     @property
     def number_seen(self) -> np.ndarray:
         """How many targets are expected, (N,)."""
-        return np.sum([of > 0.0 for of in self.seen.values()], axis=0)
+        return np.asarray(np.sum([of > 0.0 for of in self.seen.values()], axis=0))
 
     def selected(self, at: Sequence[int] | np.ndarray) -> Candidates:
         """Some of them."""
@@ -93,8 +93,8 @@ def drawn_candidates(cell: Cell, options: PlanOptions, covariance: Array, rng: n
     drawn = visible = within = reached = 0
     for _ in range(MOST_BATCHES if pairs else 0):
         if options.arm is not None and len(options.arm.names) < 6:  # other poses it cannot have
-            T = options.arm.hand(rng.uniform(*options.arm.limits, (BATCH, len(options.arm.names))))[0]
-            A = moving_pose(T, options)
+            low, high = options.arm.limits
+            A = moving_pose(options.arm.hand(low + (high - low) * rng.random((BATCH, len(low))))[0], options)
         else:
             A = np.concatenate([_drawn(cell, options, pair, present, BATCH // len(pairs), rng) for pair in pairs])
         drawn += len(A)
@@ -116,8 +116,8 @@ def drawn_candidates(cell: Cell, options: PlanOptions, covariance: Array, rng: n
             break
     A = np.concatenate([np.zeros((0, 4, 4)), *(one.A for one in found)])
     seen = {pair: np.concatenate([one.seen[pair] for one in found]) for pair in pairs}
-    joints = [one.joints for one in found if one.joints is not None and len(one.joints)]
-    every = Candidates(A, seen, np.concatenate(joints) if joints else None, drawn, visible, within, reached)
+    tried = [one.joints for one in found if one.joints is not None]
+    every = Candidates(A, seen, np.concatenate(tried) if tried else None, drawn, visible, within, reached)
     chosen = rng.permutation(len(A))[: options.candidates]
     return every.selected(chosen)
 
@@ -137,12 +137,13 @@ def _limits_m(cell: Cell, options: PlanOptions, pair: Pair, present: Array) -> t
 
 def spacing_m(board: Array) -> float:
     """The typical distance from a corner to its neighbour."""
-    return float(np.median(cKDTree(board).query(board, k=2)[0][:, 1]))
+    return float(np.median(np.asarray(cKDTree(board).query(board, k=2)[0])[:, 1]))
 
 
 def _drawn(cell: Cell, options: PlanOptions, pair: Pair, present: Array, count: int, rng: np.random.Generator) -> Array:
     """A (n, 4, 4) at which a target is before a sensor: anywhere in its image, near and far, tilted and turned."""
-    distance = np.exp(rng.uniform(*np.log(_limits_m(cell, options, pair, present)), count))
+    near, far = _limits_m(cell, options, pair, present)
+    distance = near * (far / near) ** rng.random(count)
     if pair.sensor in cell.kit.cameras:
         camera = cell.kit.cameras[pair.sensor]
         share = rng.uniform(options.border, 1.0 - options.border, (count, 2))
@@ -208,7 +209,7 @@ def seen_at(cell: Cell, options: PlanOptions, A: Array, covariance: Array) -> di
         pixels = camera.project(points @ B[at, :3, :3].transpose(0, 2, 1) + B[at, None, :3, 3])
         size = np.array([camera.width, camera.height])
         inside = (pixels >= options.border * size - 0.5) & (pixels <= (1.0 - options.border) * size - 0.5)
-        neighbour = cKDTree(board).query(board, k=2)[1][:, 1]
+        neighbour = np.asarray(cKDTree(board).query(board, k=2)[1])[:, 1]
         apart = np.linalg.norm(pixels - pixels[:, neighbour], axis=2)
         with np.errstate(invalid="ignore"):
             at = at[inside.all(axis=(1, 2)) & (apart.min(axis=1) >= options.spacing_px)]

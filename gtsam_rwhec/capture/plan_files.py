@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.capture.plan_poses import Plan, PlannedPose
+from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.detect.pictures import Picture, draw, jpeg_of
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.files.whole_files import write_atomically
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import DetectionRecord
 from gtsam_rwhec.report.report_blocks import Paragraph, Table
@@ -140,7 +140,7 @@ def _yaml(plan: Plan, rows: list[dict[str, Any]]) -> str:
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110)
 
 
-def picture_of(plan: Plan, pose: PlannedPose, sensor: str, background: Array | None = None) -> Picture:
+def picture_of(plan: Plan, pose: PlannedPose, sensor: str, background: Gray | None = None) -> Picture:
     """What a camera should see at a pose: each target's paper, corners and axes; (height, width, 3), blue, green, red.
 
     Parameters
@@ -150,7 +150,8 @@ def picture_of(plan: Plan, pose: PlannedPose, sensor: str, background: Array | N
     """
     camera = plan.kit.cameras[sensor]
     is_empty = background is None
-    gray = np.full((camera.height, camera.width), AROUND, np.uint8) if background is None else background.copy()
+    empty = np.full((camera.height, camera.width), AROUND, np.uint8)
+    gray: Gray = empty if background is None else background.copy()
     records = []
     for pair, B in pose.B.items():
         if pair.sensor != sensor:
@@ -163,6 +164,8 @@ def picture_of(plan: Plan, pose: PlannedPose, sensor: str, background: Array | N
             hull = cv2.convexHull(np.round(paper).astype(np.int32).reshape(-1, 1, 2))
             cv2.fillConvexPoly(gray, hull, PAPER, cv2.LINE_AA)
         records.append(
-            DetectionRecord(0, 0, "", sensor, "", pair.target, corners_px=pixels, T_camera_tag=np.asarray(B))
+            DetectionRecord(
+                0, 0, "", sensor, "", pair.target, corners_px=np.asarray(pixels, np.float64), T_camera_tag=np.asarray(B)
+            )
         )
     return draw(gray, records, camera, f"{sensor} should see this")

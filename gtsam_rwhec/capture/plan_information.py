@@ -50,7 +50,7 @@ def _own_rows(cell: Cell, pair: Pair, A: Array) -> tuple[Array, Array, Array]:
     if cell.has_corners(pair):
         _, *parts = by_corners(cell, pair, A, cell.kit.boards[pair.target])
         widths = np.cumsum([part.shape[2] for part in parts])[:-1]
-        R = np.linalg.qr(np.concatenate(parts, axis=2) / cell.kit.corner_px, mode="r")
+        R = _triangle(np.concatenate(parts, axis=2) / cell.kit.corner_px)
         by_B, by_scale, by_camera = np.split(R, widths, axis=2)
         return by_B / np.repeat(noise, 3), by_scale / noise[1], by_camera
     J = derivatives(predicted(cell, pair, A), cell.scale[pair.target]) / np.repeat(noise, 3)[:, None]
@@ -85,9 +85,9 @@ def rows_at(cell: Cell, A: Array, seen: Mapping[Pair, np.ndarray]) -> Array:
     if carriers:
         own = np.concatenate([np.tile(np.eye(6), (len(A), 1, 1)), np.zeros((len(A), 6, cell.dimension))], axis=2)
         both = np.concatenate([own, np.concatenate([np.concatenate(carriers, axis=1), rows], axis=2)], axis=1)
-        rows = np.linalg.qr(both, mode="r")[:, 6:, 6:]
+        rows = _triangle(both)[:, 6:, 6:]
     elif rows.shape[1] > cell.dimension:
-        rows = np.linalg.qr(rows, mode="r")
+        rows = _triangle(rows)
     return np.asarray(np.sqrt(cell.share) * rows)
 
 
@@ -99,6 +99,11 @@ def by_frames(cell: Cell, pair: Pair, B: Array, by_B: Array) -> Array:
     if pair.sensor in cell.slots:
         J[:, :, cell.slots[pair.sensor]] = -(by_B @ se3.adjoint(se3.inverse(B)))
     return J
+
+
+def _triangle(rows: Array) -> Array:
+    """R (N, k, m), upper triangular, with R'R = J'J of rows J (N, r, m)."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _scattered(part: Array, where: np.ndarray) -> Array:
@@ -125,4 +130,4 @@ def measured_information(cell: Cell, problem: Problem) -> Array:
         at = keys[begin[i] : begin[i + 1]]
         A[at], seen[pair][at] = raw[i].A, True
     W = rows_at(cell, A, seen)
-    return np.einsum("nij,nik->jk", W, W)
+    return np.asarray(np.einsum("nij,nik->jk", W, W))

@@ -19,7 +19,7 @@ from gtsam_rwhec.capture.plan_options import PlanOptions
 from gtsam_rwhec.capture.plan_ranking import free_frames
 from gtsam_rwhec.errors import FrameError, OptionError, RwhecWarning
 from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.fitting.fit_options import CarrierNoise, Stated
+from gtsam_rwhec.fitting.fit_options import About, CarrierNoise, Stated
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.stated_intrinsics import prior_of
 from gtsam_rwhec.fitting.unknowns import UnknownKind
@@ -72,13 +72,13 @@ def _kit(
     cameras: Mapping[str, Camera],
     boards: Mapping[str, Array],
 ) -> Kit:
-    about = "sensorcarrier" if options.moves == "sensors" else "targetcarrier"
+    about: About = "sensorcarrier" if options.moves == "sensors" else "targetcarrier"
     noise, px = options.carrier_noise or CarrierNoise(ARM_RAD, ARM_M, about=about), options.corner_px
     carriers: tuple[str | None, str | None] = (None, None)
     stated: dict[str, Stated] = {}
     if problem is not None:
         carriers = problem.sensor_carrier, problem.target_carrier
-        cameras, boards, px = cameras | problem.cameras, boards | problem.boards, problem.corner_px or px
+        cameras, boards, px = {**cameras, **problem.cameras}, {**boards, **problem.boards}, problem.corner_px or px
     if rig is not None:
         carriers = rig.carriers.sensors, rig.carriers.targets
         for name, sensor in rig.sensors.items():
@@ -191,7 +191,9 @@ def _poses(problem: Problem | None) -> Array:
 def _views(problem: Problem | None, kit: Kit) -> dict[str, View]:
     """Where sensors without intrinsics saw their targets."""
     seen: dict[str, list[Array]] = {}
-    for pair in () if problem is None else problem.pairs:
+    if problem is None:
+        return {}
+    for pair in problem.pairs:
         if not pair.is_motion and pair.sensor not in kit.cameras:
             seen.setdefault(pair.sensor, []).append(problem.measurements(*pair).B[:, :3, 3])
     views = {}
@@ -287,7 +289,7 @@ def _excess(cell: Cell, problem: Problem) -> float:
             noise = raw.covariance_of_B() + noise_of_A(cell.carrier_noise, raw.A, cell.X[pair.target], scale)
             total += float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(noise), residual))
             spare += residual.size
-    return max(1.0, total / chdtri(spare, CHANCE)) if spare > 0 else 1.0
+    return max(1.0, total / float(chdtri(spare, CHANCE))) if spare > 0 else 1.0
 
 
 def _present(options: PlanOptions) -> Array:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import binascii
 import json
 import struct
 import time
@@ -148,34 +147,33 @@ class FoxgloveSource(Source):
         try:
             said = json.loads(text)
             op = said["op"]
-        except (ValueError, TypeError, KeyError, RecursionError):
-            self.say("texts that are not of the protocol", brief(text))
-            return
-        if op == "advertise":
-            await self._advertised(said.get("channels"))
-        elif op == "serverInfo":
-            takes = "clientPublish" in (said.get("capabilities") or ())
-            self._encodings = tuple(map(str, said.get("supportedEncodings") or ())) if takes else ()
-        elif op == "unadvertise":
-            for number in said.get("channelIds") or ():
-                gone = self._channels.pop(number, None) if isinstance(number, int) else None
-                if gone is not None:
-                    self.topics.pop(gone[0].topic, None)
-        elif op == "status":
-            if said.get("level") in (1, 2):
-                self.say("warnings of the server", brief(said.get("message"), 300))
-        elif op not in _OTHER_OPS:
+            if op == "advertise":
+                await self._advertised(said["channels"])
+            elif op == "serverInfo":
+                takes = "clientPublish" in said["capabilities"]
+                self._encodings = tuple(map(str, said.get("supportedEncodings") or ())) if takes else ()
+            elif op == "unadvertise":
+                for number in said["channelIds"]:
+                    gone = self._channels.pop(number, None)
+                    if gone is not None:
+                        self.topics.pop(gone[0].topic, None)
+            elif op == "status":
+                if said["level"] in (1, 2):
+                    self.say("warnings of the server", brief(said["message"], 300))
+            elif op not in _OTHER_OPS:
+                raise ValueError("an unknown op")
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
             self.say("texts that are not of the protocol", brief(text))
 
     async def _advertised(self, channels: Any) -> None:
         """Subscribe to those that the rig file needs; a subscription has the number of its channel."""
         asked = []
-        for each in channels if isinstance(channels, list) else [channels]:
+        for each in channels:
             try:
                 number, channel, schema = _described(each)
                 if len(self.topics) >= MOST_CHANNELS:
                     raise ValueError(f"more than {MOST_CHANNELS}")
-            except (KeyError, TypeError, ValueError, binascii.Error) as error:
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
                 self.say("channels that are not described as the protocol says", f"{brief(each)} ({error!r})")
                 continue
             self.topics[channel.topic] = schema.name if schema else ""
@@ -197,6 +195,7 @@ def _described(channel: Any) -> tuple[int, Channel, Schema | None]:
     if len(text) > 2 * SCHEMA:
         raise ValueError(f"a schema of {len(text)} characters")
     kind = channel.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, encoding)
+    f"{topic}{encoding}{name}{kind}".encode()  # half a character could not be written
     data = base64.b64decode(text, validate=True) if kind in ("protobuf", "flatbuffer") else text.encode()
     schema = Schema(1, data, str(kind), name) if name else None
     return number, Channel(number, topic, encoding, {}, 1 if schema else 0), schema

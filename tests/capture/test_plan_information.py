@@ -143,7 +143,7 @@ def test_the_next_take_leaves_what_was_predicted(kind: str) -> None:
     true, problem = cell(kind, 5), rw.Problem()
     options = replace(true.options, candidates=80)
     off, promised = [], np.inf
-    for i in range(7):
+    for i in range(9):
         plan = rw.plan(problem if i else None, options, cameras=true.cameras, boards=true.boards)
         if np.isfinite(promised):
             off.append(abs(promised / plan.outlook.now_mm - 1.0))

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 import pytest
 from foxglove_robot import Robot, messages_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from places import CELL, EXAMPLES
 from stations import stations
 from synthetic_logs import rig, write
@@ -29,6 +31,11 @@ from gtsam_rwhec.logs.ros2_messages import ros2_decoder
 from gtsam_rwhec.rig import parse_rig, read_rig
 from gtsam_rwhec.runs import write_folder_log
 
+OPS = ("advertise", "serverInfo", "unadvertise", "status", "removeStatus")
+KEYS = (
+    "op", "channels", "id", "topic", "encoding", "schemaName", "schema", "schemaEncoding", "capabilities",
+    "supportedEncodings", "channelIds", "level", "message",
+)  # fmt: skip
 ROS2_RIG = CELL / "eye_to_hand.yaml"
 
 
@@ -284,3 +291,28 @@ def test_the_node_s_definitions_are_those_that_the_reader_takes(
     ((pose,),) = ros2_decoder("geometry_msgs/msg/PoseStamped", found, lambda count: None)("/pose", [data], [0])
     assert isinstance(pose, PoseRecord)
     assert (pose.parent, pose.stamp_ns, pose.T[0, 3]) == ("base", 1_000_000_002, 0.1)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(KEYS), inner, max_size=6),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.binary(max_size=40)
+    | st.text(max_size=40)
+    | st.builds(
+        lambda op, rest: json.dumps(rest | {"op": op}),
+        JSON | st.sampled_from(OPS),
+        st.dictionaries(st.sampled_from(KEYS), JSON),
+    )
+)
+def test_no_frame_of_a_server_ends_a_session(frame: str | bytes) -> None:
+    source = FoxgloveSource("ws://robot", rig())
+    with pytest.raises(StopIteration) as end:  # it waits for nothing where there is no connection
+        source._message(frame).send(None)
+    assert end.value.value is None
+    assert all(str(trouble).isprintable() for trouble in source.troubles.values())
