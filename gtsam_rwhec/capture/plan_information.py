@@ -35,7 +35,8 @@ def by_corners(cell: Cell, pair: Pair, A: Array, points: Array) -> tuple[Array, 
     """Pixels (N, n, 2) of points (n, 3) of a board, and derivatives (N, 2n, m) by B, the scale, and the camera."""
     number, camera = len(points), cell.kit.cameras[pair.sensor]
     stack = Stack(
-        *pair, np.arange(len(A)), points / cell.scale[pair.target], np.zeros((len(A), number, 2)),
+        (pair.target,), pair.sensor, np.zeros(len(A), dtype=np.int64), np.arange(len(A)),
+        (points / cell.scale[pair.target])[None], np.zeros((len(A), number, 2)),
         np.ones((len(A), number), dtype=bool), camera,
     )  # fmt: skip
     at = linearised(stack, cell.X[pair.target], cell.Y[pair.sensor], A, camera.parameters, np.zeros(4))
