@@ -16,6 +16,9 @@ from gtsam_rwhec.capture.stopping import Accuracy, StopDecision, StoppingRule
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.rig import Rig
 
+#: So many poses are planned, of which the first is proposed: one alone determines nothing where nothing is known.
+AHEAD = 6
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -50,9 +53,9 @@ def next_pose(
     known: Calibration | None, rig: Rig, cameras: Mapping[str, Camera], wanted: Wanted | None
 ) -> tuple[Proposal | None, str]:
     """The pose that adds most, and what more takes lead to; ``known`` is what the takes so far say, if they say any."""
-    options = PlanOptions(poses=1)
+    options = PlanOptions(poses=AHEAD)
     if wanted is not None:
-        options = PlanOptions(poses=1, wanted_mm=wanted.mm, point_m=wanted.at_m, level=wanted.level)
+        options = PlanOptions(poses=AHEAD, wanted_mm=wanted.mm, point_m=wanted.at_m, level=wanted.level)
     try:
         found = plan(known, options, rig=rig, cameras=cameras)
     except OptionError:  # no camera whose intrinsics are known, and nothing was measured: there is nothing to plan with
