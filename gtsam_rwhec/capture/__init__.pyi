@@ -6,6 +6,7 @@ from .plan_poses import PlannedPose as PlannedPose
 from .plan_poses import Outlook as Outlook
 from .plan_poses import Reason as Reason
 from .plan_arm import Arm as Arm
+from .plan_candidates import stated_pose as stated_pose
 
 # The same in files, and as pictures.
 from .plan_files import picture_of as picture_of

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from gtsam_rwhec.capture.plan_cell import Cell, in_front, nearest_m
 from gtsam_rwhec.capture.plan_information import by_corners, by_frames, predicted
 from gtsam_rwhec.capture.plan_options import PlanOptions
-from gtsam_rwhec.geometry.poses import Array, one_transform
+from gtsam_rwhec.geometry.poses import Array, as_transforms, one_transform
 from gtsam_rwhec.problem.measurements import Pair
 
 #: Poses are drawn in batches of so many, until there are enough candidates, and at most so many batches.
@@ -76,6 +76,12 @@ def present_pose(cell: Cell, options: PlanOptions) -> Array:
             B = in_front(cell.kit.cameras[sensor], cell.kit.boards[target])
             return np.asarray(cell.Y[sensor] @ B @ se3.inverse(cell.X[target]))
     return np.eye(4)
+
+
+def stated_pose(numbers: Sequence[float], where: str, *, is_inverse: bool) -> Array:
+    """A pose of x, y, z (m) and a quaternion with x first, or its inverse; a PoseError for what is none."""
+    pose = as_transforms(np.array([[*numbers[3:], *numbers[:3]]]), "xyzw", where)[0]
+    return se3.inverse(pose) if is_inverse else pose
 
 
 def moving_pose(A: Array, options: PlanOptions) -> Array:

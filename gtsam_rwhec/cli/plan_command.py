@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.failures import ExitStatus
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import say, shown, shown_path
-from gtsam_rwhec.geometry.poses import as_transforms
 
 ARM_PANEL = "Options for an arm, of which a URDF tells the reach (pip install 'gtsam-rwhec[plan]')"
 
@@ -89,8 +86,7 @@ def plan(
     fixed, moving = names[::-1] if sensors_move else names
     now = None
     if present is not None:
-        pose = as_transforms(np.array([[*present[3:], *present[:3]]]), "xyzw", "--present")
-        now = inverse(pose[0]) if sensors_move else pose[0]
+        now = rw.capture.stated_pose(present, "--present", is_inverse=sensors_move)
     arm = None
     if urdf is not None:
         arm = rw.capture.Arm.read(
