@@ -23,13 +23,15 @@ BUDGET = {
     # could not run: 160; issue 27: the acceptance test 1,210, rows that slip and conventions of angles 650, known
     # frames and quick corners of many detections 490, blocks as the last judge 420, mixed cameras 70,
     # errors of trajectories that last, by kind, with their file 230; a drift that tracks share 40
-    "lines": 86_920,
-    "code": 54_050,
-    # three modules of more than 500 lines were cut in two: three files
-    "files": 383,
-    "packages": 18,
+    # issue 27: clocks' rates 150, errors of the view 200, tags that are alike in one stack 70
+    # issue 28: while the robot stands there: plan 2,000, stream and stopping rule 1,400, live with its sources 2,100
+    "lines": 93_000,
+    "code": 58_100,
+    # capture has 25 files, and is a package of its own
+    "files": 408,
+    "packages": 19,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 67_320,
+    "lines of tests and benchmarks": 70_100,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
