@@ -23,7 +23,7 @@ from scipy.special import chdtr, chdtri, fdtr, fdtri
 from gtsam_rwhec.errors import FrameError, OptionError, PoseError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown
 from gtsam_rwhec.geometry.poses import LARGEST_M, Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_real
@@ -306,7 +306,7 @@ def _view(seen: np.ndarray) -> SensorView:
 
 
 def point_uncertainty(
-    refined: Refined,
+    refined: RefinedPoses,
     views: Mapping[str, SensorView],
     noise_m: Mapping[Pair, float],
     noise_of_A: CarrierNoise | None,

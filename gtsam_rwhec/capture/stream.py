@@ -26,7 +26,7 @@ from gtsam_rwhec.fitting.fit_options import check_choices
 from gtsam_rwhec.fitting.robust_solution import SPARE, TruncatedLeastSquares
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, rows_of, slots_of
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
 from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
 from gtsam_rwhec.problem.problem import Problem, seen_pair
@@ -150,12 +150,10 @@ class Stream:
         """
         start = time.perf_counter()
         pair = Pair(target, sensor) if target == sensor else seen_pair(target, sensor)
-        one = (
-            np.asarray(T.matrix() if hasattr(T, "matrix") else T)[None]
-            for T in (T_sensorcarrier_targetcarrier, T_sensor_target)
-        )
+        poses = {"A": T_sensorcarrier_targetcarrier, "B": T_sensor_target}
+        A, B = (one_transform(T, f"{name} of {pair}")[None] for name, T in poses.items())
         stamps = None if stamp_ns is None else np.array([stamp_ns])
-        given = GivenMeasurements(*one, sigma, kappa, None, stamps, covariance, None)
+        given = GivenMeasurements(A, B, sigma, kappa, None, stamps, covariance, None)
         raw = given.checked(f"measurement {self._store.number} of {pair}")
         each = zip(STATED, (sigma, kappa, stamp_ns, covariance), strict=True)
         place = self._store.append(pair, raw, frozenset(name for name, value in each if value is not None))
@@ -330,16 +328,16 @@ class Stream:
             J[:, rows_of(slots, [unknown])] += block
         assert self._noise is not None
         f = np.array(self._noise.factors) / np.array(self._weights)
-        V = self._variances(rows)[0] + J @ answer.covariance(f) @ J.T
+        V = self._variances(np.array([place]))[0] + J @ answer.covariance(f) @ J.T
         square = float(at.residual[0] @ np.linalg.solve(V, at.residual[0]))
         rows["square"], rows["judged"] = square, self._store.number
         return square <= self._threshold(self._store.number)
 
-    def _variances(self, rows: np.ndarray) -> Array:
-        """(N, 6, 6): the covariances of B under the noise that all show."""
+    def _variances(self, places: np.ndarray) -> Array:
+        """(N, 6, 6): the covariances of B of some rows, under the noise that all show."""
         assert self._noise is not None
         deviation = np.sqrt(np.repeat(self._noise.factors, 3))
-        own: Array = self._store.covariances(rows) * deviation[:, None] * deviation
+        own: Array = self._store.measurements(places).covariance_of_B() * deviation[:, None] * deviation
         return own
 
     def _judge_again(self) -> set[Pair]:
@@ -372,7 +370,9 @@ class Stream:
         first, second = (np.array([poses.get(pair[i], np.eye(4)) for pair in store.pairs])[own["pair"]] for i in (0, 1))
         alpha = np.array([scales.get(pair.target, 1.0) for pair in store.pairs])[own["pair"]]
         e = BatchResiduals(own["A"], own["B"]).residuals(first, second, alpha)
-        square = np.einsum("ni,ni->n", e, np.linalg.solve(self._variances(own), e[:, :, None])[:, :, 0])
+        square = np.einsum(
+            "ni,ni->n", e, np.linalg.solve(self._variances(np.flatnonzero(known)), e[:, :, None])[:, :, 0]
+        )
         rows["square"][known], rows["judged"] = square, store.number
         counts = np.ones(len(rows), dtype=bool)
         counts[known] = square <= self._threshold(store.number) * np.where(own["counts"], 1.0, BACK)

@@ -10,7 +10,6 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, MeasurementsNotKeptError, NoiseError, StampError
 from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.many_measurements import Sorted
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
@@ -160,13 +159,6 @@ class Store:
         """Whether measurements have stamps."""
         return self._stated is not None and "stamps_ns" in self._stated
 
-    def covariances(self, rows: np.ndarray) -> Array:
-        """(N, 6, 6): the covariances of B of some rows, as stated."""
-        if "covariance" in (rows.dtype.names or ()):
-            return rows["covariance"]
-        variances = np.repeat(np.column_stack([0.5 / rows["kappa"], rows["sigma"] ** 2]), 3, axis=1)
-        return variances[:, :, None] * np.eye(6)
-
     def moments(self, factors: VarianceFactors) -> Problem:
         """The moments of all that counts, with weights by variance factors."""
         there = np.flatnonzero(self._sums.count)
@@ -203,7 +195,7 @@ class Store:
         return result
 
     def measurements(self, places: np.ndarray) -> Measurements:
-        """Some rows of a pair."""
+        """Some rows."""
         own = self.rows[places]
         covariances = own["covariance"] if "covariance" in (own.dtype.names or ()) else None
         return Measurements(own["A"], own["B"], own["sigma"], own["kappa"], own["stamp_ns"], covariances)

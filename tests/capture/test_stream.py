@@ -228,7 +228,7 @@ def test_bad_input_leaves_the_stream_as_it_was() -> None:
         (NoiseError, "covariances", one, {"sigma": None, "kappa": None, "covariance": covariance}),
         (StampError, "the first one stated", one, {"stamp_ns": None}),
         (FrameError, "already", One(one.sensor, one.target, one.A, one.B, 0, 1.0, 1.0), {}),
-        (FrameError, "", One("", one.sensor, one.A, one.B, 0, 1.0, 1.0), {}),
+        (FrameError, "name", One("", one.sensor, one.A, one.B, 0, 1.0, 1.0), {}),
     ]
     for error, words, measurement, others in bad:
         with pytest.raises(error, match=words):
