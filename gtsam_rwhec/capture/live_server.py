@@ -136,13 +136,16 @@ class PageServer:
     async def _page(self, page: WebSocket) -> None:
         """One page: what it asks is done, and what is new is sent to it, as fast as it takes it."""
         await page.accept()
-        changed = asyncio.Event()
+        changed, drawing = asyncio.Event(), set[str]()
         changed.set()
         self._session.viewers.add(changed)
-        showing = asyncio.create_task(self._show(page, changed))
+        showing = asyncio.create_task(self._show(page, changed, drawing))
         try:
             while True:
-                await self._asked(page, await page.receive())
+                sensor = await self._asked(page, await page.receive())
+                if sensor is not None:
+                    drawing.discard(sensor)
+                    changed.set()
         except (WebSocketDisconnect, RuntimeError):  # the page was closed, maybe while it was answered
             return
         finally:
@@ -150,7 +153,8 @@ class PageServer:
             showing.cancel()
             await asyncio.gather(showing, return_exceptions=True)
 
-    async def _asked(self, page: WebSocket, message: Any) -> None:
+    async def _asked(self, page: WebSocket, message: Any) -> str | None:
+        """Do what a page asks; the sensor whose picture it has drawn, if it says that."""
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message.get("code", 1000))
         text = message.get("text")
@@ -158,6 +162,8 @@ class PageServer:
             if text is None or len(text) > LONGEST_ASKED:
                 raise RwhecError("the page sent bytes, or too much, in place of a command")
             said = json.loads(text)
+            if isinstance(said, dict) and isinstance(said.get("drawn"), str):
+                return str(said["drawn"])
             if not isinstance(said, dict) or said.get("do") not in (*COMMANDS,):
                 raise RwhecError(f"the page sent {brief(text)} in place of one of {', '.join(COMMANDS)}")
             await self._session.command(said["do"])
@@ -165,16 +171,20 @@ class PageServer:
             await page.send_text(json.dumps({"error": str(error)}))
         except json.JSONDecodeError as error:
             await page.send_text(json.dumps({"error": f"the page sent no JSON: {error}"}))
+        return None
 
-    async def _show(self, page: WebSocket, changed: asyncio.Event) -> None:
+    async def _show(self, page: WebSocket, changed: asyncio.Event, drawing: set[str]) -> None:
+        """Send what is new; the next picture of a camera once the page has drawn the last one, so that none wait."""
         numbers: dict[str, int] = {}
         last, last_s = "", 0.0
         while True:
             await changed.wait()
             changed.clear()
             for sensor, stream in self._session.streams.sensors.items():
-                if stream.latest is not None and numbers.get(sensor) != stream.latest.number:
+                is_new = stream.latest is not None and numbers.get(sensor) != stream.latest.number
+                if stream.latest is not None and is_new and sensor not in drawing:
                     numbers[sensor] = stream.latest.number
+                    drawing.add(sensor)
                     await page.send_bytes(_picture(stream.latest))
             if (wait_s := last_s + STATE_S - time.monotonic()) > 0.0:
                 if not changed.is_set():

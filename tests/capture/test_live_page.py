@@ -8,15 +8,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from mcap.records import Channel, Schema
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from stations import stations
-from synthetic_logs import rig, write
+from stations import SQUARE, stations
+from synthetic_logs import BEGIN_NS, detections, rig, tag, write
 
 from gtsam_rwhec.capture.live_server import PageServer, finite
 from gtsam_rwhec.capture.live_session import COMMANDS, LiveOptions, Session, source_of
 from gtsam_rwhec.capture.live_terminal import drawn, show_on_terminal
+from gtsam_rwhec.capture.sources import Message
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.terminal import SafeConsole
 
@@ -140,3 +143,39 @@ def test_what_happens_is_printed_once_until_the_end(session: Session) -> None:
 
     asyncio.run(run())
     assert [line.split(" ", 1)[1] for line in written.getvalue().splitlines()] == ["the first", "the second"]
+
+
+def test_a_page_gets_the_next_picture_once_it_has_drawn_the_last(session: Session, server: PageServer) -> None:
+    def see(t: float) -> None:
+        sent = detections(
+            "/cam_0/tags", BEGIN_NS + round(1e9 * t), "cam_0", [tag(0, np.eye(4), corners_px=SQUARE[:, :2])]
+        )
+        schema = Schema(1, b"{}", "jsonschema", sent.schema)
+        message = Message(
+            Channel(1, sent.topic, "json", {}, 1), schema, sent.logged_ns, json.dumps(sent.content).encode()
+        )
+        (seen,) = session.streams.take_in(message)
+        session.streams.looked(seen)
+
+    client = TestClient(server.app, base_url=f"http://127.0.0.1:{server.port}")
+    with client.websocket_connect(socket(server), headers=origin(server)) as page:
+        received: list[Any] = []
+
+        def until(kind: str) -> Any:
+            while kind not in (one := page.receive()):
+                received.append(one)
+            return one[kind]
+
+        see(0.0)
+        page.send_text('{"do": "when_still"}')
+        first = until("bytes")
+        assert json.loads(first[4 : 4 + int.from_bytes(first[:4], "little")])["targets"][0]["name"] == "tag_0"
+        see(1.0)
+        see(2.0)
+        received.clear()
+        page.send_text('{"do": "nothing"}')
+        while "error" not in json.loads(until("text")):
+            pass
+        assert not any("bytes" in one for one in received)
+        page.send_text('{"drawn": "cam_0"}')
+        assert until("bytes")

@@ -83,10 +83,10 @@ async function showPicture(buffer) {
   const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   const view = viewOf(head.sensor), picture = new Blob([new Uint8Array(buffer, 4 + length)]);
   const image = picture.size ? await createImageBitmap(picture).catch(() => null) : null;
-  if (view.head && view.head.seen_ms > head.seen_ms) return;
   view.image?.close();
   view.head = head; view.image = image;
   draw(head.sensor);
+  socket.send(JSON.stringify({ drawn: head.sensor }));
 }
 
 function showCamera(camera, answer) {
