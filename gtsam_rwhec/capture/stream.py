@@ -104,7 +104,8 @@ class Stream:
             raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.StreamOptions")
         self.options = options or StreamOptions()
         self._store = Store(knowledge, None if self.options.keep == "measurements" else self.options.window)
-        self._weights, self._noise = AS_STATED, None
+        self._weights: VarianceFactors = AS_STATED
+        self._noise: NoiseShown | None = None
         self._parts: dict[tuple[str, ...], PartAnswer | str] = {}
         self._rotations: dict[str, Array] = {}
         self._judged_at = self._searched_at = 0
