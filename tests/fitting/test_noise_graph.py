@@ -325,3 +325,15 @@ def test_steps_that_do_not_end_are_said() -> None:
             task, replace(found, state=there, model=task.model_like(found.model, there)), solution,
             RefineOptions(max_iterations=1),
         )  # fmt: skip
+
+
+def test_steps_that_become_no_shorter_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    task, found, solution = of_two_targets()
+    change = np.zeros(len(task.layout.unit))
+    change[:3] = 0.05
+    there = moved(found.state, task.variables, task.layout, change)
+    model = task.model_like(found.model, there)
+    monkeypatch.setattr(Task, "model_like", lambda *_: model)  # so each step is as long as the first
+    with pytest.warns(NotConvergedWarning, match="standard deviations"):
+        result = refined(task, replace(found, state=there, model=model), solution)
+    assert result.iterations == graphs.IN_A_CIRCLE
