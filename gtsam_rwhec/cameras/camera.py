@@ -16,6 +16,8 @@ from gtsam_rwhec.cameras.distortion import Model, distorted, folding_radius, und
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.geometry.poses import Array
 
+#: COLMAP has the middle of the upper left pixel at (0.5, 0.5), `Camera` at (0, 0).
+PIXEL_CENTRE = 0.5
 #: ROS, Foxglove, Kalibr and OpenCV name the models by these words.
 MODELS: dict[str, Model] = {
     "": "pinhole", "none": "pinhole", "pinhole": "pinhole",

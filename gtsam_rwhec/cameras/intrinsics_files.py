@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from gtsam_rwhec.cameras.camera import MODELS, NAMES, Camera
+from gtsam_rwhec.cameras.camera import MODELS, NAMES, PIXEL_CENTRE, Camera
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_storage, read_text, read_yaml, shown
 from gtsam_rwhec.geometry.poses import Array
@@ -349,8 +349,6 @@ _MODELS = {
     "FULL_OPENCV": ("radtan", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
     "OPENCV_FISHEYE": ("equidistant", "fx fy cx cy k1 k2 k3 k4"),
 }
-#: COLMAP has the middle of the upper left pixel at (0.5, 0.5), `Camera` at (0, 0).
-PIXEL_CENTRE = 0.5
 _LINE = re.compile(r"\d+[\s,]+[A-Z][A-Z_]+[\s,]+\d+[\s,]+\d+[\s,]")
 
 

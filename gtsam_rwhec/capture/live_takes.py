@@ -8,6 +8,7 @@ take is to remove its file.
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ class Takes:
         self.folder = folder
         try:
             (folder / TAKES).mkdir(parents=True, exist_ok=True)
-            self._held = (folder / TAKES / ".session").open("w")
+            self._held = os.fdopen(os.open(folder / TAKES / ".session", os.O_CREAT | os.O_RDWR))
             fcntl.flock(self._held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             for unfinished in (folder / TAKES).glob(".*.part"):
                 unfinished.unlink()

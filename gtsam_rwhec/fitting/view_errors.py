@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
-from scipy.optimize import minimize
 from scipy.special import expit
 
 from gtsam_rwhec.fitting.drift import own_directions, unit_of
@@ -82,6 +81,8 @@ class _Compared:
 
     def fitted(self, distance: Array, length: float) -> tuple[float, Array]:
         """The least of minus twice the log likelihood, with its prior, and the logarithms that make it."""
+        from scipy.optimize import minimize  # here, since few logs need it
+
         start = np.array([0.0, 0.0, math.log(length)])
 
         def cost(logs: Array) -> float:

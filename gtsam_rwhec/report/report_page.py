@@ -16,12 +16,13 @@ from gtsam_rwhec.errors import EvidenceWarning, FileFormatError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import checked_path, is_one_of, read_whole, write_atomically
 from gtsam_rwhec.fitting.refined import Refined
-from gtsam_rwhec.report.choices_section import choices_section, inputs_section
+from gtsam_rwhec.report.choices_section import choices_section
 from gtsam_rwhec.report.contribution_section import contribution_section
 from gtsam_rwhec.report.corners_section import corners_section
 from gtsam_rwhec.report.detections_section import seen_section
 from gtsam_rwhec.report.determined_section import determines_section
 from gtsam_rwhec.report.html_page import write_page
+from gtsam_rwhec.report.inputs_section import inputs_section
 from gtsam_rwhec.report.proof_section import proof_section
 from gtsam_rwhec.report.report_blocks import TONES, Chart, Drawing, Page, Section, every
 from gtsam_rwhec.report.residual_section import residuals_section

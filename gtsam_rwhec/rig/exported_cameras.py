@@ -10,8 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from rwhec_factors.se3 import inverse
 
-from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.intrinsics_files import PIXEL_CENTRE
+from gtsam_rwhec.cameras.camera import PIXEL_CENTRE, Camera
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.rig_frames import RigFrames

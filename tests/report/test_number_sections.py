@@ -14,7 +14,7 @@ from refinement_problems import rig
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.report.choices_section import inputs_section
+from gtsam_rwhec.report.inputs_section import inputs_section
 from gtsam_rwhec.report.contribution_section import contribution_section
 from gtsam_rwhec.report.determined_section import determines_section
 from gtsam_rwhec.report.proof_section import proof_section
