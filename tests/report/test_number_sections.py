@@ -14,9 +14,9 @@ from refinement_problems import rig
 from shown_numbers import numbers_of, wrong_numbers
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.report.inputs_section import inputs_section
 from gtsam_rwhec.report.contribution_section import contribution_section
 from gtsam_rwhec.report.determined_section import determines_section
+from gtsam_rwhec.report.inputs_section import inputs_section
 from gtsam_rwhec.report.proof_section import proof_section
 from gtsam_rwhec.report.report_blocks import Block, Chart, CopyText, Table, plain_text
 from gtsam_rwhec.report.report_page import read_shown
