@@ -104,11 +104,12 @@ class BlockMatrix:
 
         if self.order.is_dense and self.size <= FEW_ROWS:
             return np.asarray(of(self._whole) @ v)
-        n, m, _ = self.tails.shape
+        n, m, q = self.tails.shape
         columns, D = (v[:, None], 1) if v.ndim == 1 else (v, v.shape[1])
         of_frames, of_tail, tails = columns[: n * m].reshape(n, m, D), columns[n * m :], of(self.tails)
         result = np.matmul(of(self.frames), of_frames) + tails @ of_tail
-        last = of(self.tail) @ of_tail + np.einsum("niq,nid->qd", tails, of_frames)
+        # of no frames einsum gives nan in extended precision, and this zero
+        last = of(self.tail) @ of_tail + tails.reshape(n * m, q).T @ columns[: n * m]
         first, second = self.ends
         for at in self._portions():
             blocks = of(self.couplings[at])

@@ -420,3 +420,13 @@ def test_a_known_sensor_may_tell_the_scale_of_another_one() -> None:
     assert solution.certificate.is_certified
     assert solution.scale == pytest.approx(scale, rel=1e-9)
     np.testing.assert_allclose(solution.Y["cam"].matrix(), T_carrier_sensor["cam"], atol=1e-8)
+
+
+def test_of_a_sensor_whose_frame_is_known_moments_alone_tell_the_cost() -> None:
+    poses = random_poses(9, 1.0, np.random.default_rng(2))
+    problem = rw.Problem(keep_measurements=False)
+    problem.add_motion("cam", poses[1:], np.linalg.inv(poses[0]) @ poses[1:] @ poses[0], 0.01, 5e3)
+    problem.fix("cam", poses[0])
+    certificate = rw.solve(problem).certificate
+    assert certificate.is_certified
+    assert 0.0 <= certificate.cost < 1e-6
