@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -53,9 +53,12 @@ def next_pose(
     known: Calibration | None, rig: Rig, cameras: Mapping[str, Camera], wanted: Wanted | None
 ) -> tuple[Proposal | None, str]:
     """The pose that adds most, and what more takes lead to; ``known`` is what the takes so far say, if they say any."""
-    options = PlanOptions(poses=AHEAD)
+    poses = rig.carriers.poses
+    child = poses.child if poses.topic is not None else (poses.tf or poses.frames or ("", ""))[1]
+    # Poses are of what moves, in what stands: a hand's in its base.
+    options = PlanOptions(poses=AHEAD, moves="targets" if child == rig.carriers.targets else "sensors")
     if wanted is not None:
-        options = PlanOptions(poses=AHEAD, wanted_mm=wanted.mm, point_m=wanted.at_m, level=wanted.level)
+        options = replace(options, wanted_mm=wanted.mm, point_m=wanted.at_m, level=wanted.level)
     try:
         found = plan(known, options, rig=rig, cameras=cameras)
     except OptionError:  # no camera whose intrinsics are known, and nothing was measured: there is nothing to plan with
@@ -64,7 +67,7 @@ def next_pose(
         return None, str(found)
     pose = found.poses[0]
     seen = " and ".join(f"{pair.target} by {pair.sensor}" for pair in pose.sees)
-    where = "Bring the board where the outline is" if found.is_rough else f"Move {pose.child} there"
+    where = "Bring the board where the outline is" if found.is_rough else f"Move {pose.child} there, or to the outlines"
     outlines: dict[str, list[list[tuple[float, float]]]] = {}
     for pair in pose.sees:
         if pair.sensor in found.kit.cameras and pair.target in found.kit.boards:
@@ -88,8 +91,8 @@ def stop_decision(
     if rule is None or calibration is None:
         return Decision(False, None, outlook) if outlook else None
     said: StopDecision = rule.after(calibration, takes=takes)
-    words = str(said) if said.stop or not outlook else f"{said} {outlook}"
-    return Decision(said.stop, said.more_takes, words)
+    short = str(replace(said, reason=""))  # the verdict says what speaks against the answer
+    return Decision(said.stop, said.more_takes, short if said.stop or not outlook else f"{short} {outlook}")
 
 
 def rule_of(wanted: Wanted | None) -> StoppingRule | None:

@@ -44,3 +44,12 @@ def test_the_rule_and_the_planner_speak_of_one_calibration() -> None:
     assert decision is not None
     assert decision.is_enough
     assert decision.words.startswith("Stop: ")
+
+
+def test_the_pose_is_of_the_carrier_that_moves() -> None:
+    simulation = rw.simulate.general(1, 1, seed=3, noise=rw.simulate.Noise(0.001, 1e5), number_of_measurements=25)
+    calibration = rw.calibrate(simulation.problem)
+    in_hand, beside = rig(), rig(poses="{tf: [hand, base]}")
+    assert (in_hand.carriers.sensors, in_hand.carriers.targets) == ("hand", "base")
+    frames = [next_pose(calibration, described, {}, None)[0] for described in (in_hand, beside)]
+    assert [one.frame for one in frames if one is not None] == ["base", "hand"]
