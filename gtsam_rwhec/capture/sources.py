@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ class Trouble:
         return f"{self.what}: {self.count}; the first: {self.first}"
 
 
-class Source:
+class Source(ABC):
     """Where messages come from. `messages` gives those that a rig file needs, and waits for more."""
 
     #: Whether everything that comes was taken at rest, with its own pose: images in a folder.
@@ -70,6 +71,7 @@ class Source:
         self.received: Counter[str] = Counter()  #: messages by topic
         self._wanted = frozenset(wanted_topics(rig))
 
+    @abstractmethod
     def messages(self) -> AsyncIterator[Message]:
         """The messages of the rig file's topics as they come; what cannot be used is in `troubles`.
 
@@ -78,7 +80,6 @@ class Source:
         LogError
             The source cannot be read, and waiting will not help.
         """
-        raise NotImplementedError
 
     async def publish(self, topic: str, frame: str, T: Array, stamp_ns: int) -> None:
         """Send a pose T_frame_proposed (4, 4), metres, to whoever listens there.
