@@ -84,7 +84,7 @@ def taken(kind: str, seed: int) -> Taken:
             off.append(abs(promised / plan.outlook.now_mm - 1.0))
         if i == PLANNED or not plan.poses:
             break
-        poses.append(plan.poses[0].A)
+        poses.append(plan.poses[0].T_sensorcarrier_targetcarrier)
         promised = plan.poses[0].deviation_mm
         unseen += not true.take(problem, poses[-1], i)
     found, at_random = [], rw.Problem()
@@ -112,7 +112,7 @@ def calibrated(kind: str, seed: int) -> list[float]:
                 off.append(abs(promised / max(points) - 1.0))
         plan = rw.plan(source, options, cameras=true.cameras, boards=true.boards)
         promised = plan.poses[0].deviation_mm if i >= FIRST else np.nan
-        true.take(problem, plan.poses[0].A, i)
+        true.take(problem, plan.poses[0].T_sensorcarrier_targetcarrier, i)
         options = replace(options, present=None)
     return off
 
@@ -160,7 +160,7 @@ def said_after(case: str, seed: int) -> int:
         plan = rw.plan(problem if i else None, options, cameras=true.cameras, boards=true.boards)
         if not plan.outlook.can_be_reached:
             return i
-        true.take(problem, plan.poses[0].A, i)
+        true.take(problem, plan.poses[0].T_sensorcarrier_targetcarrier, i)
         options = replace(options, present=None)
     return 99
 

@@ -34,7 +34,6 @@ from .sources import Source as Source
 from .live_answer import Answer as Answer
 from .live_advice import Decision as Decision
 from .live_advice import Proposal as Proposal
-from .live_advice import Wanted as Wanted
 
 # Who shows it.
 from .live_server import PageServer as PageServer

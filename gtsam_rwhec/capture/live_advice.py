@@ -21,15 +21,6 @@ AHEAD = 6
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """The accuracy that is wanted: a point `at_m` in front of each sensor within `mm` millimetres of its true place."""
-
-    mm: float
-    at_m: float = 0.8
-    level: float = 0.95
-
-
-@dataclass(frozen=True)
 class Proposal:
     """The pose to take next."""
 
@@ -50,7 +41,7 @@ class Decision:
 
 
 def next_pose(
-    known: Calibration | None, rig: Rig, cameras: Mapping[str, Camera], wanted: Wanted | None
+    known: Calibration | None, rig: Rig, cameras: Mapping[str, Camera], wanted: Accuracy | None
 ) -> tuple[Proposal | None, str]:
     """The pose that adds most, and what more takes lead to; ``known`` is what the takes so far say, if they say any."""
     poses = rig.carriers.poses
@@ -58,7 +49,7 @@ def next_pose(
     # Poses are of what moves, in what stands: a hand's in its base.
     options = PlanOptions(poses=AHEAD, moves="targets" if child == rig.carriers.targets else "sensors")
     if wanted is not None:
-        options = replace(options, wanted_mm=wanted.mm, point_m=wanted.at_m, level=wanted.level)
+        options = replace(options, wanted_mm=1e3 * wanted.radius_m, point_m=wanted.distance_m, level=wanted.level)
     try:
         found = plan(known, options, rig=rig, cameras=cameras)
     except OptionError:  # no camera whose intrinsics are known, and nothing was measured: there is nothing to plan with
@@ -78,7 +69,7 @@ def next_pose(
 
 def _outline(found: Plan, pose: PlannedPose, target: str, sensor: str) -> list[tuple[float, float]]:
     """The hull of a board's corners as the camera should see them, pixels."""
-    B = next(B for pair, B in pose.B.items() if pair == (target, sensor))
+    B = next(B for pair, B in pose.T_sensor_target.items() if pair == (target, sensor))
     pixels = found.kit.cameras[sensor].project(found.kit.boards[target] @ B[:3, :3].T + B[:3, 3])
     hull = cv2.convexHull(pixels[np.isfinite(pixels).all(axis=1)].astype(np.float32)).reshape(-1, 2)
     return [(float(x), float(y)) for x, y in hull]
@@ -93,8 +84,3 @@ def stop_decision(
     said: StopDecision = rule.after(calibration, takes=takes)
     short = str(replace(said, reason=""))  # the verdict says what speaks against the answer
     return Decision(said.stop, said.more_takes, short if said.stop or not outlook else f"{short} {outlook}")
-
-
-def rule_of(wanted: Wanted | None) -> StoppingRule | None:
-    """The rule for a wanted accuracy; one rule is asked after every take of a session."""
-    return None if wanted is None else StoppingRule(Accuracy(1e-3 * wanted.mm, wanted.at_m, wanted.level))

@@ -15,8 +15,8 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.capture.live_advice import Decision, Proposal, Wanted, next_pose, rule_of, stop_decision
-from gtsam_rwhec.capture.stopping import StoppingRule
+from gtsam_rwhec.capture.live_advice import Decision, Proposal, next_pose, stop_decision
+from gtsam_rwhec.capture.stopping import Accuracy, StoppingRule
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import RwhecError, RwhecWarning
 from gtsam_rwhec.logs import ImageRecord
@@ -93,16 +93,16 @@ class _Known:
 
 #: By the folder of the takes.
 _KNOWN: dict[Path, _Known] = {}
-_RULES: dict[tuple[Path, Wanted | None], StoppingRule | None] = {}
+_RULES: dict[tuple[Path, Accuracy | None], StoppingRule | None] = {}
 
 
-def answer_of(takes: Sequence[Path], rig: Rig, wanted: Wanted | None) -> Answer:
+def answer_of(takes: Sequence[Path], rig: Rig, wanted: Accuracy | None) -> Answer:
     """Calibrate from takes, as ``calibrate_log`` would from the log that they make. It raises nothing of ours."""
     begun_s = time.monotonic()
     cells: dict[str, list[list[int]]] = {}
     pairs: tuple[PairRow, ...] = ()
     known = _KNOWN.setdefault(takes[0].parent, _Known())
-    rule = _RULES.setdefault((takes[0].parent, wanted), rule_of(wanted))
+    rule = _RULES.setdefault((takes[0].parent, wanted), None if wanted is None else StoppingRule(wanted))
     cameras: Mapping[str, Camera] = {}
     try:
         with warnings.catch_warnings():
@@ -170,11 +170,11 @@ def _pairs(found: RunLog, solved: Calibrated | None = None) -> tuple[PairRow, ..
     return tuple(rows)
 
 
-def _points(solved: Calibrated, wanted: Wanted | None) -> tuple[PointRow, ...]:
+def _points(solved: Calibrated, wanted: Accuracy | None) -> tuple[PointRow, ...]:
     calibration = solved.calibration
     if wanted is None:
         points = list(calibration.points.values())
     else:
-        at = [0.0, 0.0, wanted.at_m]
+        at = [0.0, 0.0, wanted.distance_m]
         points = [calibration.uncertainty_at(at, name, level=wanted.level) for name in calibration.points]
     return tuple(PointRow(one.frame, float(np.linalg.norm(one.point_m)), one.radius_mm) for one in points)

@@ -22,13 +22,13 @@ from loky import ProcessPoolExecutor, cpu_count
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
-from gtsam_rwhec.capture.live_advice import Wanted
 from gtsam_rwhec.capture.live_answer import Answer, answer_of, calibrated
 from gtsam_rwhec.capture.live_streams import Seen, SensorStream, Stillness, StillOptions, Streams
 from gtsam_rwhec.capture.live_takes import CALIBRATION, RECORDED, RIG_FILE, TAKES, Takes
 from gtsam_rwhec.capture.sources import FollowedFile, ReplayedLog, Source, is_of_transforms
 from gtsam_rwhec.capture.sources_folder import FolderSource
 from gtsam_rwhec.capture.sources_foxglove import FoxgloveSource
+from gtsam_rwhec.capture.stopping import Accuracy
 from gtsam_rwhec.detect.many_images import ONE_THREAD, quiet_on_one_thread
 from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.geometry.poses import Array
@@ -52,7 +52,7 @@ NEW_M, NEW_RAD = 0.005, 0.01
 class LiveOptions:
     """Options of a session."""
 
-    wanted: Wanted | None = None  #: the accuracy that is wanted
+    wanted: Accuracy | None = None  #: the accuracy that is wanted
     still: StillOptions = field(default_factory=StillOptions)
     #: Whether it takes by itself from the start, wherever the robot stands still at a new pose.
     takes_when_still: bool = False

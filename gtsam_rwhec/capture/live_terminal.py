@@ -77,7 +77,7 @@ def drawn(state: dict[str, Any]) -> RenderableType:
                 STYLES.get(answer["verdict"], ""),
             )
         )
-        wanted = f", wanted {state['wanted']['mm']:g} mm" if state["wanted"] else ""
+        wanted = f", wanted {1e3 * state['wanted']['radius_m']:g} mm" if state["wanted"] else ""
         for one in answer["points"]:
             is_known = one["radius_mm"] < float("inf")
             off = f"within {rounded(one['radius_mm'])} mm" if is_known else "not determined"

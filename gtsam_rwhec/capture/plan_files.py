@@ -153,7 +153,7 @@ def picture_of(plan: Plan, pose: PlannedPose, sensor: str, background: Gray | No
     empty = np.full((camera.height, camera.width), AROUND, np.uint8)
     gray: Gray = empty if background is None else background.copy()
     records = []
-    for pair, B in pose.B.items():
+    for pair, B in pose.T_sensor_target.items():
         if pair.sensor != sensor:
             continue
         board = plan.kit.boards[pair.target]

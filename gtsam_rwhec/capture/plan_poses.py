@@ -109,13 +109,13 @@ class Outlook:
 class PlannedPose:
     """A pose to measure at."""
 
-    A: Array  #: (4, 4): T_sensorcarrier_targetcarrier, metres
+    T_sensorcarrier_targetcarrier: Array  #: (4, 4): metres
     #: The same as the robot has it: T_parent_child (4, 4) of the carrier that it moves
     parent: str
     child: str
     T_parent_child: Array
     joints: Array | None  #: (n,): Of the arm: rad, and m of joints that slide
-    B: dict[Pair, Array]  #: (4, 4): T_sensor_target of each target that a sensor sees there
+    T_sensor_target: dict[Pair, Array]  #: (4, 4): of each target that a sensor sees there, metres
     bits: float  #: The information that it adds to that of the poses before it
     #: After it the task's point is within this distance of its true place, mm; infinite while it is free
     deviation_mm: float
@@ -123,7 +123,7 @@ class PlannedPose:
     @property
     def sees(self) -> tuple[Pair, ...]:
         """Which targets which sensors see."""
-        return tuple(self.B)
+        return tuple(self.T_sensor_target)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,12 +267,12 @@ def _poses(cell: Cell, options: PlanOptions, candidates: Candidates, ranking: Ra
     B = {pair: predicted(cell, pair, chosen.A) for pair in cell.pairs}
     return tuple(
         PlannedPose(
-            A=A,
+            T_sensorcarrier_targetcarrier=A,
             parent=parent,
             child=child,
             T_parent_child=moving_pose(A, options),
             joints=None if chosen.joints is None else chosen.joints[i],
-            B={pair: B[pair][i] for pair, seen in chosen.seen.items() if seen[i] > 0.0},
+            T_sensor_target={pair: B[pair][i] for pair, seen in chosen.seen.items() if seen[i] > 0.0},
             bits=ranking.nats[i] / math.log(2.0),
             deviation_mm=ranking.radii_mm[i],
         )

@@ -52,7 +52,7 @@ def live(
     not moved: poses are proposed.
     """
     described = rw.rig.read_rig(rig)
-    wanted = None if wanted_mm is None else rw.capture.Wanted(wanted_mm, at_m)
+    wanted = None if wanted_mm is None else rw.Accuracy(1e-3 * wanted_mm, at_m)
     options = rw.capture.LiveOptions(wanted=wanted, takes_when_still=when_still, publish=publish)
     session = rw.capture.Session(rw.capture.source_of(source, described, speed), described, output, options)
     server = None if terminal else rw.capture.PageServer(session, host, port)
@@ -67,8 +67,8 @@ def live(
         error.add_note(f"The takes are in {shown_path(output)}; the same command goes on with them.")
         raise
     if session.judgement is None:
-        say("No calibration was saved.", to_errors=True)
-        return ExitStatus.NOT_UNIQUE if session.takes.all else ExitStatus.DONE
+        say(f"No calibration was saved. {_why_none(session)}", to_errors=True)
+        return ExitStatus.NOT_UNIQUE
     say(f"{session.judgement}\nWritten to {shown_path(output)}.")
     return exit_status(session.judgement, of_rig=True)
 
@@ -89,3 +89,14 @@ async def _together(session: rw.capture.Session, server: rw.capture.PageServer |
             task.cancel()
         with suppress(asyncio.CancelledError):
             await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _why_none(session: rw.capture.Session) -> str:
+    """What a session without a calibration has left, and what to do."""
+    if session.takes.all:
+        return f"The takes are in {shown_path(session.takes.folder)}; the same command goes on with them."
+    if session.options.takes_when_still:
+        return (
+            "Nothing was taken: the robot never stood still where a target is seen. Stop it at each pose, or press T."
+        )
+    return "Nothing was taken: press T on the page, or give --when-still."

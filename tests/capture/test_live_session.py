@@ -15,8 +15,7 @@ from mcap.records import Channel, Schema
 from stations import stations
 from synthetic_logs import BEGIN_NS, Message, detections, rig, tag, transform, write
 
-from gtsam_rwhec.capture import sources
-from gtsam_rwhec.capture.live_advice import Wanted
+from gtsam_rwhec.capture import Accuracy, sources
 from gtsam_rwhec.capture.live_session import LiveOptions, Session, source_of
 from gtsam_rwhec.capture.live_takes import TakeInfo, Takes
 from gtsam_rwhec.errors import LogError, RwhecError
@@ -79,7 +78,7 @@ def solved(log_path: Path | list[Path], rig_file: Rig) -> Calibrated:
 
 def test_it_takes_by_itself_where_the_robot_stands_still_and_saves_what_calibrate_gives(tmp_path: Path) -> None:
     log = write(tmp_path / "stations.mcap", stations(7))
-    options = LiveOptions(wanted=Wanted(0.001), takes_when_still=True)
+    options = LiveOptions(wanted=Accuracy(1e-6, 0.8), takes_when_still=True)
     rig_file = rig()
 
     async def run() -> Session:
@@ -115,7 +114,7 @@ def test_it_takes_by_itself_where_the_robot_stands_still_and_saves_what_calibrat
 def test_it_takes_no_more_by_itself_where_the_wanted_accuracy_is_reached(tmp_path: Path) -> None:
     log = write(tmp_path / "stations.mcap", stations(8))
     rig_file = rig()
-    options = LiveOptions(wanted=Wanted(1000.0), takes_when_still=True)
+    options = LiveOptions(wanted=Accuracy(1.0, 0.8), takes_when_still=True)
     session = Session(source_of(str(log), rig_file, 2.5), rig_file, tmp_path / "out", options)
     asyncio.run(session.run())
     assert session.answer is not None

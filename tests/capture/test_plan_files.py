@@ -60,7 +60,7 @@ def test_all_files_hold_the_same_poses(plan: rw.Plan, tmp_path: Path) -> None:
         R = Rotation.from_quat([entry[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
         T = se3.pose(R, [entry[name] for name in ("x_m", "y_m", "z_m")])
         assert np.abs(T - pose.T_parent_child).max() < 1e-12
-        assert np.abs(se3.inverse(T) - pose.A).max() < 1e-12  # the hand carries the sensor
+        assert np.abs(se3.inverse(T) - pose.T_sensorcarrier_targetcarrier).max() < 1e-12  # the hand carries the sensor
         assert [float(row[name]) for name in ("x_m", "y_m", "z_m")] == [entry[n] for n in ("x_m", "y_m", "z_m")]
         assert [ros.position.x, ros.orientation.w] == pytest.approx([entry["x_m"], entry["qw"]], abs=1e-12)
         assert entry["sees"] == row["sees"].split() == [f"{pair.sensor}:{pair.target}" for pair in pose.sees]
@@ -72,7 +72,7 @@ def test_pictures_show_the_board_where_the_camera_should_see_it(plan: rw.Plan, t
     camera = plan.kit.cameras["cam_0"]
     picture = rw.capture.picture_of(plan, pose, "cam_0")
     scale = picture.shape[1] / camera.width
-    board, B = plan.kit.boards["board_0"], pose.B[rw.Pair("board_0", "cam_0")]
+    board, B = plan.kit.boards["board_0"], pose.T_sensor_target[rw.Pair("board_0", "cam_0")]
     middle = scale * camera.project(board @ B[:3, :3].T + B[:3, 3]).mean(axis=0)
     paper = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) > 200
     assert paper[int(middle[1]) - 25 : int(middle[1]) + 25, int(middle[0]) - 25 : int(middle[0]) + 25].mean() > 0.3

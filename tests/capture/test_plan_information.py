@@ -97,8 +97,8 @@ def test_every_proposed_pose_is_seen_although_guesses_are_rough(kind: str, seed:
         plan = rw.plan(problem if i else None, options, cameras=true.cameras, boards=true.boards)
         for pose in plan.poses if i else plan.poses[:1]:  # before the first take nobody knows where the board is
             assert pose.sees
-            assert true.sees(pose.A[None])[0]
-        true.take(problem, plan.poses[0].A, i)
+            assert true.sees(pose.T_sensorcarrier_targetcarrier[None])[0]
+        true.take(problem, plan.poses[0].T_sensorcarrier_targetcarrier, i)
         options = replace(options, present=None)
 
 
@@ -128,12 +128,15 @@ def test_free_frames_are_named_until_two_axes_turned() -> None:
     assert free_frames(known, known.covariance) == ("cam_0", "board_0")
     plan = rw.plan(None, options, cameras=true.cameras, boards=true.boards)
     assert np.isinf(plan.poses[0].deviation_mm)
-    assert np.allclose(plan.poses[0].A, true.present)
-    turns = [se3.so3_logmap((one.A @ se3.inverse(true.present))[None, :3, :3])[0] for one in plan.poses[1:4]]
+    assert np.allclose(plan.poses[0].T_sensorcarrier_targetcarrier, true.present)
+    turns = [
+        se3.so3_logmap((one.T_sensorcarrier_targetcarrier @ se3.inverse(true.present))[None, :3, :3])[0]
+        for one in plan.poses[1:4]
+    ]
     spread = np.linalg.svd(np.array(turns))[1]
     assert spread[1] > np.radians(30.0)  # two axes
     for i, pose in enumerate(plan.poses[:4]):
-        true.take(problem, pose.A, i)
+        true.take(problem, pose.T_sensorcarrier_targetcarrier, i)
     known = cell_of(problem, options, None, true.cameras, true.boards)
     assert free_frames(known, known.covariance) == ()
 
@@ -148,6 +151,6 @@ def test_the_next_take_leaves_what_was_predicted(kind: str) -> None:
         if np.isfinite(promised):
             off.append(abs(promised / plan.outlook.now_mm - 1.0))
         promised = plan.poses[0].deviation_mm
-        true.take(problem, plan.poses[0].A, i)
+        true.take(problem, plan.poses[0].T_sensorcarrier_targetcarrier, i)
         options = replace(options, present=None)
     assert np.median(off) < 0.1

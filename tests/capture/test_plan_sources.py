@@ -88,7 +88,7 @@ def test_nothing_but_a_camera_and_a_board() -> None:
     plan = rw.plan(cameras={"cam": camera}, boards={"board": board}, options=rw.PlanOptions(candidates=80, poses=4))
     assert plan.is_rough
     assert "pictures" in str(plan)
-    B = np.array([one.B[rw.Pair("board", "cam")] for one in plan.poses])
+    B = np.array([one.T_sensor_target[rw.Pair("board", "cam")] for one in plan.poses])
     turns = np.degrees([np.linalg.norm(se3.so3_logmap((B[0].T @ one)[None, :3, :3])) for one in B[1:3]])
     assert (turns >= 30.0).all()
     with pytest.raises(OptionError, match="nothing to plan with"):

@@ -13,7 +13,7 @@ import pytest
 from browser import ARGUMENTS, Opened, chromium, screenshots
 from places import CELL
 
-from gtsam_rwhec.capture.live_answer import Wanted
+from gtsam_rwhec.capture import Accuracy
 from gtsam_rwhec.capture.live_server import PageServer
 from gtsam_rwhec.capture.live_session import LiveOptions, Session, source_of
 from gtsam_rwhec.rig import read_rig
@@ -34,7 +34,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
     async def run() -> None:
         source = source_of(str(CELL / "eye_to_hand.mcap"), rig, 0.5)
-        session = Session(source, rig, out, LiveOptions(wanted=Wanted(5.0)))
+        session = Session(source, rig, out, LiveOptions(wanted=Accuracy(0.005, 0.8)))
         server = PageServer(session)
         addresses.append(server.address)
         started.set()

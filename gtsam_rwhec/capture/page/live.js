@@ -111,19 +111,20 @@ function showAnswer({ answer, verdict, wanted, takes, is_answering }) {
     ? `From ${answer.takes} take${answer.takes === 1 ? "" : "s"}, in ${answer.seconds.toFixed(1)} s${is_answering ? "; calibrating the newer ones" : ""}.`
     : "";
   const decision = answer?.decision;
+  const wanted_mm = wanted ? Number((1e3 * wanted.radius_m).toPrecision(4)) : null;
   $("#accuracy .wanted").textContent = [
-    wanted ? `Wanted: a point ${wanted.at_m} m away within ${wanted.mm} mm, with ${Math.round(100 * wanted.level)} %.` : "",
+    wanted ? `Wanted: a point ${wanted.distance_m} m away within ${wanted_mm} mm, with ${Math.round(100 * wanted.level)} %.` : "",
     decision ? decision.words : "",
     decision?.takes_needed ? `About ${decision.takes_needed} more takes.` : "",
   ].join(" ");
   fill($("#accuracy .points"), (answer?.points ?? []).map((point) => {
-    const is_reached = wanted && point.radius_mm !== null && point.radius_mm <= wanted.mm;
+    const is_reached = wanted && point.radius_mm !== null && point.radius_mm <= wanted_mm;
     const item = made("li", "", is_reached ? "reached" : "");
     const off = point.radius_mm === null ? digits(null) : `within ${digits(point.radius_mm)} mm`;
     item.append(made("div", `${point.sensor}, ${point.distance_m.toFixed(2)} m away: ${off}${is_reached ? " ✓" : ""}`));
     if (wanted) {
       const bar = made("div", "", "bar"), inside = made("i");
-      inside.style.width = `${point.radius_mm ? Math.min(100, (100 * wanted.mm) / point.radius_mm) : 0}%`;
+      inside.style.width = `${point.radius_mm ? Math.min(100, (100 * wanted_mm) / point.radius_mm) : 0}%`;
       bar.append(inside); item.append(bar);
     }
     return item;
