@@ -29,7 +29,7 @@ from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 
 #: At most so many measurements are compared with each other, evenly over the log; with fewer, no view is told.
-MOST, FEWEST = 110, 20
+MOST, FEWEST = 80, 20
 #: The likelihood is evaluated so often at most.
 MOST_EVALUATIONS = 60
 #: Deviation before the data of the logarithms of a size and of a length.
