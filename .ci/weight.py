@@ -25,13 +25,14 @@ BUDGET = {
     # errors of trajectories that last, by kind, with their file 230; a drift that tracks share 40
     # issue 27: clocks' rates 150, errors of the view 200, tags that are alike in one stack 70
     # issue 28: while the robot stands there: plan 2,000, stream and stopping rule 1,400, live with its sources 2,100
-    "lines": 93_000,
-    "code": 58_100,
+    # issue 29: clouds of 3D cameras and LiDARs, points and planes in the certified problem: 5,000
+    "lines": 98_000,
+    "code": 61_400,
     # capture has 25 files, and is a package of its own
-    "files": 408,
-    "packages": 19,
+    "files": 435,
+    "packages": 20,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 70_100,
+    "lines of tests and benchmarks": 73_500,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

@@ -77,6 +77,7 @@ from . import odometry as odometry
 from . import runs as runs
 from . import rig as rig
 from . import detect as detect
+from . import clouds as clouds
 from .runs import calibrate_log as calibrate_log
 
 # While the robot stands there: what to measure next, the answer so far, and when it is good enough.

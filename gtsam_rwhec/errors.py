@@ -134,6 +134,10 @@ class ImageError(RwhecError):
     page = "docs/from_a_log.md#folders-of-images"
 
 
+class CloudError(RwhecError):
+    """A point cloud cannot be read or used: nothing is seen in it, or it belongs to another view."""
+
+
 class TargetError(RwhecError):
     """A target cannot be printed: an unknown family, an id that the family lacks, or a size that is not valid."""
 

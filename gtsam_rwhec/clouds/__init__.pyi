@@ -1,0 +1,1 @@
+from .cloud import Cloud as Cloud
