@@ -185,7 +185,7 @@ def agreeing(
             for item in data_of(judged, variables, how)
         ]
         everything = replace(
-            task, problem=judged, data=data, variables=variables, instants=Instants.of(data), white=None
+            task, problem=judged, data=data, variables=variables, instants=Instants.of(data), noisy=None
         )
         everything = everything.cut_at_jumps(state)
         for _ in range(STEPS):

@@ -44,6 +44,8 @@ MOST_LINKS = 50
 FEWEST_REVISITED, SAMPLED = 0.2, 300
 #: A velocity is taken from neighbours that are no further apart than this, s.
 NEIGHBOURS_S = 0.5
+#: Variances along the axes that differ by less than this share are one.
+ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -238,20 +240,20 @@ class Rows:
         state: State,
         layout: JointCovariance,
         instants: Instants,
-        white: Array | None = None,
+        noisy: Array | None = None,
     ) -> Rows:
         """The rows at an estimate; ``layout`` has the places of the unknowns.
 
-        ``white`` (N, 6), in the order of the instants, is the residuals' white noise: derivatives are then without it.
+        ``noisy`` (N, 6), in the order of the instants, is the noise of S = Y^-1 A X: derivatives are then without it.
         """
         at = linearized(data, variables, state)
         every = [at[item.pair] for item in data]
         counts = [item.count for item in data]
         residual, right = (np.concatenate([getattr(of, part) for of in every]) for part in ("residual", "carrier"))
-        if white is not None:
-            of_data = np.empty_like(white)
-            of_data[instants.order] = white
-            every = _without_noise(every, residual, of_data)
+        if noisy is not None:
+            of_data = np.empty_like(noisy)
+            of_data[instants.order] = noisy
+            every = _without_noise(every, residual, of_data, np.concatenate([item.covariance for item in data]))
         jacobians = [jacobian_of(item, linear, variables, layout) for item, linear in zip(data, every, strict=True)]
         frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
         X, Y = (np.repeat([frames[item.pair[i]] for item in data], counts, axis=0) for i in (0, 1))
@@ -318,16 +320,23 @@ class Rows:
         return found
 
 
-def _without_noise(every: list[Linearization], residual: Array, white: Array) -> list[Linearization]:
-    """The derivatives by X and Y where residuals (N, 6) are nothing, and at poses that are less noisy.
+def _without_noise(every: list[Linearization], residual: Array, noisy: Array, given: Array) -> list[Linearization]:
+    """The derivatives by X and Y where residuals (N, 6) are nothing, and at S Expmap(-noisy).
 
     With r = Log(B^-1 S), S = Y^-1 A X, they are Jr^-1(r) and -Jr^-1(r) Ad(S^-1). Noise of A is in S, and in r: together
-    they say that Y is where it is taken to be. At S Expmap(-white) it would be B's. Nobody knows whose it is: in the
-    middle both weigh the same, with opposite signs.
+    they say that Y is where it is taken to be. Without all of the white noise S would be B, which has its own; in the
+    middle both weigh the same, with opposite signs. Where B's covariance is not the same along all axes, it is of B's
+    axes, and derivatives must be too: a depth that B's noise turns is a side, which is known a hundred times better.
     """
+    left = se3.logmap(se3.expmap(residual) @ se3.expmap(-noisy))
+    blocks = np.stack([given[:, :3, :3], given[:, 3:, 3:]], axis=1)
+    sizes = np.einsum("nkii->nk", blocks)[..., None, None] / 3.0
+    alike = (np.abs(blocks - sizes * np.eye(3)) < ALIKE * sizes).all(axis=(1, 2, 3))
     straight = np.linalg.inv(se3.right_jacobian_inverse(residual))
-    target = straight @ np.concatenate([linear.target for linear in every])
-    sensor = se3.adjoint(se3.expmap(0.5 * white)) @ straight @ np.concatenate([linear.sensor for linear in every])
+    turned = se3.adjoint(se3.expmap(noisy)) @ straight
+    of_B = se3.right_jacobian_inverse(left) @ turned
+    target = np.where(alike[:, None, None], straight, of_B) @ np.concatenate([linear.target for linear in every])
+    sensor = np.where(alike[:, None, None], turned, of_B) @ np.concatenate([linear.sensor for linear in every])
     ends = np.cumsum([len(linear.residual) for linear in every])[:-1]
     parts = zip(every, np.split(target, ends), np.split(sensor, ends), strict=True)
     return [replace(linear, target=by_X, sensor=by_Y) for linear, by_X, by_Y in parts]

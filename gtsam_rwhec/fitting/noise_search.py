@@ -77,8 +77,8 @@ class Task:
     tell: Progress = silent
     #: The instants at which tracks are cut.
     jumps: tuple[int, ...] = ()
-    #: (N, 6): The residuals' white noise, where derivatives are without it.
-    white: Array | None = None
+    #: (N, 6): The white noise of S = Y^-1 A X, where derivatives are without it.
+    noisy: Array | None = None
     _known: list[tuple[State, Rows]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -108,7 +108,7 @@ class Task:
         for known, rows in self._known:
             if known is state:
                 return rows
-        found = Rows.of(self.data, self.variables, state, self.layout, self.instants, self.white)
+        found = Rows.of(self.data, self.variables, state, self.layout, self.instants, self.noisy)
         self._known.append((state, found))
         del self._known[:-KEPT]
         return self._known[-1][1]
@@ -138,7 +138,7 @@ class Task:
         """
         task, deviations = self, _deviations(found.model, found)
         for _ in range(ROUNDS):
-            task = replace(self, white=white_noise(found))
+            task = replace(self, noisy=noise_of_predictions(found))
             model = task.model_like(found.model, found.state)
             after = _deviations(model, found)
             if (np.abs(after / deviations - 1.0) < FAKE).all():
@@ -209,14 +209,17 @@ def _deviations(model: NoiseModel, found: Settled) -> Array:
     return deviations
 
 
-def white_noise(found: Settled) -> Array:
-    """The residuals' white noise (N, 6), of A and of B: what drift and errors of the configuration leave."""
+def noise_of_predictions(found: Settled) -> Array:
+    """What of the residuals' white noise is in S = Y^-1 A X (N, 6): A's.
+
+    Measurements of one instant share A's noise, and tell it from B's. Of a single one nobody knows whose it is: half.
+    """
     eliminated = found.model.eliminated(found.fit.sizes.values(found.fit.logs))
     rows = found.model.rows
-    of_A = eliminated.effects[1][rows.instants.index]  # of instants that several measurements share
-    left: Array = eliminated.left(eliminated.measured.of.columns)
-    left -= (rows.twist[found.model.side] @ of_A[:, :, None])[:, :, 0]
-    return left
+    of_A: Array = -(rows.twist[found.model.side] @ eliminated.effects[1][rows.instants.index][:, :, None])[:, :, 0]
+    alone = np.bincount(rows.instants.index)[rows.instants.index] == 1
+    of_A[alone] = 0.5 * (of_A + eliminated.left(eliminated.measured.of.columns))[alone]
+    return of_A
 
 
 def start_at(sizes: Sizes, near: Fitted | None) -> Array:

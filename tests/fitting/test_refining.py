@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
+import synthetic_logs as logs
 from noisy_rows import problem_of, random_poses, rows_of, task_of
 from rwhec_factors import se3
+from simulated_cells import CAMERA
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting import Component, NoiseOptions, refine_under_noise, under_noise
@@ -296,3 +300,28 @@ def test_noise_in_the_derivatives_is_no_information() -> None:
             found.append(float(error @ np.linalg.solve(refined.covariance("camera"), error)))
     assert np.median(squares) < 12.6 < np.median(before)
     assert max(squares) < max(before)
+
+
+def test_a_wall_of_small_tags_along_a_path_that_walks() -> None:
+    """Their noise is of their own axes, most of it along the ray: about other axes it ended 80 to 190 mm off."""
+    chance, frames, size = np.random.default_rng(1), 23, 0.5 * 0.05
+    square = size * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    exact = np.array([logs.hand(1.0 + i) for i in range(frames)])
+    hands = exact @ np.array(list(accumulate(twists(chance, frames, np.radians(0.01), 4e-4), np.matmul)))
+    problem = rw.Problem()
+    for row, column in np.ndindex(5, 5):
+        at = (0.08 * (row - 2), 0.08 * (column - 2), chance.normal(0.0, 5e-3))
+        tag = logs.pose(chance.normal(0.0, 3.0, 3), at)
+        for name, T_hand_camera in logs.Y.items():
+            T = se3.inverse(exact @ T_hand_camera) @ tag
+            P = square @ T[:, :3, :3].mT + T[:, None, :3, 3]
+            px = chance.normal(CAMERA.project(P), 0.1)
+            seen = ((px > 0.0) & (px < (CAMERA.width, CAMERA.height))).all(axis=(1, 2))
+            stamps = 10**9 * np.flatnonzero(seen)
+            A = se3.inverse(hands[seen])
+            problem.add_corners(
+                f"tag_{row}{column}", name, A, px[seen], square, CAMERA, corner_px=0.1, stamps_ns=stamps
+            )
+    refined, _ = refined_under(problem)
+    for name, T in logs.Y.items():
+        assert refined.contains(name, T, 0.9999)
