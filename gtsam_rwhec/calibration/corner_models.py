@@ -21,8 +21,10 @@ from gtsam_rwhec.fitting.observations import Observations, Views
 from gtsam_rwhec.fitting.reprojection_record import Intrinsics
 from gtsam_rwhec.geometry.poses import Array, PoseLike
 
-#: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case.
+#: Images in the comparison of models: at most so many in all, but up to so many of each pair in any case; of very many
+#: pairs at most so many in all again, but a few of each.
 MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
+MOST_OF_MANY_PAIRS, FEW = 600, 3
 #: Number of cross-validation folds; below `FEW_IMAGES` images more folds, so that enough images remain to calibrate
 #: from.
 FOLDS, FEW_IMAGES, FOLDS_OF_FEW = 4, 50, 8
@@ -139,7 +141,8 @@ def chosen_model(
 
 def thinned(observations: Observations) -> Observations:
     """At most so many images of each pair, evenly over their order."""
-    most = max(MOST_IMAGES // len(observations.views), FEWEST_OF_PAIR)
+    pairs = len(observations.views)
+    most = max(MOST_IMAGES // pairs, min(FEWEST_OF_PAIR, MOST_OF_MANY_PAIRS // pairs), FEW)
 
     def some(view: Views) -> Views:
         number = len(view.A)
