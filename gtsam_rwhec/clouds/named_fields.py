@@ -80,7 +80,7 @@ def _seconds(times: np.ndarray, stamp_ns: int | None) -> Array:
     return np.asarray(after if stamp_ns is None else after + (float(first) * unit - stamp_ns * 1e-9))
 
 
-def cloud_of_record(record: CloudRecord, unit_m: float = METRE) -> Cloud:
+def cloud_of_record(record: CloudRecord, unit_m: float = METRE, *, source: str = "") -> Cloud:
     """The cloud of a log's message. Raises `CloudError` as `cloud_of_fields`."""
     dtype = np.dtype({
         "names": [name for name, _, _ in record.fields],
@@ -101,8 +101,38 @@ def cloud_of_record(record: CloudRecord, unit_m: float = METRE) -> Cloud:
         T_frame_points=record.T_frame_points,
         stamp_ns=record.stamp_ns,
         frame_id=record.frame,
-        source=f"topic {record.topic}, cloud at {record.stamp_ns} ns",
+        source=source or f"topic {record.topic}, cloud at {record.stamp_ns} ns",
     )
+
+
+def record_of_cloud(cloud: Cloud | None, topic: str, stamp_ns: int, frame: str) -> CloudRecord:
+    """A cloud as a message, with nan where nothing is seen; without a cloud, one of no points.
+
+    Numbers of single precision, as nearly all files have, stay such.
+    """
+    if cloud is None:
+        cloud = Cloud(np.empty((0, 3)), np.empty(0, dtype=int))
+    rows, columns = (1, len(cloud)) if cloud.shape is None else cloud.shape
+    at = np.arange(len(cloud)) if cloud.shape is None else cloud.at
+    kind = "<f4" if np.array_equal(cloud.points.astype("<f4"), cloud.points) else "<f8"
+    columns_of = {axis: (cloud.points[:, i], kind) for i, axis in enumerate("xyz")}
+    for name, values, of in (
+        ("intensity", cloud.intensities, "<f4"), ("ring", cloud.rings, "<u2"), ("times_s", cloud.times_s, "<f4")
+    ):  # fmt: skip
+        if values is not None:
+            columns_of[name] = values, of
+    dtype = np.dtype([(name, of) for name, (_, of) in columns_of.items()])
+    table = np.zeros(rows * columns, dtype)
+    for axis in "xyz":
+        table[axis] = np.nan
+    for name, (values, _) in columns_of.items():
+        table[name][at] = values
+    offsets = np.cumsum([0, *(np.dtype(of).itemsize for _, of in columns_of.values())]).tolist()[:-1]
+    fields = tuple((name, offset, of) for (name, (_, of)), offset in zip(columns_of.items(), offsets, strict=True))
+    step = dtype.itemsize
+    return CloudRecord(
+        stamp_ns, stamp_ns, topic, frame, columns, rows, step, columns * step, fields, table.tobytes()
+    )  # fmt: skip
 
 
 def cloud_of_depth(image: ImageRecord, camera: Camera, unit_m: float | None = None, *, source: str = "") -> Cloud:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -104,13 +105,21 @@ class LogWriter:
             closing.push(self._file)
             self._writer.finish()  # type: ignore[no-untyped-call]
 
-    def copy(self, log: Log, topics: Iterable[str] | None = None, images: Images = "copy") -> int:
+    def copy(
+        self,
+        log: Log,
+        topics: Iterable[str] | None = None,
+        images: Images = "copy",
+        of_stages: re.Pattern[str] | None = None,
+    ) -> int:
         """Copy messages byte for byte, with their schemas, channels and times, but no metadata and no attachments.
 
-        Without `topics`, of all; ``images="leave_out"`` leaves out images, videos and clouds. Damaged blocks are left
-        out (``log.losses`` and `Log.records` name them). Returns how many messages were copied.
+        Without `topics`, of all; ``images="leave_out"`` leaves out images, videos and clouds, but not those on topics
+        that match `of_stages`. Damaged blocks are left out (``log.losses`` and `Log.records` name them). Returns how
+        many messages were copied.
         """
         wanted = None if topics is None else set(topics)
+        leaves = images == "leave_out"
         copied = 0
         for file in log.files:
             file.spending.begin_pass()
@@ -127,7 +136,7 @@ class LogWriter:
                     messages.heads.tolist(), spans, strict=True
                 ):
                     if channel_id not in made:
-                        made[channel_id] = self._copied_channel(file, channel_id, wanted, images)
+                        made[channel_id] = self._copied_channel(file, channel_id, wanted, of_stages, leaves=leaves)
                     target = made[channel_id]
                     if target is not None:
                         with self._saying():
@@ -279,14 +288,17 @@ class LogWriter:
         with self._saying():
             self._writer.add_message(channel, stamp_ns, data, stamp_ns)
 
-    def _copied_channel(self, file: Any, channel_id: int, wanted: set[str] | None, images: Images) -> int | None:
+    def _copied_channel(
+        self, file: Any, channel_id: int, wanted: set[str] | None, of_stages: re.Pattern[str] | None, *, leaves: bool
+    ) -> int | None:
         """The channel of this log for a channel of `file`. It is None if its messages are not copied."""
         channel = file.channels.get(channel_id)
         if channel is None or (wanted is not None and channel.topic not in wanted):
             return None
         schema = file.schemas.get(channel.schema_id)
         large = IMAGE_SCHEMAS + VIDEO_SCHEMAS + CLOUD_SCHEMAS
-        if images == "leave_out" and schema is not None and schema_word(schema.name) in large:
+        is_of_stage = of_stages is not None and of_stages.fullmatch(channel.topic)
+        if leaves and schema is not None and schema_word(schema.name) in large and not is_of_stage:
             return None
         schema_id = 0 if schema is None else self._schema(schema.name, schema.encoding, schema.data)
         return self._channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)

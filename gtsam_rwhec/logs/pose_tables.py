@@ -187,9 +187,14 @@ def _check_workspace(T: Array, rows: Sequence[PoseRow]) -> None:
 
 
 def stem_of(name: str) -> str:
-    """A name without folders and without the ending of an image."""
+    """A name without folders and without the ending of an image or a cloud."""
     bare = re.split(r"[/\\]", name.strip().strip("\"'"))[-1]
-    return re.sub(r"\.(png|jpe?g|webp|bmp|tiff?|ya?ml|json|xml|csv|tum|txt)$", "", bare, flags=re.IGNORECASE)
+    return re.sub(
+        r"\.(png|jpe?g|webp|bmp|tiff?|ya?ml|json|xml|csv|tum|txt|pcd|ply|np[yz]|(pcd\.)?bin)$",
+        "",
+        bare,
+        flags=re.IGNORECASE,
+    )
 
 
 #: A table has at most this many lines, and a line at most this many characters.

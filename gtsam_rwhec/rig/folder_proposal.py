@@ -133,7 +133,7 @@ def _text(
     carriers, remarks["carriers", "poses"] = _carriers(reading)
     origin = origin_of([part for _, poses in cameras for part in poses.path.split("/")])
     notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
-    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets={**targets})
     return first_rig_text("folder", folder.resolve().name, rig, remarks, "# Paths start from that folder.\n")
 
 

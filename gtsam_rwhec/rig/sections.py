@@ -296,22 +296,32 @@ def _frame_or_section(given: Any) -> Any:
 
 
 class Sensor(Section):
-    """A camera with images, or with the detections of a driver."""
+    """A camera with images, or with the detections of a driver; or a 3D camera or LiDAR with clouds of points."""
 
-    model_config = one_of("images", "detections", together=(("images", "intrinsics"), ("poses", "images")))
+    model_config = one_of("images", "detections", "clouds", together=(("images", "intrinsics"), ("unit_m", "clouds")))
 
     images: Text | None = optional(
         "topic of the camera's images; of a folder of images, their path in it", "/cam_left/image"
     )
+    clouds: Text | None = optional(
+        "topic of a 3D camera's or a LiDAR's clouds (PointCloud2, Foxglove's PointCloud), or of depth images; of a "
+        "folder, the path or the pattern of files of clouds: PCD, PLY, NumPy, .bin, or depth images of 16 bits",
+        "/camera/depth/points",
+    )
+    unit_m: Positive | None = optional(
+        "with clouds: metres of one unit of theirs; without it 1, and 0.001 for depth images of whole numbers",
+        0.001,
+        unit="m",
+    )
     poses: Text | None = optional(
-        "with images in a folder: path of the carriers' poses, one file for all images, a folder with a file an "
+        "with images or clouds in a folder: path of the carriers' poses, one file for all, a folder with a file an "
         "image, or an index",
         "poses.csv",
     )
     detections: Text | None = optional("topic of a driver's detections, in place of images", "/tag_detections")
     intrinsics: IntrinsicsOrText | None = optional(
         "with images: a file, a section, or the word estimate, which needs no calibration but images of a board; "
-        "detections with poses need none",
+        "detections with poses need none, and of clouds only depth images do",
         "left.yaml",
         {"topic": "/cam_left/camera_info"},
         "estimate",
@@ -341,12 +351,16 @@ class Sensor(Section):
     @model_validator(mode="after")
     def _is_one(self) -> Sensor:
         self._need_one(
-            self._given("images", "detections"),
-            "images (a topic of a log, or a path in a folder) and detections (a topic); a sensor that knows only its "
-            "own motion has odometry",
+            self._given("images", "detections", "clouds"),
+            "images (a topic of a log, or a path in a folder), detections (a topic) and clouds (a topic or a path); a "
+            "sensor that knows only its own motion has odometry",
         )
-        if self.poses is not None and self.images is None:
-            raise ValueError("poses go with images in a folder; poses of detections are in the log")
+        if self.poses is not None and self.detections is not None:
+            raise ValueError("poses go with images or clouds in a folder; poses of detections are in the log")
+        if self.unit_m is not None and self.clouds is None:
+            raise ValueError("unit_m is the unit of clouds; lengths of targets are in metres")
+        if self.clouds is not None and self.time_offset == "estimate":
+            raise ValueError("a clock is not estimated from clouds; take them at rest, or state the offset in seconds")
         if self.images is not None and self.intrinsics is None:
             raise ValueError(
                 "images without intrinsics; give FILE, {topic: ...}, {kalibr: ..., camera: ...} or numbers, "
@@ -354,7 +368,8 @@ class Sensor(Section):
             )
         if self.images is None and self.intrinsics is not None and self.intrinsics.estimate is not None:
             raise ValueError(
-                "intrinsics: estimate needs images, and a driver's detections do not say their size; state intrinsics"
+                "intrinsics: estimate needs images of a board, which neither a driver's detections nor clouds are; "
+                "state intrinsics"
             )
         return self
 
