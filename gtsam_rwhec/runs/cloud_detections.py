@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.clouds.cloud import Cloud
@@ -27,8 +28,8 @@ from gtsam_rwhec.runs.sensor_detections import SensorDetections, message_count
 
 #: Points of a view that are kept, for people who look at the log and for the report.
 KEPT_POINTS = 2000
-#: A registration slides along a direction whose deviation is at least this share of the thing's size.
-SLIDES = 0.3
+#: Two clouds slide along a direction that has less than this share of the information of the best known one.
+NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,13 +174,11 @@ def _records(seen: SeenObject, topic: str, frame: str, target: str, stamps_ns: S
 def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) -> ObjectReport:
     pairs = seen.registrations
     # The carriers' poses and the certified pose of the sensor predict each registration.
-    Y = seen.T_sensorcarrier_sensor
-    T_target_sensor = se3.inverse(seen.A) @ Y
+    T_target_sensor = se3.inverse(seen.A) @ seen.T_sensorcarrier_sensor
     predicted = se3.inverse(T_target_sensor[pairs.i]) @ T_target_sensor[pairs.j]
-    registered = se3.inverse(Y) @ pairs.A @ Y if False else pairs.B
-    off = se3.logmap(se3.inverse(predicted) @ registered)
-    sizes = np.r_[np.ones(3), np.full(3, 1.0)]
-    deviations = np.sqrt(np.linalg.eigvalsh(pairs.covariances / np.outer(sizes, sizes)))
+    off = se3.logmap(se3.inverse(predicted) @ pairs.B)
+    tells = np.linalg.eigvalsh(pairs.information)
+    slides = (tells <= NOTHING * tells[:, -1:]).sum(axis=1)
     return ObjectReport(
         target=target,
         sensor=sensor,
@@ -194,10 +193,10 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
                 overlap=float(overlap),
                 off_mm=1e3 * float(np.linalg.norm(xi[3:])),
                 off_deg=float(np.degrees(np.linalg.norm(xi[:3]))),
-                slides=int((of_pair > SLIDES).sum()),
+                slides=free,
             )
-            for i, j, overlap, xi, of_pair in zip(
-                pairs.i.tolist(), pairs.j.tolist(), pairs.overlap, off, deviations, strict=True
+            for i, j, overlap, xi, free in zip(
+                pairs.i.tolist(), pairs.j.tolist(), pairs.overlap, off, slides.tolist(), strict=True
             )
         ),
         remarks=tuple(f"{finding}." for finding in (*seen.left_out.values(), *seen.findings)),
