@@ -151,7 +151,7 @@ class ObjectReport(FileRecord):
     used: Count = Field(description="clouds that were registered with others")
     noise_mm: NotNegative = Field(description="standard deviation of points of two clouds across the surface, mm")
     spacing_mm: Positive = Field(description="distance of neighbouring points after thinning, mm")
-    pairs: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
+    registrations: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
     remarks: tuple[str, ...] = Field(default=(), description="what is wrong with single clouds, in words")
 
 

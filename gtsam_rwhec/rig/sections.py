@@ -17,6 +17,7 @@ from gtsam_rwhec.cameras.unknown_intrinsics import Lens
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import to_rotations
+from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.rig.section_types import (
     EulerAxes,
     FramePair,
@@ -195,7 +196,8 @@ class PoseSource(Section):
         "tf", "topic", "frames",
         together=(
             ("topic", "parent", "child"), ("parent", "topic"), ("child", "topic"), ("quaternion", "frames"),
-            ("euler", "frames"), ("angles", "frames"), ("length", "frames"), ("one_instant", "frames"),
+            ("euler", "frames"), ("angles", "frames"), ("columns", "frames"), ("length", "frames"),
+            ("one_instant", "frames"),
         ),
     )  # fmt: skip
 
@@ -217,12 +219,23 @@ class PoseSource(Section):
         "ZYX",
     )
     angles: Literal["degrees", "radians"] | None = optional("with euler: the unit of the files' angles", "degrees")
+    columns: tuple[Text, ...] | None = optional(
+        "with frames: what the columns of a table without a line of names are: x, y, z with qx, qy, qz, qw, or with "
+        "rx, ry, rz; without it a position, then a rotation",
+        ["rx", "ry", "rz", "x", "y", "z"],
+    )
     length: Literal["m", "mm"] | None = optional(
         "with frames: the unit of the files' positions; without it names of columns tell, else m", "mm"
     )
     one_instant: bool | None = optional(
         "with frames, images taken at rest: whether images of one name, of different cameras, are of one instant", True
     )
+
+    @property
+    def stated(self) -> PoseStatement:
+        """How the numbers of files are meant."""
+        columns = None if self.columns is None else " ".join(self.columns)
+        return PoseStatement(self.quaternion, self.euler, self.angles, self.length, columns)
 
     @property
     def parent_and_child(self) -> tuple[str, str]:
@@ -240,7 +253,7 @@ class PoseSource(Section):
             raise ValueError(f"{self._given('tf', 'frames')[0]} names both frames already; leave parent and child out")
         if self.topic is not None and len(self._given("parent", "child")) < 2:
             raise ValueError(f"name the frames of the poses of {self.topic}: parent: ..., child: ...")
-        of_files = self._given("quaternion", "euler", "angles", "length", "one_instant")
+        of_files = self._given("quaternion", "euler", "angles", "columns", "length", "one_instant")
         if of_files and self.frames is None:
             raise ValueError(f"{', '.join(of_files)}: only for poses in files, with frames: [parent, child]")
         return self

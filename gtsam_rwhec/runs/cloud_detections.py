@@ -186,7 +186,7 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
         used=int(seen.used.sum()),
         noise_mm=1e3 * float(seen.sigma_m[0]),
         spacing_mm=1e3 * seen.spacing_m,
-        pairs=tuple(
+        registrations=tuple(
             RegisteredPair(
                 first=names[i],
                 second=names[j],

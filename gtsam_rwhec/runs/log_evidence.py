@@ -123,7 +123,9 @@ def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
     path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
-    boards = {name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X}
+    boards = {
+        name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X if name in targets
+    }
     wanted = ("", RemovalReason.OUTLIER)
     is_used = {
         (pair, stamp): not reason
@@ -187,7 +189,7 @@ def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvid
         found,
         lambda target, sensor: of_tracks.get(f"{target}/{sensor}") if found is None else found.corner_px,
     )
-    topics = {sensor: source.images or "" for sensor, source in solved.rig.sensors.items()}
+    topics = {sensor: source.images or source.clouds or "" for sensor, source in solved.rig.sensors.items()}
     topics |= dict.fromkeys(solved.rig.odometries, "")
 
     worst = worst_views(rated)

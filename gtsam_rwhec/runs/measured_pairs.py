@@ -252,6 +252,7 @@ def problem_of(
                 measured.B[used],
                 stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
                 source="the cleaned log",
+                directional=pair.target == rig.object and "covariances" in weights,  # clouds slide on each other
                 **weights,  # type: ignore[arg-type]
             )
         except NoiseError as error:

@@ -41,7 +41,7 @@ from gtsam_rwhec.logs.image_folder import (
     read_poses,
 )
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_tables import NamedPoses, PoseStatement, stem_of
+from gtsam_rwhec.logs.pose_tables import NamedPoses, stem_of
 from gtsam_rwhec.logs.records import Array, DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
@@ -171,8 +171,7 @@ def _said_with(rig: Rig, path: KeyPath) -> Iterator[None]:
 
 
 def _stamped(folder: Path, rig: Rig) -> list[_Stamped]:
-    source = rig.carriers.poses
-    stated = PoseStatement(source.quaternion, source.euler, source.angles, source.length)
+    stated = rig.carriers.poses.stated
     read: dict[Path, NamedPoses] = {}
     found: list[tuple[str, list[Path], NamedPoses]] = []
     for name, sensor in rig.sensors.items():
@@ -305,7 +304,7 @@ def samples_of_rig(path: str | Path, rig: Rig) -> tuple[HandEyeSamples, bool]:
 
     Raises `LogError` as `read_hand_eye_samples`; or the rig file has more sensors or targets, or another setup.
     """
-    source, (parent, child) = rig.carriers.poses, rig.carriers.poses.parent_and_child
+    parent, child = rig.carriers.poses.parent_and_child
     if len(rig.sensors) != 1 or len(rig.targets) != 1:
         raise LogError(
             f"{rig.source.place(('sensors',), ('targets',))}: {len(rig.sensors)} sensors and {len(rig.targets)} "
@@ -317,7 +316,7 @@ def samples_of_rig(path: str | Path, rig: Rig) -> tuple[HandEyeSamples, bool]:
             f"{rig.source.place(('sensors', name))}: the samples in {path} have no images. Write detections: /samples "
             "in place of images"
         )
-    samples = read_hand_eye_samples(path, PoseStatement(source.quaternion, source.euler, source.angles, source.length))
+    samples = read_hand_eye_samples(path, rig.carriers.poses.stated)
     on_hand = rig.carriers.sensors == child
     if samples.is_on_hand not in (None, on_hand) and samples.is_of_carriers:
         setup = "on the hand" if samples.is_on_hand else "fixed"
