@@ -21,11 +21,11 @@ from gtsam_rwhec.geometry.poses import Array
 #: Rotations of the sensor on its carrier that are tried: neighbours are 40 degrees apart.
 ROTATIONS = 120
 #: Pairs of views by which starts are compared.
-PAIRS = 16
+PAIRS = 12
 #: Relative rotations beyond this, rad, are used if there are no others: views from far apart hardly overlap.
 WIDE = np.radians(70.0)
 #: Points of a surface that are moved, and those to which they are moved in the early stages.
-MOVED, COARSE = 100, 600
+MOVED, COARSE = 64, 500
 #: (gate as a share of the thing's size, steps, starts that are kept)
 STAGES = ((0.8, 4, 24), (0.4, 6, 10), (0.15, 8, 6))
 #: Gate (in spacings) and steps of the last stage.

@@ -35,7 +35,7 @@ MISFIT = 0.45
 #: Rounds of registrations and certified solutions.
 ROUNDS = 4
 #: Gates of GICP, and of points to planes after it, in spacings.
-WIDE_GATES, GATE = (4.0, 2.0), 2.0
+WIDE, GATE = 4.0, 2.0
 #: A round is the last if predicted poses move by less than this share of the spacing.
 STILL = 0.05
 #: Added to variances (rad^2, m^2): arms and registrations are no better.
@@ -140,7 +140,7 @@ class SeenObject:
         """Add the views that are used to a problem, as measurements of a target."""
         used = self.used
         problem.add(
-            target, sensor, self.A[used], self.T_sensor_object[used], covariances=self.covariances[used], source="clouds"
+            target, sensor, self.A[used], self.T_sensor_object[used], covariances=self.covariances[used], directional=True, source="clouds"
         )
 
 
@@ -260,8 +260,8 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
         poses = se3.inverse(views.A) @ Y
         predicted = se3.inverse(poses[i]) @ poses[j]
         if not len(starts):
-            gates = [gate * spacing for gate in WIDE_GATES]
-            starts = np.array([aligned(views.surfaces, *pair, gates) for pair in zip(i, j, predicted, strict=True)])
+            tried = zip(i, j, predicted, strict=True)
+            starts = np.array([aligned(views.surfaces, *pair, WIDE * spacing) for pair in tried])
         pairs = registered(views.surfaces, views.A, i, j, starts, predicted, GATE * spacing)
         if len(pairs) < FEWEST_VIEWS - 1:
             raise CloudError(_no_overlap(views, i, j))
@@ -270,7 +270,7 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
         # What A is off counts as well, and is the same in all directions.
         floor = np.median(off**2, axis=0).reshape(2, 3).mean(axis=1).repeat(3)
         problem = Problem()
-        problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=pairs.covariances + np.diag(floor + TINY))
+        problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=pairs.covariances + np.diag(floor + TINY), directional=True)
         with warnings.catch_warnings():
             # The caller's own problem is judged by `calibrate`, with A's noise.
             warnings.simplefilter("ignore", RwhecWarning)

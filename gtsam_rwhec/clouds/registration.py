@@ -27,6 +27,8 @@ PAIRS_EACH = 8
 ALL_PAIRS_TO = 10
 #: Steps of points to planes after GICP, which ends before edges are in place.
 STEPS = 5
+#: A step is the last if it moves points by less than this share of the gate.
+SETTLED = 2e-2
 #: No more pairs than this are looked at for their overlap.
 MOST_PROBED = 20_000
 
@@ -103,21 +105,19 @@ def overlapping_pairs(surfaces: Sequence[Surface], poses: Array, gate_m: float) 
     return i[chosen], j[chosen]
 
 
-def aligned(surfaces: Sequence[Surface], i: int, j: int, T_i_j: Array, gates_m: Sequence[float]) -> Array:
-    """T_i_j (4, 4) by GICP from a start, through gates from wide to narrow."""
-    for gate in gates_m:
-        result = small_gicp.align(
-            surfaces[i].native,
-            surfaces[j].native,
-            surfaces[i].native_tree,
-            init_T_target_source=T_i_j,
-            registration_type="GICP",
-            max_correspondence_distance=gate,
-            rotation_epsilon=1e-5,
-            translation_epsilon=1e-6,
-        )
-        T_i_j = result.T_target_source
-    return T_i_j
+def aligned(surfaces: Sequence[Surface], i: int, j: int, T_i_j: Array, gate_m: float) -> Array:
+    """T_i_j (4, 4) by GICP from a start."""
+    result = small_gicp.align(
+        surfaces[i].native,
+        surfaces[j].native,
+        surfaces[i].native_tree,
+        init_T_target_source=T_i_j,
+        registration_type="GICP",
+        max_correspondence_distance=gate_m,
+        rotation_epsilon=1e-4,
+        translation_epsilon=1e-5,
+    )
+    return np.asarray(result.T_target_source)
 
 
 def registered(
@@ -127,22 +127,24 @@ def registered(
 
     Where a pair slides, it lies as predicted (P, 4, 4). Pairs that turn out not to overlap are left out.
     """
-    T = starts.copy()
-    for step in range(STEPS):
+    T = starts
+    for _ in range(STEPS):
         several = [matches(surfaces[b], surfaces[a], each, gate_m) for a, b, each in zip(i, j, T, strict=True)]
         enough = np.array([each.overlap >= OVERLAP / 2.0 for each in several], dtype=bool)
-        if not enough.any() or step == STEPS - 1:
-            break
         i, j, T, predicted = i[enough], j[enough], T[enough], predicted[enough]
         several = [each for each, yes in zip(several, enough, strict=True) if yes]
         sigma_m = sigmas(several, gate_m)
         # A point that many pairs have is still one point; a residual has the noise of two.
         degrees = np.bincount(np.r_[i, j], minlength=len(surfaces))
         tell = [known(m, sigma_m, (degrees[a] + degrees[b] + 2) / 4.0) for m, a, b in zip(several, i, j, strict=True)]
+        if not tell:
+            break
         guesses = se3.logmap(se3.inverse(T) @ predicted)
-        T = T @ se3.expmap(np.array([t.step + t.of_guess @ guess for t, guess in zip(tell, guesses, strict=True)]))
-    if not enough.any():
-        i, j, tell, several, T = i[:0], j[:0], [], [], T[:0]
+        steps = np.array([t.step + t.of_guess @ guess for t, guess in zip(tell, guesses, strict=True)])
+        T = T @ se3.expmap(steps)
+        reach = np.array([np.linalg.norm(surfaces[b].faces.points.mean(axis=0)) for b in j])
+        if (np.linalg.norm(steps[:, :3], axis=1) * reach + np.linalg.norm(steps[:, 3:], axis=1)).max() < SETTLED * gate_m:
+            break
     return Registrations(
         i,
         j,

@@ -24,8 +24,8 @@ SAMPLED = 20_000
 THINNED = 1.5
 #: Edges are looked for among points that are closer to each other by this factor.
 FINER = 2.5
-#: Points from which a normal is made, and around which an edge is looked for.
-NEIGHBOURS = 15
+#: Points from which a normal is made, and those around a point that may be on an edge.
+NEIGHBOURS, AROUND = 15, 12
 #: A view with fewer points after thinning tells no pose.
 FEWEST_POINTS = 50
 #: A point is on an edge if its neighbours leave such an angle free, rad, around its normal.
@@ -91,18 +91,17 @@ def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
     native, tree = small_gicp.preprocess_points(cloud.points, spacing.faces_m, NEIGHBOURS)
     points = native.points()[:, :3]
     faces = Features(points, native.normals()[:, :3], cKDTree(points))
-    return Surface(name, faces, _edges(cloud.points, spacing.edges_m), native, tree)
+    return Surface(name, faces, _edges(cloud.points, spacing.edges_m, faces), native, tree)
 
 
-def _edges(points: Array, spacing_m: float) -> Features:
+def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     """Where a surface ends that faces the sensor; normals point outwards, in the surface."""
     fine = small_gicp.PointCloud(points)
     if spacing_m > 0.0:
         fine = small_gicp.voxelgrid_sampling(fine, spacing_m)
-    tree = small_gicp.KdTree(fine)
-    small_gicp.estimate_normals_covariances(fine, tree, NEIGHBOURS)
-    points, normals = fine.points()[:, :3], fine.normals()[:, :3]
-    neighbours = np.asarray(tree.batch_knn_search(points, NEIGHBOURS + 1)[0], dtype=np.int64)[:, 1:]
+    points = fine.points()[:, :3]
+    normals = faces.normals[faces.tree.query(points)[1]]
+    neighbours = np.asarray(small_gicp.KdTree(fine).batch_knn_search(points, AROUND + 1)[0], dtype=np.int64)[:, 1:]
     to = points[neighbours] - points[:, None]
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
