@@ -40,7 +40,9 @@ def _square_root(information: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
 
-def _solved(start: Array, i: np.ndarray, j: np.ndarray, T_i_j: Array, roots: Array, weak: Array, *, robust: bool) -> Array:
+def _solved(
+    start: Array, i: np.ndarray, j: np.ndarray, T_i_j: Array, roots: Array, weak: Array, *, robust: bool
+) -> Array:
     """Poses of a graph of relative poses, about weak priors at the start."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, (pose, covariance) in enumerate(zip(start, weak, strict=True)):
@@ -55,9 +57,7 @@ def _solved(start: Array, i: np.ndarray, j: np.ndarray, T_i_j: Array, roots: Arr
     return np.array([solved.atPose3(k).matrix() for k in range(len(start))])
 
 
-def joint_poses(
-    surfaces: Sequence[Surface], predicted: Array, pairs: Registrations, gate_m: float
-) -> JointPoses:
+def joint_poses(surfaces: Sequence[Surface], predicted: Array, pairs: Registrations, gate_m: float) -> JointPoses:
     """Poses of all views at once.
 
     First a graph of the registrations, in which a wrong one does not count (Huber); then points are matched at the

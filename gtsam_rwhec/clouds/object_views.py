@@ -14,13 +14,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.first_registration import Start, first_poses
 from gtsam_rwhec.clouds.joint_registration import joint_poses
-from gtsam_rwhec.clouds.registration import (
-    Registrations,
-    aligned,
-    largest_group,
-    overlapping_pairs,
-    registered,
-)
+from gtsam_rwhec.clouds.registration import Registrations, aligned, largest_group, overlapping_pairs, registered
 from gtsam_rwhec.clouds.surfaces import FEWEST_POINTS, FINER, Spacing, Surface, spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, RwhecWarning
 from gtsam_rwhec.geometry.poses import Array, PoseLike, PosesLike, as_transforms, one_transform
@@ -140,7 +134,13 @@ class SeenObject:
         """Add the views that are used to a problem, as measurements of a target."""
         used = self.used
         problem.add(
-            target, sensor, self.A[used], self.T_sensor_object[used], covariances=self.covariances[used], directional=True, source="clouds"
+            target,
+            sensor,
+            self.A[used],
+            self.T_sensor_object[used],
+            covariances=self.covariances[used],
+            directional=True,
+            source="clouds",
         )
 
 
@@ -270,7 +270,9 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
         # What A is off counts as well, and is the same in all directions.
         floor = np.median(off**2, axis=0).reshape(2, 3).mean(axis=1).repeat(3)
         problem = Problem()
-        problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=pairs.covariances + np.diag(floor + TINY), directional=True)
+        problem.add_motion(
+            SENSOR, pairs.A, pairs.B, covariances=pairs.covariances + np.diag(floor + TINY), directional=True
+        )
         with warnings.catch_warnings():
             # The caller's own problem is judged by `calibrate`, with A's noise.
             warnings.simplefilter("ignore", RwhecWarning)
@@ -308,11 +310,16 @@ def _first(views: _Views, options: ObjectOptions) -> Start:
 def _unexplained(views: _Views, misfit: float) -> str:
     """Words for poses that explain nothing: with the reading of them that would explain the clouds, if there is one."""
     shifted = {
-        f"the poses belong to other views: shifted by {'one row' if by == 1 else 'minus one row'} they fit": np.roll(views.A, by, axis=0)
+        f"the poses belong to other views: shifted by {'one row' if by == 1 else 'minus one row'} they fit": np.roll(
+            views.A, by, axis=0
+        )
         for by in (1, -1)
     }
     scaled = {}
-    for factor, unit in ((1e-3, "poses look like millimetres and clouds like metres"), (1e3, "clouds look like millimetres and poses like metres")):
+    for factor, unit in (
+        (1e-3, "poses look like millimetres and clouds like metres"),
+        (1e3, "clouds look like millimetres and poses like metres"),
+    ):
         other = views.A.copy()
         other[:, :3, 3] *= factor
         scaled[f"{unit}: with A's translations times {factor:g} they fit"] = other

@@ -127,7 +127,9 @@ def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
     certain = np.maximum(values, 0.0)
     total = certain + 1.0 / size**2  # a guess is off by the size of the thing
     step = -vectors @ (vectors.T @ gradient / total)
-    information, covariance, of_guess = ((vectors * d) @ vectors.T for d in (certain, 1.0 / total, 1.0 - certain / total))
+    information, covariance, of_guess = (
+        (vectors * d) @ vectors.T for d in (certain, 1.0 / total, 1.0 - certain / total)
+    )
     return Known(
         _symmetric(to_unit.T @ information @ to_unit),
         _symmetric(from_unit @ covariance @ from_unit.T),

@@ -143,7 +143,9 @@ def registered(
         steps = np.array([t.step + t.of_guess @ guess for t, guess in zip(tell, guesses, strict=True)])
         T = T @ se3.expmap(steps)
         reach = np.array([np.linalg.norm(surfaces[b].faces.points.mean(axis=0)) for b in j])
-        if (np.linalg.norm(steps[:, :3], axis=1) * reach + np.linalg.norm(steps[:, 3:], axis=1)).max() < SETTLED * gate_m:
+        if (
+            np.linalg.norm(steps[:, :3], axis=1) * reach + np.linalg.norm(steps[:, 3:], axis=1)
+        ).max() < SETTLED * gate_m:
             break
     return Registrations(
         i,

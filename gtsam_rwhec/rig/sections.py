@@ -220,9 +220,9 @@ class PoseSource(Section):
     )
     angles: Literal["degrees", "radians"] | None = optional("with euler: the unit of the files' angles", "degrees")
     columns: tuple[Text, ...] | None = optional(
-        "with frames: what the columns of a table without a line of names are: x, y, z with qx, qy, qz, qw, or with "
+        "with frames: what the columns of a table without a line of names are: tx, ty, tz with qx, qy, qz, qw, or with "
         "rx, ry, rz; without it a position, then a rotation",
-        ["rx", "ry", "rz", "x", "y", "z"],
+        ["rx", "ry", "rz", "tx", "ty", "tz"],
     )
     length: Literal["m", "mm"] | None = optional(
         "with frames: the unit of the files' positions; without it names of columns tell, else m", "mm"
