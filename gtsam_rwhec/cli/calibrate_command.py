@@ -85,7 +85,7 @@ def calibrate(
     source: Annotated[
         Path,
         typer.Argument(
-            help="MCAP log, folder of images (--rig) or of clouds with poses beside them, samples of MoveIt, easy_handeye "
+            help="MCAP log, folder of images (--rig) or clouds with poses beside them, samples of MoveIt, easy_handeye "
             f"or OpenCV (YAML, JSON, XML), or {FOLDER_OF_CSV}."
         ),
     ],

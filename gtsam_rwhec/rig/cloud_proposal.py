@@ -162,10 +162,8 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             "measurement tells these apart"
         )
     rig = Rig(carriers=carriers, sensors={**sensors}, targets={OBJECT: ObjectTarget(type="object")})
-    remarks: dict[KeyPath, str] = {
-        ("carriers", "poses"): remark,
-        ("targets", OBJECT): "anything that stood still in front of the sensor",
-    }
+    remarks: dict[KeyPath, str] = {("carriers", "poses"): remark}
+    remarks["targets", OBJECT] = "anything that stood still in front of the sensor"
     head = "# Paths start from that folder.\n"
     return first_rig_text("folder", folder.resolve().name, rig, remarks, head), tuple(notes)
 
