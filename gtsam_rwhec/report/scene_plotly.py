@@ -5,14 +5,14 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator, Sequence
 from functools import cache
-from itertools import combinations
+from itertools import combinations, cycle
 from typing import Any
 
 import numpy as np
 
 from gtsam_rwhec.files.terminal_text import printable
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, shortened
+from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, VIEW_COLOURS, shortened
 from gtsam_rwhec.report.scene_model import Line, Scene, labels_of
 
 #: With more names than this, they are seen on request only.
@@ -34,7 +34,7 @@ Trace = dict[str, Any]
 
 def traces_of(scene: Scene, lines: Sequence[Line]) -> tuple[Trace, ...]:
     """The traces; ``meta`` has the group of each."""
-    of_scene = (_boards, _views, _path, _ellipsoids, _axes, _origins)
+    of_scene = (_boards, _clouds, _views, _path, _ellipsoids, _axes, _origins)
     traces = [trace for made in of_scene for trace in made(scene)]
     return (*traces, *_lines(scene, lines), *_names(scene, lines))
 
@@ -48,6 +48,16 @@ def _boards(scene: Scene) -> Iterator[Trace]:
     if paper and not scene.has_many:
         closed = [np.vstack([polygon, polygon[:1]]) for polygon in paper]
         yield _strokes("boards", "boards, edges", closed, scene, colour=GREY, width=2, showlegend=False)
+
+
+def _clouds(scene: Scene) -> Iterator[Trace]:
+    size = 1.5 if scene.views or len(scene.path) else 2.0
+    for (name, points), colour in zip(scene.clouds, cycle(VIEW_COLOURS), strict=False):
+        marker = {"size": size, "color": colour, "opacity": 0.8}
+        yield _trace(
+            "scatter3d", "clouds", _safe(shortened(name)), points, DIGITS, mode="markers", marker=marker,
+            hoverinfo="name",
+        )  # fmt: skip
 
 
 def _views(scene: Scene) -> Iterator[Trace]:
@@ -242,6 +252,7 @@ BUTTONS = (
     ("path", "Path", 0.145),
     ("ellipsoids", "Ellipsoids", 0.225),
     ("boards", "Boards", 0.19),
+    ("clouds", "Clouds", 0.19),
     ("names", "Names", 0.19),
 )
 #: A pressed button of plotly is nearly white on any page, so that all have dark words.
