@@ -199,18 +199,11 @@ def _scene(
 def scene_of_clouds(scene: Scene) -> Scene:
     """The clouds of a scene alone, from near."""
     low, high = box_of([points for _, points in scene.clouds])
-    margin = 0.05 * float((high - low).max())
-    frames = tuple(f for f in scene.frames if ((low < f.T[:3, 3]) & (f.T[:3, 3] < high)).all())
-    return replace(
-        scene,
-        frames=frames,
-        views=(),
-        boards=(),
-        path=np.zeros((0, 7)),
-        low=low - margin,
-        high=high + margin,
-        times=1.0,
-    )
+    margin = 0.15 * float((high - low).max())
+    within = (f for f in scene.frames if ((low < f.T[:3, 3]) & (f.T[:3, 3] < high)).all())
+    frames = tuple(replace(frame, covariance=None) for frame in within)  # an ellipsoid would hide the clouds
+    alone = replace(scene, frames=frames, views=(), boards=(), path=np.zeros((0, 7)))
+    return replace(alone, low=low - margin, high=high + margin)
 
 
 def _clouds(shown: ShownResult, placed: Array | None) -> tuple[tuple[str, Array], ...]:
