@@ -70,10 +70,8 @@ def scene_section(shown: ShownResult) -> Section:
             assert shown.evidence is not None
             assert shown.evidence.clouds is not None
             near, of = scene_of_clouds(scene), shown.evidence.clouds.of
-            says = (
-                f"The clouds of {len(scene.clouds)} of {of} views, each in its colour, where the calibrated poses put "
-            )
-            says += "them: where the calibration is right, they lie on one surface."
+            says = f"The clouds of {len(scene.clouds)} of {of} views, each in its colour, where the calibrated poses "
+            says += "put them: where these are right, they lie on one surface."
             blocks.append(_drawing("clouds", "The clouds in one frame", near, (), says))
         blocks += [*_facts(shown, evidence), *_turned_away(shown, evidence), *_heights(shown)]
         return Section("scene", TITLE, tuple(blocks))
@@ -252,9 +250,10 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
         axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=GREY, linewidths=widths, zorder=1))
     for view in scene.views:
         axes.add_collection(LineCollection([edge @ P.T for edge in view.edges], colors=SKY, linewidths=0.9, zorder=2))
+    size = 1.5 if len(scene.path) else 3.0
     for (_, points), colour in zip(scene.clouds, cycle(VIEW_COLOURS), strict=False):
         within = ((points > scene.low) & (points < scene.high)).all(axis=1)
-        axes.plot(*(points[within] @ P.T).T, ".", color=colour, markersize=1.5, markeredgewidth=0, rasterized=True)
+        axes.plot(*(points[within] @ P.T).T, ".", color=colour, markersize=size, markeredgewidth=0, rasterized=True)
     if len(scene.path):
         shades = LinearSegmentedColormap.from_list("path", [EARLY, LATE])
         x, y = P @ scene.path[:, :3].T
