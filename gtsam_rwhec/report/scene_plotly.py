@@ -51,7 +51,7 @@ def _boards(scene: Scene) -> Iterator[Trace]:
 
 
 def _clouds(scene: Scene) -> Iterator[Trace]:
-    size = 1.5 if scene.views or len(scene.path) else 2.0
+    size = 1.5 if len(scene.path) else 1.2
     for (name, points), colour in zip(scene.clouds, cycle(VIEW_COLOURS), strict=False):
         marker = {"size": size, "color": colour, "opacity": 0.8}
         yield _trace(
