@@ -12,9 +12,14 @@ from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
 
 #: Normals of points that match differ by less than 37 degrees.
-ALIKE = 0.8
+ALIKE = 0.95
+#: Neighbours lie beside each other by less than this share of the gate.
+ASIDE = 0.5
 #: Cauchy's constant, in deviations: 95 % efficiency for Gaussian noise.
 CAUCHY = 2.385
+#: What all points of faces, and of edges, are off by together, in their deviations. An edge is seen up to a whole point
+#: inside of where it is, and how far depends on how steep it is seen.
+SHARED = (0.2, 0.5)
 #: Information of a direction counts if it is so many of its own deviations above zero.
 SIGNIFICANT = 4.0
 #: And if it is at least this share of the largest: surfaces are round or flat to no better, as sensors see them.
@@ -25,9 +30,11 @@ LEAST_SHARE = 1e-3
 class Matches:
     """Points (m, 3) of a surface that lie on another, and how far off.
 
-    ``residuals`` (m,) are distances from the other's tangent planes, in metres; ``rows`` (m, 6) their derivatives by a
-    right perturbation of T_other_surface (rotation first), ``own_rows`` the same by the surface's own normals. ``kind``
-    is 0 for faces and 1 for edges; ``at`` are places among the surface's faces, then edges.
+    ``residuals`` (m,) are distances across the mean of both normals, in metres: where a surface is curved, neighbours that
+    lie beside each other are off the tangent plane of either, but not of this mean (Rusinkiewicz 2019, "A symmetric
+    objective function for ICP"). ``rows`` (m, 6) are derivatives by a right perturbation of T_other_surface (rotation
+    first) across the other's normals, ``own_rows`` across the surface's own. ``kind`` is 0 for faces and 1 for edges;
+    ``at`` are places among the surface's faces, then edges.
     """
 
     points: Array
@@ -53,7 +60,12 @@ def matches(surface: Surface, other: Surface, T_other_surface: Array, gate_m: fl
         alike = cosine > ALIKE if kind else np.abs(cosine) > ALIKE
         at, normals, sign = at[alike], normals[alike], np.sign(cosine[alike])[:, None]
         points = own.points[at]
-        residuals = np.einsum("ij,ij->i", normals, points - (its.points[nearest[at]] - t) @ R)
+        both = 0.5 * (normals + sign * own.normals[at])
+        apart = points - (its.points[nearest[at]] - t) @ R
+        residuals = np.einsum("ij,ij->i", both, apart)
+        # Farther aside than any neighbour within a surface: the point is beyond the end of the other.
+        within = (apart**2).sum(axis=1) - residuals**2 < (ASIDE * gate_m) ** 2
+        at, normals, sign, points, residuals = at[within], normals[within], sign[within], points[within], residuals[within]
         rows = [np.hstack([np.cross(points, n), n]) for n in (normals, sign * own.normals[at])]
         found.append((points, residuals, *rows, np.full(len(at), kind), first + at))
         counts.append(len(at))
@@ -120,9 +132,12 @@ def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
         a, b, w = one[mine], two[mine], weights[mine]
         values, vectors = np.linalg.eigh(_symmetric(a.T @ (b * w[:, None])))
         spread = np.sqrt(((w[:, None] * (a @ vectors) * (b @ vectors)) ** 2).sum(axis=0))
-        kept = vectors[:, (values > SIGNIFICANT * spread) & (values > LEAST_SHARE * values.max())]
-        certain += kept @ (kept.T @ (a.T @ (b * w[:, None])) @ kept) @ kept.T
-        gradient += kept @ (kept.T @ (a.T @ (w * found.residuals[mine])))
+        kept = (values > SIGNIFICANT * spread) & (values > LEAST_SHARE * values.max())
+        values, vectors = values[kept], vectors[:, kept]
+        # All points of one kind share an error, so their information has a limit.
+        limit = 1.0 / (1.0 + values * (SHARED[kind] * sigma_m[kind]) ** 2)
+        certain += (vectors * values * limit) @ vectors.T
+        gradient += (vectors * limit) @ (vectors.T @ (0.5 * (a + b).T @ (w * found.residuals[mine])))
     values, vectors = np.linalg.eigh(_symmetric(certain))
     certain = np.maximum(values, 0.0)
     total = certain + 1.0 / size**2  # a guess is off by the size of the thing
