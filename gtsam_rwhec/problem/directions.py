@@ -11,11 +11,11 @@ of each other, so a sphere's centre counts whole, whatever the frame's origin is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rwhec_factors.se3 import hat
+from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, NoiseError, PoseError
 from gtsam_rwhec.files.terminal_text import brief
@@ -55,7 +55,7 @@ def points_as_given(
             f"{where}: give sigma (m, along each axis) or covariances (3 x 3, m^2) of the points, one of both"
         )
     if covariances is None:
-        spread = _deviations(sigma, N, "sigma", where)[:, None, None] ** 2 * np.eye(3)
+        spread: Array = _deviations(sigma, N, "sigma", where)[:, None, None] ** 2 * np.eye(3)
     else:
         spread = _checked_spread(covariances, N, where)
     B, noise = np.tile(np.eye(4), (N, 1, 1)), np.zeros((N, 6, 6))
@@ -97,12 +97,13 @@ def planes_as_given(
     return GivenMeasurements(A, B, None, None, order, stamps_ns, noise, source, kind=Kind.PLANE)
 
 
-def frames_of(normals: Array) -> Array:
-    """Rotations (N, 3, 3) whose z is a unit normal (N, 3), and whose x is as near as may be to the first axis.
+def frames_of(normals: Array, along: Array | None = None) -> Array:
+    """Rotations (N, 3, 3) whose z is a unit normal (N, 3), and whose x is as near as may be to ``along`` (N, 3).
 
-    Where the normal is near that axis, x is as near as may be to the second one.
+    Left out, that is the first axis; the second one where the normal is near the first.
     """
-    along = np.where(np.abs(normals[:, :1]) < 0.9, np.eye(3)[0], np.eye(3)[1])
+    if along is None:
+        along = np.where(np.abs(normals[:, :1]) < 0.9, np.eye(3)[0], np.eye(3)[1])
     x = along - np.einsum("ni,ni->n", along, normals)[:, None] * normals
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     frames: Array = np.stack([x, np.cross(normals, x), normals], axis=2)
@@ -175,16 +176,16 @@ class Weighing:
         moment = np.stack([crossed[:, j, k] - crossed[:, k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
         arm = np.einsum("nii->n", of_rotation)[:, None, None] * np.eye(3) - of_rotation
         centre = -np.linalg.solve(arm, moment[:, :, None])[:, :, 0]
-        moved = np.concatenate([-hat(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
+        is_point, is_plane, z = raw.is_of(Kind.POINT), raw.is_of(Kind.PLANE), np.array([0.0, 0.0, 1.0])
+        centre[is_point], centre[is_plane, 2] = 0.0, 0.0
+        moved = np.concatenate([-se3.hat(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
         there = moved @ noise @ moved.transpose(0, 2, 1)
         information, turns = np.linalg.eigh(np.linalg.inv(of_rotation))
         information[:, 2] = np.minimum(information[:, 2], information[:, 0] + information[:, 1])
         of_turns = np.maximum(0.5 * information.sum(axis=1, keepdims=True) - information, 0.0)
         variances, axes = np.linalg.eigh(0.5 * (there + there.transpose(0, 2, 1)))
         of_axes, mean = 1.0 / variances, 3.0 / variances.sum(axis=1)
-        kinds = raw.kinds if raw.kinds is not None else np.zeros(len(centre), dtype=np.int8)
-        is_point, is_plane, z = kinds == Kind.POINT, kinds == Kind.PLANE, np.array([0.0, 0.0, 1.0])
-        of_turns[is_point] = centre[is_point] = 0.0
+        of_turns[is_point] = 0.0
         turns[is_plane] = axes[is_plane] = np.eye(3)
         of_turns[is_plane] = 2.0 / np.einsum("nii->n", of_rotation[is_plane, :2, :2])[:, None] * z
         of_axes[is_plane] = 1.0 / there[is_plane, 2, 2, None] * z
@@ -198,8 +199,44 @@ class Weighing:
         return int(seen[0].sum()), int(seen[1].sum())
 
 
+def aligned(raw: Measurements, X: Array, Y: Array, scale: float = 1.0) -> Measurements:
+    """The measurements, each slid to where poses (4, 4) X and Y predict it, along what it does not measure.
+
+    So a residual is small in every direction, and its directions turn with the target. A point's rotation is the
+    predicted one; a plane's frame turns about its normal and moves in the plane; others slide along the eigenvectors
+    of their covariance with a variance of at least ``SLIDES``. Covariances move along. ``scale``: measured over true
+    length.
+    """
+    if raw.covariances is None or raw.kinds is None:
+        return raw
+    predicted = se3.inverse(Y)[None] @ raw.A @ X
+    predicted[:, :3, 3] *= scale
+    B, slid = raw.B, raw.B.copy()
+    point, plane, other = (raw.is_of(kind) for kind in (Kind.POINT, Kind.PLANE, Kind.DIRECTIONAL))
+    slid[point, :3, :3] = predicted[point, :3, :3]
+    normal = B[plane, :3, 2]
+    slid[plane, :3, :3] = frames_of(normal, predicted[plane, :3, 0])
+    off = predicted[plane, :3, 3] - B[plane, :3, 3]
+    slid[plane, :3, 3] += off - np.einsum("ni,ni->n", off, normal)[:, None] * normal
+    covariances = raw.covariances
+    if other.any():
+        variances, along = np.linalg.eigh(covariances[other])
+        free = along * (variances >= SLIDES)[:, None, :]
+        step = free @ (free.transpose(0, 2, 1) @ se3.logmap(se3.inverse(B[other]) @ predicted[other])[:, :, None])
+        slid[other] = B[other] @ se3.expmap(step[:, :, 0])
+    moved = se3.adjoint(se3.inverse(slid) @ B)
+    moved[raw.is_of(Kind.POSE)] = np.eye(6)
+    covariances = moved @ covariances @ moved.transpose(0, 2, 1)
+    return replace(raw, B=slid, covariances=0.5 * (covariances + covariances.transpose(0, 2, 1)))
+
+
+#: Variances, rad^2 or m^2, from which on a direction slides.
+SLIDES = 1.0
+
+
 def unseen_by(raw: Measurements) -> np.ndarray:
     """(6,): which directions of the target's frame none of the measurements sees."""
     if raw.kinds is None:
         return UNSEEN[Kind.POSE]
-    return np.logical_and.reduce([UNSEEN[Kind(kind)] for kind in np.unique(raw.kinds)])
+    unseen: np.ndarray = np.all([UNSEEN[Kind(kind)] for kind in np.unique(raw.kinds)], axis=0)
+    return unseen

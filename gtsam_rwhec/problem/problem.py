@@ -80,7 +80,7 @@ def check_measurements(measurements: object) -> None:
             )
 
 
-def _kind_of(covariances: ArrayLike | None, directional: bool) -> Kind:  # noqa: FBT001
+def _kind_of(covariances: ArrayLike | None, directional: bool) -> Kind:
     """The kind of a batch of poses."""
     if directional and covariances is None:
         raise NoiseError("directional=True weighs by direction; give covariances, which have the directions")
@@ -457,8 +457,8 @@ class Problem(Knowledge):
             )
         if self.scale == "per_target":
             raise ScaleError(
-                f"{where}: with scale='per_target' the certified form cannot weigh by direction; take scale='known', or "
-                "'shared' for one unknown scale"
+                f"{where}: with scale='per_target' the certified form cannot weigh by direction; take scale='known', "
+                "or 'shared' for one unknown scale"
             )
 
     def _check_names(self, pair: Pair, where: str) -> None:
@@ -536,10 +536,10 @@ class Problem(Knowledge):
         of_target = name not in self.fixed and self._kind.get(name) == "target"
         if not of_target or not all(each.has_kinds for each in kept):
             return np.zeros(6, dtype=bool)
-        unseen = np.logical_and.reduce([unseen_by(batch) for each in kept for batch in each.batches])
+        unseen: np.ndarray = np.all([unseen_by(batch) for each in kept for batch in each.batches], axis=0)
         for prior in self.priors.get(name, []):
             unseen &= ~np.repeat([prior.kappa is not None, prior.sigma is not None], 3)
-        return np.asarray(unseen)
+        return unseen
 
     @property
     def has_measurements(self) -> bool:

@@ -120,7 +120,7 @@ def stacks_of(measured: Measured, block: int = BLOCK) -> Iterator[Stack]:
     for pair, directed in measured.directed:
         for first in range(0, directed.count, block):
             part = slice(first, min(first + block, directed.count))
-            A, B = (_rows(poses[part])[None] for poses in (directed.raw.A, directed.raw.B))
+            A, B = (_rows(poses[part])[None] for poses in (directed.A, directed.B))
             one = np.ones(A.shape[:2])
             yield Stack(np.array([pair]), A, B, one, one, (directed, part))
     for pair, raw in measured.batches:
@@ -203,7 +203,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         else:
             directed, part = stack.directed
             turn = directed.reach(part)
-            low = (low + DOUBLED * _reach(r)).reshape(k, D, 12) @ turn.T * (1.0 + 1e-9)
+            rounded = (low + DOUBLED * _reach(r)).reshape(k, D, 12) * (1.0 + 1e-9)
+            low = np.matmul(rounded, turn.T).reshape(k, outputs)
             r, weights = directed.turned(part, r, rest), directed.weights(part)[None]
         residuals = r.reshape(k, m, D, 12)
         weighted = residuals * weights[:, :, None, :]
@@ -220,12 +221,12 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         else:
             square, error = _together(weighted, residuals, root, slack)
             places = np.zeros(1, dtype=int)
-        one_size, one_error = of_ones * root, of_ones * (unit * root + slack)
+        in_rows, rows_error = of_ones * root, of_ones * (unit * root + slack)
         if stack.directed is not None:
             flat = directed.turned_back(part, flat)
-            one_error = (one_error + gamma(_FEW + 12) * one_size) @ turn * (1.0 + 1e-9)
-            one_size = one_size @ turn
-        one_size, one_error = one_size.reshape(k, 1, outputs), one_error.reshape(k, 1, outputs)
+            rows_error = np.matmul((rows_error + gamma(_FEW + 12) * in_rows) * (1.0 + 1e-9), turn)
+            in_rows = np.matmul(in_rows, turn)
+        one_size, one_error = in_rows.reshape(k, 1, outputs), rows_error.reshape(k, 1, outputs)
         of_poses, of_errors = [], []
         for poses, rounding in ((A, off), (stack.B, np.zeros((k, 12))))[of_A_and_B]:
             of_poses.append(np.matmul(poses.transpose(0, 2, 1), flat))
