@@ -105,7 +105,7 @@ def _ellipsoids(scene: Scene) -> Iterator[Trace]:
 
 
 def _axes(scene: Scene) -> Iterator[Trace]:
-    for k, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True)):
+    for k, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True) if scene.frames else ()):
         yield _strokes("axes", name, scene.axes(k), scene, colour=colour, width=5)
 
 
@@ -140,7 +140,8 @@ def _lines(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
 def _names(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
     """Names of frames, and labels of directions at the first frame that has them."""
     few = len(scene.frames) <= MOST_NAMES
-    yield _texts("names", [(frame.name, frame.T[:3, 3]) for frame in scene.frames], INK, is_visible=few)
+    if scene.frames:
+        yield _texts("names", [(frame.name, frame.T[:3, 3]) for frame in scene.frames], INK, is_visible=few)
     labels = labels_of(lines)
     if labels:
         yield _texts("directions", list(labels.items()), PURPLE, is_visible=True)
@@ -328,7 +329,12 @@ def near_sensors(scene: Scene) -> dict[str, Any] | None:
 
 def _spread(scene: Scene) -> Array:
     places = np.concatenate(
-        [scene.path[:, :3], *(f.T[None, :3, 3] for f in scene.frames), *(v.rim for v in scene.views)]
+        [
+            scene.path[:, :3],
+            *(f.T[None, :3, 3] for f in scene.frames),
+            *(v.rim for v in scene.views),
+            *(points[:: max(1, len(points) // 9)] for _, points in scene.clouds),
+        ]
     )
     return np.asarray(np.cov(places.T)) if len(places) > 1 else np.eye(3)
 
