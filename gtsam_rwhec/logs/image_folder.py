@@ -138,7 +138,8 @@ def images_in(folder: Path, endings: Iterable[str] = tuple(FORMATS)) -> list[Pat
         raise LogError(f"{folder}: there is no such folder of images{_folders_near(folder)}")
     files = sorted((f for f in folder.glob(pattern) if f.suffix.lower() in endings), key=lambda f: natural_key(f.name))
     if not files:
-        raise LogError(f"{folder / pattern if pattern != '*' else folder} has no files {', '.join(endings)}")
+        what = "images" if set(endings) == set(FORMATS) else "clouds"
+        raise LogError(f"{folder / pattern if pattern != '*' else folder} has no {what} ({', '.join(endings)})")
     return files
 
 
@@ -197,7 +198,7 @@ def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
         return _enough(matched, files, poses, where)
     if any(poses.names) and pose_stamps(poses) is None and len(set(poses.names)) == len(poses.names) > 1:
         raise LogError(
-            f"{where}: no pose has the name of its {_word(files)}. The first is {files[0].name}, and the first pose is "
+            f"{where}: no pose has the name of {_a(files)}. The first is {files[0].name}, and the first pose is "
             f"{poses.names[0]!r} ({poses.places[0]}). Give both the same names or numbers"
         )
     if len(files) != len(poses.T):
@@ -210,7 +211,11 @@ def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
 
 
 def _word(files: Sequence[Path]) -> str:
-    return "image" if files[0].suffix.lower() in FORMATS else "cloud"
+    return _a(files).partition(" ")[2]
+
+
+def _a(files: Sequence[Path]) -> str:
+    return "an image" if files[0].suffix.lower() in FORMATS else "a cloud"
 
 
 def _number(name: str) -> str:
