@@ -42,7 +42,7 @@ def run(*arguments: object, status: int | tuple[int, ...] = (0, 1)) -> str:
 
 
 def write_poses(A: np.ndarray, path: Path) -> None:
-    """T_base_flange as an arm's controller writes it: x, y, z in millimetres, rx, ry, rz in degrees, a comma at last."""
+    """T_base_flange as a controller writes it: x, y, z in millimetres, rx, ry, rz in degrees, a comma at the end."""
     T = se3.inverse(A)
     angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=True)
     rows = np.column_stack([1e3 * T[:, :3, 3], angles])
@@ -92,7 +92,7 @@ def test_a_folder_of_clouds_gives_the_truth(out: Path, made: SimulatedClouds) ->
     assert degrees < 0.05
     assert mm < 0.3
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    assert result["certificate"]["status"] == "certified"
+    assert result["certified"]["certificate"]["status"] == "certified"
     assert result["verdict"] != "do_not_use"
     (seen,) = result["log"]["detection"]["objects"]
     assert (seen["used"], seen["views"]) == (VIEWS, VIEWS)
@@ -220,7 +220,7 @@ def test_real_things_agree(shared_data: Path, tmp_path: Path, name: str) -> None
     assert poses.columns == ("rx", "ry", "rz", "tx", "ty", "tz")
     run("calibrate", source, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
     result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
-    assert result["certificate"]["status"] == "certified"
+    assert result["certified"]["certificate"]["status"] == "certified"
     assert result["verdict"] != "do_not_use"
     # Eight things of this cell agreed within these, by another road (motions of pairs, and no joint registration).
     assert np.abs(sensor(tmp_path / "out")[:3, 3] - [0.0711, -0.0352, 0.0598]).max() < 0.0015
