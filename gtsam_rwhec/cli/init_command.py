@@ -39,7 +39,9 @@ def init(
 ) -> ExitStatus:
     """Look at a log or a folder of images or clouds, and write a first rig file. TODO marks the lines that you must complete."""
     if schema + reference + (template is not None) + (log is not None) != 1:
-        raise typer.BadParameter("give one of: a log or a folder of images or clouds, --template, --schema, --reference")
+        raise typer.BadParameter(
+            "give one of: a log or a folder of images or clouds, --template, --schema, --reference"
+        )
     if schema or reference:
         typer.echo(rw.rig.schema_text() if schema else rw.rig.reference_text(), nl=False)
         return ExitStatus.DONE

@@ -198,8 +198,8 @@ def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
         return _enough(matched, files, poses, where)
     if any(poses.names) and pose_stamps(poses) is None and len(set(poses.names)) == len(poses.names) > 1:
         raise LogError(
-            f"{where}: no pose has the name of {_a(files)}. The first is {files[0].name}, and the first pose is "
-            f"{poses.names[0]!r} ({poses.places[0]}). Give both the same names or numbers"
+            f"{where}: no pose has the name of {_a(files)}. The first {_word(files)} is {files[0].name}, and the first "
+            f"pose is {poses.names[0]!r} ({poses.places[0]}). Give both the same names or numbers"
         )
     if len(files) != len(poses.T):
         raise LogError(

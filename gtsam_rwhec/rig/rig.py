@@ -249,8 +249,8 @@ def _sensors(rig: RigFile) -> Iterator[Fault]:
         if sensor.poses is not None and rig.carriers.poses.frames is None:
             yield (
                 ("sensors", name, "poses"),
-                "poses in files beside images or clouds, and carriers.poses is of a log; write carriers.poses: "
-                "{frames: [parent, child]} for these files",
+                f"poses in files beside {'images' if sensor.images else 'clouds'}, and carriers.poses is of a log; "
+                "write carriers.poses: {frames: [parent, child]} for these files",
             )
 
 
