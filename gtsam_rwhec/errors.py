@@ -137,6 +137,8 @@ class ImageError(RwhecError):
 class CloudError(RwhecError):
     """A point cloud cannot be read or used: nothing is seen in it, or it belongs to another view."""
 
+    page = "docs/clouds.md"
+
 
 class TargetError(RwhecError):
     """A target cannot be printed: an unknown family, an id that the family lacks, or a size that is not valid."""

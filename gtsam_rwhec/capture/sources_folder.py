@@ -15,7 +15,7 @@ from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, images_in, match, read_poses
 from gtsam_rwhec.logs.mcap_reader import open_log
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_tables import PoseStatement, stem_of
+from gtsam_rwhec.logs.pose_tables import stem_of
 from gtsam_rwhec.logs.records import Array
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.recorded_logs import APART_NS, FIRST_NS
@@ -50,8 +50,7 @@ class FolderSource(Source):
 
     def _arrived(self) -> dict[int, list[tuple[str, Path, Array]]]:
         """New images with their sensors and poses, by stamp."""
-        poses_of = self.rig.carriers.poses
-        stated = PoseStatement(poses_of.quaternion, poses_of.euler, poses_of.angles, poses_of.length)
+        stated = self.rig.carriers.poses.stated
         new: dict[int, list[tuple[str, Path, Array]]] = {}
         self.state = "watching the folder"
         for name, sensor in self.rig.sensors.items():

@@ -38,6 +38,7 @@ from gtsam_rwhec.cli.shared_options import (
     written_in,
 )
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Method = Literal["auto", "sdp", "local"]
@@ -84,8 +85,8 @@ def calibrate(
     source: Annotated[
         Path,
         typer.Argument(
-            help="MCAP log, folder of images with poses beside them (--rig), samples of MoveIt, easy_handeye or OpenCV "
-            f"(YAML, JSON, XML), or {FOLDER_OF_CSV}."
+            help="MCAP log, folder of images (--rig) or clouds with poses beside them, samples of MoveIt, easy_handeye "
+            f"or OpenCV (YAML, JSON, XML), or {FOLDER_OF_CSV}."
         ),
     ],
     rig: RigOption = None,
@@ -184,7 +185,8 @@ def calibrate(
     A log needs a rig file, which states the sizes of the targets. Its calibration writes calibration.mcap, result.json,
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, and the cameras for Kalibr, ROS, OpenCV and COLMAP.
     """
-    if rig is not None or is_log(source):
+    is_of_clouds = rig is None and not is_log(source) and source.is_dir() and bool(rw.rig.cloud_folders(source))
+    if rig is not None or is_log(source) or is_of_clouds:
         refuse(context, NOT_FOR_A_LOG)
         described = None if rig is None else rw.rig.read_rig(rig)
         is_of_odometries = rw.odometry.is_of_odometries(described, source)
@@ -192,7 +194,7 @@ def calibrate(
             refuse(context, NOT_FOR_ODOMETRIES)
         if output is None:
             needed = "give -o FOLDER"
-            if rig is None:
+            if rig is None and not is_of_clouds:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
         if is_of_odometries:
@@ -293,6 +295,20 @@ def _write_report(output: Path, evidence: rw.results.Evidence | None) -> Path | 
     return page
 
 
+def _proposed(folder: Path, stage: StageDisplay) -> rw.rig.Rig:
+    """The rig file that ``init`` proposes for a folder of clouds, where nothing in it is left to a person."""
+    proposal = folder / "rig.yaml"
+    text, notes = rw.rig.propose_folder_rig(folder, proposal, progress=stage)
+    for note in notes:
+        say(note, to_errors=True)
+    if rw.rig.todo_lines(text):
+        raise RigError(
+            f"{shown_path(folder)}: the folder does not tell how its poses are to be read. gtsam-rwhec init "
+            f"{shown_path(folder)} -o rig.yaml writes a rig file; complete it, and give it with --rig"
+        )
+    return rw.rig.parse_rig(text, f"the rig file that was made of {folder}", folder)
+
+
 def is_log(source: Path) -> bool:
     """Whether this is a log, and not a folder of CSV files."""
     return source.suffix.lower() == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
@@ -329,6 +345,8 @@ def calibrate_log(
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
         described = None if rig is None else rw.rig.read_rig(rig)
+        if rig is None and not is_log(source):
+            described = _proposed(source, stage)
         if described is not None and rw.runs.is_file_of_samples(source, described):
             samples, on_hand = rw.runs.samples_of_rig(source, described)
             say(f"{samples.reading(on_hand)}.", to_errors=True)

@@ -14,14 +14,14 @@ from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 from gtsam_rwhec.files.whole_files import write_atomically
 
-Template = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "odometry"]
+Template = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "clouds", "odometry"]
 
 
 def init(
     log: Annotated[
         Path | None,
         typer.Argument(
-            help="MCAP file, a folder of MCAP files (a ROS 2 bag), or a folder of images with poses beside them.",
+            help="MCAP file, a folder of MCAP files (a ROS 2 bag), or a folder of images or clouds with poses beside them.",
             show_default=False,
         ),
     ] = None,
@@ -37,9 +37,11 @@ def init(
         bool, typer.Option("--reference", help="Print every key of rig files, as Markdown, and write nothing.")
     ] = False,
 ) -> ExitStatus:
-    """Look at a log or a folder of images, and write a first rig file. TODO marks the lines that you must complete."""
+    """Look at a log or a folder of images or clouds, and write a first rig file. TODO marks the lines that you must complete."""
     if schema + reference + (template is not None) + (log is not None) != 1:
-        raise typer.BadParameter("give one of: a log or a folder of images, --template, --schema, --reference")
+        raise typer.BadParameter(
+            "give one of: a log or a folder of images or clouds, --template, --schema, --reference"
+        )
     if schema or reference:
         typer.echo(rw.rig.schema_text() if schema else rw.rig.reference_text(), nl=False)
         return ExitStatus.DONE

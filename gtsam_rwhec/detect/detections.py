@@ -37,6 +37,7 @@ class Rejection(StrEnum):
     SQUARES = "squares do not alternate as printed"
     CIRCLES = "circles not of the sizes as printed, or the larger dot not at its corner"
     OTHER_SIZE = "board goes on: other columns or rows"
+    NOT_REGISTERED = "the cloud fits no other where its pose puts it"
 
 
 @dataclass(frozen=True)

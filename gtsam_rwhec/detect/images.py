@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -185,6 +187,38 @@ def decode_gray(image: ImageRecord, size: Size | None = None) -> Gray:
     return gray
 
 
+#: ROS's compressed depth images have this many bytes before the PNG.
+_DEPTH_HEADER = 12
+#: Raw encodings of depth, with NumPy's name for a pixel.
+_DEPTH = {"16uc1": "u2", "mono16": "u2", "32fc1": "f4"}
+
+
+def decode_depth(image: ImageRecord, size: Size) -> NDArray[Any]:
+    """Pixels (height, width) of a depth image as they were recorded: 16 bits, or 32 of floating point.
+
+    Raises
+    ------
+    ImageError
+        As `decode_gray`; or the pixels are of 8 bits, or quantised, and so no depths.
+    """
+    where = f"topic {image.topic}, image at {image.stamp_ns} ns"
+    encoding = image.encoding.strip().lower()
+    if not image.is_compressed:
+        if encoding not in _DEPTH:
+            raise ImageError(f"{where}: encoding {image.encoding!r} is no depth; depths are {', '.join(_DEPTH)}")
+        rows = _rows(image, where, size, np.dtype(_DEPTH[encoding]).itemsize)
+        return rows.view((">" if image.is_bigendian else "<") + _DEPTH[encoding])
+    if "compresseddepth" in encoding:
+        if encoding.startswith("32fc1"):
+            raise ImageError(f"{where}: compressed depths of floating point are quantised; record the raw topic")
+        image = replace(image, data=image.data[_DEPTH_HEADER:])
+    depth = _decoded(image, where, size, _WHOLE)
+    if depth.dtype == np.uint8:
+        raise ImageError(f"{where}: an image of 8 bits is no depth; give PNG of 16 bits, or TIFF of floating point")
+    _check_size(where, (depth.shape[1], depth.shape[0]), size)
+    return depth
+
+
 def decode_small(image: ImageRecord, width: int) -> Gray:
     """Pixels, 8 bits, of a small picture of so many columns; a JPEG is decoded at a part of its size, which is faster.
 
@@ -211,6 +245,11 @@ def _check_size(where: str, found: Size, wanted: Size | None) -> None:
 
 
 def _compressed(image: ImageRecord, where: str, wanted: Size | None, flags: int = _WHOLE) -> Gray:
+    gray = _decoded(image, where, wanted, flags)
+    return gray.astype(np.uint8, copy=False) if gray.dtype == np.uint8 else _eight_bits(gray)
+
+
+def _decoded(image: ImageRecord, where: str, wanted: Size | None, flags: int) -> NDArray[Any]:
     if not len(image.data):
         raise ImageError(f"{where}: there are no bytes in it")
     begins, claims = image.data[:8].hex(), image.encoding[:40]
@@ -237,7 +276,7 @@ def _compressed(image: ImageRecord, where: str, wanted: Size | None, flags: int 
         gray = None
     if gray is None:
         raise ImageError(f"{what}: OpenCV cannot decode them")
-    return gray.astype(np.uint8, copy=False) if gray.dtype == np.uint8 else _eight_bits(gray)
+    return np.asarray(gray)
 
 
 def _eight_bits(wide: NDArray[np.generic]) -> Gray:
@@ -257,24 +296,30 @@ def _finite(wide: NDArray[np.generic]) -> NDArray[np.float32]:
         return np.nan_to_num(wide.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _raw(image: ImageRecord, where: str, wanted: Size | None) -> Gray:
+def _rows(image: ImageRecord, where: str, wanted: Size | None, pixel: int) -> NDArray[np.uint8]:
+    """The rows (height, width * pixel) of a raw image whose pixels have so many bytes."""
     width, height, step = image.width, image.height, image.step
     if width is None or height is None or step is None:
         raise ImageError(f"{where}: a raw image without width, height or step")
-    encoding = image.encoding.strip().lower()
-    if encoding not in _RAW:
-        raise ImageError(f"{where}: encoding {image.encoding!r} is not supported; supported are {', '.join(_RAW)}")
-    channels, size, code = _RAW[encoding]
-    if width < 1 or height < 1 or step < width * channels * size or len(image.data) < step * height:
+    if width < 1 or height < 1 or step < width * pixel or len(image.data) < step * height:
         raise ImageError(
-            f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)} "
-            "bytes"
+            f"{where}: {width} x {height} pixels of {image.encoding[:40]} in rows of {step} bytes do not fit "
+            f"{len(image.data)} bytes"
         )
     if width * height > MOST_PIXELS:
         raise ImageError(f"{where}: {width} x {height} pixels are more than the {MOST_PIXELS} that are decoded")
     _check_size(where, (width, height), wanted)
     rows = np.frombuffer(image.data, dtype=np.uint8, count=step * height).reshape(height, step)
-    rows = np.ascontiguousarray(rows[:, : width * channels * size])
+    return np.ascontiguousarray(rows[:, : width * pixel])
+
+
+def _raw(image: ImageRecord, where: str, wanted: Size | None) -> Gray:
+    encoding = image.encoding.strip().lower()
+    if encoding not in _RAW:
+        raise ImageError(f"{where}: encoding {image.encoding!r} is not supported; supported are {', '.join(_RAW)}")
+    channels, size, code = _RAW[encoding]
+    rows = _rows(image, where, wanted, channels * size)
+    width, height = rows.shape[1] // (channels * size), rows.shape[0]
     if size == 2:
         return _eight_bits(rows.view(">u2" if image.is_bigendian else "<u2"))
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows

@@ -64,6 +64,10 @@ SCHEMAS = 16 * MIB
 CHANNELS = 2 * MIB
 #: Message types that the descriptors of one protobuf schema define; Foxglove's have at most ten.
 MESSAGE_TYPES = 1000
+#: Bytes. A file of one cloud, and what it decompresses to, have at most this many: eight million points of 32 bytes.
+CLOUD = 256 * MIB
+#: Bytes of one point with all of its fields.
+POINT = 4096
 #: Bytes of text with poses for a folder of images: half a million lines.
 POSES_TEXT = 64 * MIB
 

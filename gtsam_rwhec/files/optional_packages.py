@@ -15,7 +15,7 @@ EXTRAS = {
     "PIL": "log", "cv2": "log", "google": "log", "loky": "log", "lz4": "log", "mcap": "log", "mcap_protobuf": "log",
     "requests": "log", "yaml": "log", "zstandard": "log", "rosbags": "rosbags",
     "jinja2": "report", "matplotlib": "report", "plotly": "report", "rich": "report", "typer": "cli",
-    "yourdfpy": "plan",
+    "lzf": "clouds", "small_gicp": "clouds", "yourdfpy": "plan",
     "starlette": "live", "uvicorn": "live", "websockets": "live",
     "dask": "fleet", "distributed": "fleet", "fsspec": "fleet", "pyarrow": "fleet", "s3fs": "fleet",
 }  # fmt: skip

@@ -63,7 +63,8 @@ def read_whole(path: str | Path, most_bytes: int, expected: str) -> bytes:
     """
     with opened(path) as stream:
         try:
-            content = stream.read(most_bytes + 1)
+            # Python makes room for all that it is asked to read; a pipe has no size.
+            content = stream.read(min(most_bytes, os.fstat(stream.fileno()).st_size or most_bytes) + 1)
         except OSError as error:
             raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
     if len(content) > most_bytes:

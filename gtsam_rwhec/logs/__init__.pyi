@@ -11,6 +11,7 @@ from .mcap_writer import LogWriter as LogWriter
 from .records import Topic as Topic
 
 # What its messages are read as.
+from .records import CloudRecord as CloudRecord
 from .records import DetectionRecord as DetectionRecord
 from .records import ImageRecord as ImageRecord
 from .records import IntrinsicsRecord as IntrinsicsRecord

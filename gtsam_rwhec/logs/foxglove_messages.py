@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
@@ -41,12 +41,14 @@ from gtsam_rwhec.logs.records import (
     MEASURED_PAIR,
     TAG_DETECTIONS,
     Array,
+    CloudRecord,
     DetectionRecord,
     ImageRecord,
     IntrinsicsRecord,
     PairRecord,
     PoseRecord,
     Record,
+    cloud_fault,
     image_fault,
     transforms,
 )
@@ -249,6 +251,28 @@ def _camera_calibration(message: Any, access: Access, topic: str, logged: int) -
     return (IntrinsicsRecord(logged, access.stamp(message), topic, frame, width, height, model, K, D, R, P),)
 
 
+#: NumPy's names for Foxglove's types of numbers.
+NUMERIC = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
+
+
+def _point_cloud(message: Any, access: Access, topic: str, logged: int) -> Read:
+    data = access.as_bytes(access.get(message, "data"))
+    step = access.whole(message, "point_stride")
+    pose = np.array([access.pose(access.get(message, "pose"))])
+    # Protobuf leaves a pose that is not given at zero.
+    T, faults = transforms(pose[:, :3], pose[:, 3:]) if pose.any() else (np.eye(4)[None], {})
+    fields = tuple(
+        (access.text(part, "name"), access.whole(part, "offset"), NUMERIC[access.get(part, "type")])
+        for part in access.listed(message, "fields")
+        if access.get(part, "type") in NUMERIC
+    )
+    width = len(data) // step if step else 0
+    frame, stamp = access.frame(message), access.stamp(message)
+    of_frame = None if np.array_equal(T[0], np.eye(4)) else T[0]
+    cloud = CloudRecord(logged, stamp, topic, frame, width, 1, step, width * step, fields, data, of_frame)
+    return faults.get(0) or cloud_fault(cloud) or (cloud,)
+
+
 def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Read:
     """This library's ``gtsam_rwhec.TagDetections`` (see `written_schemas`)."""
     stamp, frame = access.stamp(message), access.frame(message)
@@ -313,6 +337,7 @@ _OTHERS: dict[str, Callable[[Any, Access, str, int], Read]] = {
     "foxglove.CompressedImage": _compressed_image,
     "foxglove.RawImage": _raw_image,
     "foxglove.CameraCalibration": _camera_calibration,
+    "foxglove.PointCloud": _point_cloud,
     TAG_DETECTIONS: _tag_detections,
     MEASURED_PAIR: _measured_pair,
 }
@@ -342,17 +367,68 @@ def _protobuf_parser(schema: Schema) -> Callable[[bytes | memoryview], Any]:
         raise MessageError(f"schema {schema.name}: its protobuf descriptors cannot be used: {error}") from error
     if decode is None:
         raise MessageError(f"schema {schema.name} is in {schema.encoding!r} in place of protobuf")
-    has_lists = _has_lists(decode(b"").DESCRIPTOR, set())
+    descriptor = decode(b"").DESCRIPTOR
+    has_lists = _has_lists(descriptor, set())
+    of_bytes = {
+        field.number: field.name
+        for field in descriptor.fields
+        if field.type == field.TYPE_BYTES and not _is_list(field)
+    }
 
     def parse(message: bytes | memoryview) -> Any:
+        apart: dict[str, bytes] = {}
         if has_lists and len(message) > LISTED_BYTES:
-            raise MessageError(f"{len(message)} bytes with lists in them, beyond the limit of {LISTED_BYTES}")
+            message, apart = _bytes_apart(bytes(message), of_bytes)
+            if len(message) > LISTED_BYTES:
+                raise MessageError(f"{len(message)} bytes with lists in them, beyond the limit of {LISTED_BYTES}")
         try:
-            return decode(bytes(message))
+            found = decode(bytes(message))
         except DecodeError as error:
             raise MessageError(f"not a protobuf message: {error}") from error
+        for name, data in apart.items():
+            setattr(found, name, data)
+        return found
 
     return parse
+
+
+def _bytes_apart(message: bytes, of_bytes: dict[int, str]) -> tuple[bytes, dict[str, bytes]]:
+    """A protobuf message without its outermost fields of bytes, by whose names they are returned: they are no lists."""
+    rest, apart, at = bytearray(), dict[str, bytes](), 0
+    try:
+        while at < len(message):
+            start = at
+            tag, at = _varint(message, at)
+            kind = tag & 7
+            if kind == 0:
+                _, at = _varint(message, at)
+            elif kind == 2:
+                length, at = _varint(message, at)
+                at += length
+            elif kind in (1, 5):
+                at += 8 if kind == 1 else 4
+            else:
+                break
+            if kind == 2 and tag >> 3 in of_bytes and at <= len(message):
+                apart[of_bytes[tag >> 3]] = message[at - length : at]
+            else:
+                rest += message[start:at]
+            if len(rest) > LISTED_BYTES:
+                break
+    except IndexError:
+        pass  # it ends within a number: the decoder says so
+    return bytes(rest) + message[at : at + LISTED_BYTES + 1], apart
+
+
+def _varint(message: bytes, at: int) -> tuple[int, int]:
+    """A number of protobuf, and the place behind it."""
+    value = shift = 0
+    while True:
+        byte = message[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80 or shift > 63:
+            return value, at
 
 
 def _count(type_: DescriptorProto) -> int:
@@ -365,11 +441,14 @@ def _has_lists(descriptor: Descriptor, known: set[str]) -> bool:
     known.add(descriptor.full_name)
     for field in descriptor.fields:
         inner = field.message_type
-        # protobuf before 6.31 has labels in place of the property.
-        is_list = getattr(field, "is_repeated", getattr(field, "label", None) == field.LABEL_REPEATED)
-        if is_list or (inner and inner.full_name not in known and _has_lists(inner, known)):
+        if _is_list(field) or (inner and inner.full_name not in known and _has_lists(inner, known)):
             return True
     return False
+
+
+def _is_list(field: FieldDescriptor) -> bool:
+    # protobuf before 6.31 has labels in place of the property.
+    return bool(getattr(field, "is_repeated", getattr(field, "label", None) == field.LABEL_REPEATED))
 
 
 def decoder_for(channel: Channel, schema: Schema | None, spending: Spending) -> Decoder:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -40,6 +40,8 @@ Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz t
 FORMATS = {
     ".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".bmp": "bmp", ".tif": "tiff", ".tiff": "tiff",
 }  # fmt: skip
+#: The endings of files of one cloud; of images the depths.
+CLOUD_FORMATS = (".pcd", ".ply", ".npy", ".npz", ".bin", ".png", ".tif", ".tiff")
 #: Bytes of the largest file that is taken as an image. A log keeps images as they are.
 LARGEST_IMAGE = MESSAGE
 
@@ -124,8 +126,8 @@ class Matched:
     poses: tuple[int, ...]  #: The pose of each
 
 
-def images_in(folder: Path) -> list[Path]:
-    """The images of a folder in natural order; a LogError if it does not exist or has none.
+def images_in(folder: Path, endings: Iterable[str] = tuple(FORMATS)) -> list[Path]:
+    """The images, or clouds, of a folder in natural order; a LogError if it does not exist or has none.
 
     The last part of the path may be a pattern, ``rgb/*_color.png``, for folders that have other images too.
     """
@@ -134,9 +136,10 @@ def images_in(folder: Path) -> list[Path]:
         folder, pattern = folder.parent, folder.name
     if not folder.is_dir():
         raise LogError(f"{folder}: there is no such folder of images{_folders_near(folder)}")
-    files = sorted((f for f in folder.glob(pattern) if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
+    files = sorted((f for f in folder.glob(pattern) if f.suffix.lower() in endings), key=lambda f: natural_key(f.name))
     if not files:
-        raise LogError(f"{folder / pattern if pattern != '*' else folder} has no images ({', '.join(FORMATS)})")
+        what = "images" if set(endings) == set(FORMATS) else "clouds"
+        raise LogError(f"{folder / pattern if pattern != '*' else folder} has no {what} ({', '.join(endings)})")
     return files
 
 
@@ -186,23 +189,33 @@ def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
         for i, name in enumerate(of_poses):
             first = found.setdefault(name, i)
             if name in of_images and np.abs(poses.T[first] - poses.T[i]).max() > SAME_POSE:
-                raise LogError(f"{where}: image {name} has two poses, {poses.places[first]} and {poses.places[i]}")
+                raise LogError(
+                    f"{where}: {_word(files)} {name} has two poses, {poses.places[first]} and {poses.places[i]}"
+                )
         images = tuple(i for i, name in enumerate(of_images) if name in found)
         matched = Matched(images, tuple(found[of_images[i]] for i in images))
         _say_the_rest(files, poses, matched, where, set(of_images), of_poses)
         return _enough(matched, files, poses, where)
     if any(poses.names) and pose_stamps(poses) is None and len(set(poses.names)) == len(poses.names) > 1:
         raise LogError(
-            f"{where}: no pose has the name of an image. The first image is {files[0].name}, and the first pose is "
-            f"{poses.names[0]!r} ({poses.places[0]}). Give both the same names or numbers"
+            f"{where}: no pose has the name of {_a(files)}. The first {_word(files)} is {files[0].name}, and the first "
+            f"pose is {poses.names[0]!r} ({poses.places[0]}). Give both the same names or numbers"
         )
     if len(files) != len(poses.T):
         raise LogError(
-            f"{where}: {len(files)} images and {len(poses.T)} poses without names of images ({poses.places[0]}): give "
-            "one pose an image, or a first column with the images' names"
+            f"{where}: {len(files)} {_word(files)}s and {len(poses.T)} poses without names of these "
+            f"({poses.places[0]}): give one pose each, or a first column with the names"
         )
     everyone = tuple(range(len(files)))
     return _enough(Matched(everyone, everyone), files, poses, where)
+
+
+def _word(files: Sequence[Path]) -> str:
+    return _a(files).partition(" ")[2]
+
+
+def _a(files: Sequence[Path]) -> str:
+    return "an image" if files[0].suffix.lower() in FORMATS else "a cloud"
 
 
 def _number(name: str) -> str:
@@ -214,13 +227,13 @@ def _number(name: str) -> str:
 def _enough(matched: Matched, files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
     if len(files) < 2:
         raise LogError(
-            f"{where}: there is one image, {files[0].name}; a calibration needs images at three poses and more that "
+            f"{where}: there is one {_word(files)}, {files[0].name}; a calibration needs three poses and more that "
             "turn about two axes: take more"
         )
     if len(matched.images) < 2:
         raise LogError(
-            f"{where}: {len(matched.images)} of {len(files)} images have one of the {len(poses.T)} poses; the first "
-            f"image is {files[0].name}, and the first pose is {poses.names[0]!r}"
+            f"{where}: {len(matched.images)} of {len(files)} {_word(files)}s have one of the {len(poses.T)} poses; the "
+            f"first is {files[0].name}, and the first pose is {poses.names[0]!r}"
         )
     return matched
 
@@ -231,8 +244,8 @@ def _say_the_rest(
     has_pose = set(matched.images)
     alone = [file.name for i, file in enumerate(files) if i not in has_pose]
     idle = [poses.names[i] for i, name in enumerate(of_poses) if name not in known]
-    said = [f"{len(alone)} of {len(files)} images have no pose ({_some(alone)})"] if alone else []
-    said += [f"{len(idle)} of {len(poses.T)} poses have no image ({_some(idle)})"] if idle else []
+    said = [f"{len(alone)} of {len(files)} {_word(files)}s have no pose ({_some(alone)})"] if alone else []
+    said += [f"{len(idle)} of {len(poses.T)} poses have no {_word(files)} ({_some(idle)})"] if idle else []
     if said:
         warnings.warn(f"{where}: {', and '.join(said)}; they are left out", LogWarning, stacklevel=4)
 

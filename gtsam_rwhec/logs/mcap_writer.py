@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -29,16 +30,19 @@ from gtsam_rwhec.errors import BudgetError, LogError
 from gtsam_rwhec.files.whole_files import atomic_stream
 from gtsam_rwhec.logs.mcap_reader import Log
 from gtsam_rwhec.logs.records import (
+    CLOUD_SCHEMAS,
     IMAGE_SCHEMAS,
     MEASURED_PAIR,
     TAG_DETECTIONS,
     VIDEO_SCHEMAS,
     Array,
+    CloudRecord,
     DetectionRecord,
     IntrinsicsRecord,
     PairRecord,
     schema_word,
 )
+from gtsam_rwhec.logs.ros2_messages import POINT_FIELDS
 
 Images = Literal["copy", "leave_out"]
 #: foxglove.PointsAnnotation has this number for a closed line.
@@ -57,6 +61,16 @@ POSE_ARRAY = "\n".join(
         f"{_MESSAGE}geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
         f"{_MESSAGE}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z",
         f"{_MESSAGE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    ]
+).encode()
+#: The definition of ROS 2's PointCloud2, with those of its parts.
+POINT_CLOUD = "\n".join(
+    [
+        "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields",
+        "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense",
+        f"{_MESSAGE}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id",
+        f"{_MESSAGE}builtin_interfaces/Time\nint32 sec\nuint32 nanosec",
+        f"{_MESSAGE}sensor_msgs/PointField\nstring name\nuint32 offset\nuint8 datatype\nuint32 count",
     ]
 ).encode()
 
@@ -91,13 +105,21 @@ class LogWriter:
             closing.push(self._file)
             self._writer.finish()  # type: ignore[no-untyped-call]
 
-    def copy(self, log: Log, topics: Iterable[str] | None = None, images: Images = "copy") -> int:
+    def copy(
+        self,
+        log: Log,
+        topics: Iterable[str] | None = None,
+        images: Images = "copy",
+        of_stages: re.Pattern[str] | None = None,
+    ) -> int:
         """Copy messages byte for byte, with their schemas, channels and times, but no metadata and no attachments.
 
-        Without `topics`, of all; ``images="leave_out"`` leaves out topics of images and videos. Damaged blocks are left
-        out (``log.losses`` and `Log.records` name them). Returns how many messages were copied.
+        Without `topics`, of all; ``images="leave_out"`` leaves out images, videos and clouds, but not those on topics
+        that match `of_stages`. Damaged blocks are left out (``log.losses`` and `Log.records` name them). Returns how
+        many messages were copied.
         """
         wanted = None if topics is None else set(topics)
+        leaves = images == "leave_out"
         copied = 0
         for file in log.files:
             file.spending.begin_pass()
@@ -114,7 +136,7 @@ class LogWriter:
                     messages.heads.tolist(), spans, strict=True
                 ):
                     if channel_id not in made:
-                        made[channel_id] = self._copied_channel(file, channel_id, wanted, images)
+                        made[channel_id] = self._copied_channel(file, channel_id, wanted, of_stages, leaves=leaves)
                     target = made[channel_id]
                     if target is not None:
                         with self._saying():
@@ -148,14 +170,29 @@ class LogWriter:
 
     def pose_array(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
         """Write a ``geometry_msgs/msg/PoseArray`` of (N, 4, 4) poses as ROS 2 does: CDR, little endian."""
-        time, name = _time(stamp_ns), frame.encode() + b"\0"
-        head = struct.pack(f"<iII{len(name)}s", time["sec"], time["nsec"], len(name), name)
-        head += bytes(-len(head) % 4) + struct.pack("<I", len(T))
+        time = _time(stamp_ns)
+        head = _padded(struct.pack("<iI", time["sec"], time["nsec"]) + _cdr_text(frame)) + struct.pack("<I", len(T))
         poses = [[*part["position"].values(), *part["orientation"].values()] for part in map(_pose, T)]
         data = b"\0\1\0\0" + head + bytes(-len(head) % 8) + np.array(poses, "<f8").tobytes()
         channel = self._channel(topic, "cdr", self._schema("geometry_msgs/msg/PoseArray", "ros2msg", POSE_ARRAY), {})
         with self._saying():
             self._writer.add_message(channel, stamp_ns, data, stamp_ns)
+
+    def point_cloud(self, cloud: CloudRecord) -> None:
+        """Write a ``sensor_msgs/msg/PointCloud2`` as ROS 2 does: CDR, little endian. The points are in the frame."""
+        time, types = _time(cloud.stamp_ns), {kind: number for number, kind in POINT_FIELDS.items()}
+        head = _padded(struct.pack("<iI", time["sec"], time["nsec"]) + _cdr_text(cloud.frame))
+        head += struct.pack("<III", cloud.height, cloud.width, len(cloud.fields))
+        for name, offset, kind in cloud.fields:
+            head = _padded(_padded(head + _cdr_text(name)) + struct.pack("<IB", offset, types[kind[1:]]))
+            head += struct.pack("<I", 1)
+        is_big = any(kind.startswith(">") for _, _, kind in cloud.fields)
+        head = _padded(head + bytes([is_big])) + struct.pack("<III", cloud.step, cloud.row_step, len(cloud.data))
+        schema = self._schema("sensor_msgs/msg/PointCloud2", "ros2msg", POINT_CLOUD)
+        data = b"".join((b"\0\1\0\0", head, cloud.data, b"\0"))
+        with self._saying():
+            channel = self._channel(cloud.topic, "cdr", schema, {})
+            self._writer.add_message(channel, cloud.logged_ns, data, cloud.logged_ns)
 
     def pose(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
         """Write a ``foxglove.PoseInFrame`` of one pose (4, 4)."""
@@ -251,13 +288,17 @@ class LogWriter:
         with self._saying():
             self._writer.add_message(channel, stamp_ns, data, stamp_ns)
 
-    def _copied_channel(self, file: Any, channel_id: int, wanted: set[str] | None, images: Images) -> int | None:
+    def _copied_channel(
+        self, file: Any, channel_id: int, wanted: set[str] | None, of_stages: re.Pattern[str] | None, *, leaves: bool
+    ) -> int | None:
         """The channel of this log for a channel of `file`. It is None if its messages are not copied."""
         channel = file.channels.get(channel_id)
         if channel is None or (wanted is not None and channel.topic not in wanted):
             return None
         schema = file.schemas.get(channel.schema_id)
-        if images == "leave_out" and schema is not None and schema_word(schema.name) in IMAGE_SCHEMAS + VIDEO_SCHEMAS:
+        large = IMAGE_SCHEMAS + VIDEO_SCHEMAS + CLOUD_SCHEMAS
+        is_of_stage = of_stages is not None and of_stages.fullmatch(channel.topic)
+        if leaves and schema is not None and schema_word(schema.name) in large and not is_of_stage:
             return None
         schema_id = 0 if schema is None else self._schema(schema.name, schema.encoding, schema.data)
         return self._channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)
@@ -282,6 +323,16 @@ class LogWriter:
             yield
         except OSError as error:
             raise LogError(f"{self.path} cannot be written: {error.strerror}.") from error
+
+
+def _padded(data: bytes) -> bytes:
+    """Bytes of CDR up to where a number of four bytes may begin."""
+    return data + bytes(-len(data) % 4)
+
+
+def _cdr_text(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return struct.pack("<I", len(data)) + data
 
 
 def _points(corners: Array) -> list[dict[str, float]]:

@@ -60,7 +60,7 @@ class PoseStatement:
     euler: str | None = None
     angles: Literal["degrees", "radians"] | None = None
     length: Literal["m", "mm"] | None = None
-    #: The order of a line's seven numbers, as ``"qw qx qy qz tx ty tz"``, in tables without names of columns
+    #: Names of a line's numbers, as ``"qw qx qy qz tx ty tz"``, in tables without names of columns
     columns: str | None = None
 
 
@@ -187,9 +187,14 @@ def _check_workspace(T: Array, rows: Sequence[PoseRow]) -> None:
 
 
 def stem_of(name: str) -> str:
-    """A name without folders and without the ending of an image."""
+    """A name without folders and without the ending of an image or a cloud."""
     bare = re.split(r"[/\\]", name.strip().strip("\"'"))[-1]
-    return re.sub(r"\.(png|jpe?g|webp|bmp|tiff?|ya?ml|json|xml|csv|tum|txt)$", "", bare, flags=re.IGNORECASE)
+    return re.sub(
+        r"\.(png|jpe?g|webp|bmp|tiff?|ya?ml|json|xml|csv|tum|txt|pcd|ply|np[yz]|(pcd\.)?bin)$",
+        "",
+        bare,
+        flags=re.IGNORECASE,
+    )
 
 
 #: A table has at most this many lines, and a line at most this many characters.
@@ -215,6 +220,10 @@ def read_pose_table(path: str, text: str, *, stated: PoseStatement) -> list[Pose
     header, lines = _lines(path, text)
     if not lines:
         raise LogError(f"{path} has no poses.")
+    if header is None and stated.columns is not None and len(names := stated.columns.split()) == len(lines[0][1]):
+        if not (columns := _columns(names)):
+            _refuse_names(path, names)
+        return _by_columns(path, columns, names, lines, stated)
     if header is not None and (columns := _columns(header)):
         return _by_columns(path, columns, header, lines, stated)
     if header is not None and len(header) >= 7 and all(len(fields) == len(header) for _, fields in lines):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors import se3
 
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.quaternions import to_rotations
 
 Array: TypeAlias = NDArray[np.float64]
@@ -135,7 +136,25 @@ class PairRecord:
     covariance: Array | None = None  #: (6, 6): The covariance of B, as in `PoseRecord`
 
 
-Record: TypeAlias = PoseRecord | ImageRecord | IntrinsicsRecord | DetectionRecord | PairRecord
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudRecord:
+    """A cloud of points, not decoded: `height` rows of `width` points; a cloud that is no image has one row."""
+
+    logged_ns: int
+    stamp_ns: int
+    topic: str
+    frame: str
+    width: int
+    height: int
+    step: int  #: Bytes of a point
+    row_step: int  #: Bytes from one row to the next
+    #: Of each field of a point: its name, where it begins in the point, and NumPy's name for its type, ``<f4``
+    fields: tuple[tuple[str, int, str], ...]
+    data: bytes
+    T_frame_points: Array | None = None  #: (4, 4), metres: where the points' origin is; None if it is the frame's
+
+
+Record: TypeAlias = PoseRecord | ImageRecord | IntrinsicsRecord | DetectionRecord | PairRecord | CloudRecord
 
 
 #: ROS's topics of transforms end with these words.
@@ -145,6 +164,8 @@ INTRINSICS_SCHEMAS = ("sensor_msgs/msg/CameraInfo", "sensor_msgs/CameraInfo", "f
 #: In ROS and in Foxglove, the schemas of images that can be decoded end with these words.
 IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage")
 VIDEO_SCHEMAS = ("CompressedVideo",)
+#: The schemas of clouds of points end with these words.
+CLOUD_SCHEMAS = ("PointCloud2", "PointCloud")
 #: These schemas are this library's own.
 TAG_DETECTIONS = "gtsam_rwhec.TagDetections"
 MEASURED_PAIR = "gtsam_rwhec.MeasuredPair"
@@ -178,6 +199,11 @@ class Topic:
     def has_images(self) -> bool:
         """Whether its messages are images that can be decoded."""
         return schema_word(self.schema) in IMAGE_SCHEMAS
+
+    @property
+    def has_clouds(self) -> bool:
+        """Whether its messages are clouds of points."""
+        return schema_word(self.schema) in CLOUD_SCHEMAS
 
 
 #: A quaternion's norm may be this far from 1. The quaternion is then normalised.
@@ -233,6 +259,17 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
     R = T[:, None, None, :3, :3]
     right = (R.swapaxes(-1, -2) @ blocks @ R).transpose(0, 1, 3, 2, 4).reshape(-1, 6, 6)
     return [right[i] if is_known else None for i, is_known in enumerate(known.tolist())]
+
+
+def cloud_fault(cloud: CloudRecord) -> str:
+    """Say what is wrong with a cloud's size; the text is empty if the data has all points, with all of their fields."""
+    for name, offset, kind in cloud.fields:
+        if offset + np.dtype(kind).itemsize > cloud.step:
+            return f"field {brief(name)} ends beyond the {cloud.step} bytes of a point"
+    rows = f"{cloud.height} x {cloud.width} points of {cloud.step} bytes, {cloud.row_step} bytes a row,"
+    if cloud.row_step < cloud.width * cloud.step or cloud.height * cloud.row_step > len(cloud.data):
+        return f"a cloud of {rows} has {len(cloud.data)} bytes"
+    return ""
 
 
 def image_fault(width: int, height: int, step: int, data: bytes) -> str:

@@ -20,11 +20,13 @@ from gtsam_rwhec.errors import MessageError
 from gtsam_rwhec.logs.cdr import Batch, MessageType, Numbers, find
 from gtsam_rwhec.logs.records import (
     Array,
+    CloudRecord,
     DetectionRecord,
     ImageRecord,
     IntrinsicsRecord,
     PoseRecord,
     Record,
+    cloud_fault,
     gtsam_covariances,
     image_fault,
     transforms,
@@ -115,6 +117,33 @@ def _camera_info(batch: Batch, topic: str, logged_ns: list[int]) -> list[Read]:
             logged_ns, stamps_of(batch, tree), width, height, *matrices, strict=True
         )
     ]
+
+
+#: NumPy's names for the types of a PointField, without the order of bytes.
+POINT_FIELDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def _point_cloud(batch: Batch, topic: str, logged_ns: list[int]) -> list[Read]:
+    tree = batch.shape.tree
+    columns = [batch.numbers(tree, name).tolist() for name in ("width", "height", "point_step", "row_step")]
+    big = batch.numbers(tree, "is_bigendian").tolist()
+    parts = [
+        (batch.text(part, "name"), *(batch.numbers(part, name).tolist() for name in ("offset", "datatype", "count")))
+        for part in parts_of(batch, "fields")
+    ]
+    found: list[Read] = []
+    each = zip(logged_ns, stamps_of(batch, tree), _bytes(batch), *columns, strict=True)
+    for i, (logged, stamp, data, width, height, step, row_step) in enumerate(each):
+        kinds = [POINT_FIELDS.get(kind[i]) for _, _, kind, _ in parts]
+        fields = tuple(  # what has several numbers, or an unknown type, is nothing that a cloud needs
+            (name, offset[i], (">" if big[i] else "<") + kind)
+            for (name, offset, _, count), kind in zip(parts, kinds, strict=True)
+            if kind is not None and count[i] <= 1
+        )
+        frame = frame_of(batch, tree)
+        cloud = CloudRecord(logged, stamp, topic, frame, width, height, step, row_step, fields, data)
+        found.append(cloud_fault(cloud) or (cloud,))
+    return found
 
 
 #: A read message gives its records, or its fault in words.
@@ -338,5 +367,6 @@ ROS2_SCHEMAS: dict[str, Decode] = {
     "sensor_msgs/Image": _image,
     "sensor_msgs/CompressedImage": _compressed_image,
     "sensor_msgs/CameraInfo": _camera_info,
+    "sensor_msgs/PointCloud2": _point_cloud,
     **DETECTIONS,
 }

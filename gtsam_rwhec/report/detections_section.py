@@ -31,6 +31,7 @@ from gtsam_rwhec.report.report_blocks import (
     Section,
     Table,
     Words,
+    worded,
 )
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.detection_evidence import MOST_LISTED, PIECES, RemovedMeasurement, SeenEvidence, SeenTrack
@@ -57,6 +58,7 @@ def seen_section(shown: ShownResult) -> Section:
         return Section("seen", TITLE, found, "" if found else "the result has no record of its measurements beside it.")
     blocks = [
         *_counts(shown, seen),
+        *_registered(shown),
         *_detections(seen),
         *_coverage(shown, seen),
         *_removed(shown, seen),
@@ -82,7 +84,7 @@ def _counts(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     detection = shown.tree.get("log", {}).get("detection", {})
     images = detection.get("images", {})
     if images:
-        words: list[Piece] = ["Looked at (images, or messages of a detector): "]
+        words: list[Piece] = ["Looked at (images, clouds, or messages of a detector): "]
         for sensor in list(images)[:MOST_SENTENCES]:
             words += [shown.number("log", "detection", "images", sensor, spec=",.0f"), f" of {sensor}, "]
         words[-1] = str(words[-1]).removesuffix(", ") + (" and others." if len(images) > MOST_SENTENCES else ".")
@@ -97,6 +99,36 @@ def _counts(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
         yield Paragraph(f"{len(faults):,} images could not be used.", "care")
         some = (*faults[:MOST_SENTENCES], *_and_more(len(faults) - MOST_SENTENCES, "result.json has them"))
         yield Folded("Images that could not be used", (Listing(some),))
+
+
+def _registered(shown: ShownResult) -> Iterator[Block]:
+    """How clouds were registered with each other."""
+    for k, one in enumerate(shown.tree.get("log", {}).get("detection", {}).get("objects", ())):
+        at = ("log", "detection", "objects", k)
+        used, views = (shown.number(*at, name, spec=",.0f") for name in ("used", "views"))
+        noise, spacing = (shown.number(*at, name, spec=".2g") for name in ("noise_mm", "spacing_mm"))
+        words = "{used} of {views} clouds of {sensor} were registered with each other, in {pairs} pairs; thinned to "
+        words += "{spacing} mm, points of two clouds are {noise} mm apart across the surface (one standard deviation)."
+        pairs = one["registrations"]
+        yield Paragraph(
+            worded(
+                words, used=used, views=views, sensor=one["sensor"], pairs=str(len(pairs)), spacing=spacing, noise=noise
+            )
+        )
+        rows: list[tuple[Words, ...]] = []
+        for i in sorted(range(len(pairs)), key=lambda i: -pairs[i]["off_mm"]):
+            pair, place = pairs[i], (*at, "registrations", i)
+            overlap = shown.number(*place, "overlap", times=100.0, spec=".0f")
+            off = shown.number(*place, "off_mm", spec=".2f"), shown.number(*place, "off_deg", spec=".3f")
+            rows.append((pair["first"], pair["second"], overlap, *off, shown.number(*place, "slides", spec=".0f")))
+        table = Table(
+            f"Registrations of the clouds of {one['sensor']}",
+            ("cloud", "with", "overlap, %", "off, mm", "off°", "slides"),
+            tuple(rows[:MOST_LISTED]),
+            "Off: how far the registration is from where the carriers' poses put the two clouds, at their own origins; "
+            "the farthest first. Slides: directions, of six, along which their surfaces slide on each other.",
+        )
+        yield table if len(rows) <= MOST_ROWS else Folded(f"{len(rows)} registrations", (table,))
 
 
 def _detections(seen: SeenEvidence) -> Iterator[Block]:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 #: The palette of Okabe and Ito: people with any form of colour blindness can tell its colours apart.
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, GREY = "#56B4E9", "#CC79A7", "#777777"
+#: Of views, in order: no two beside each other are alike in lightness.
+VIEW_COLOURS = (BLUE, ORANGE, GREEN, VERMILLION, SKY, "#882255", "#999933", PURPLE, GREY)
 #: Blue that is seen on dark as well as on light.
 LIGHT_BLUE = "#2C8CC9"
 #: The axes x, y, z of frames have these colours.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
@@ -12,6 +12,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.figures import round_down
 from gtsam_rwhec.report.shown_result import ShownResult
+from gtsam_rwhec.results.cloud_evidence import box_of
 from gtsam_rwhec.results.scene_evidence import SceneEvidence
 from gtsam_rwhec.solver.free_directions import SHARE, FreeDirection
 
@@ -86,6 +87,7 @@ class Scene:
     times: float  #: Ellipsoids are drawn so many times as large
     radius: float  #: Deviations to the border of an ellipsoid of `LEVEL`
     out_of_sight: tuple[str, ...]  #: Carriers whose origins are too far away
+    clouds: tuple[tuple[str, Array], ...] = ()  #: Of each view its name and points (n, 3)
 
     @property
     def extent(self) -> float:
@@ -169,8 +171,12 @@ def _scene(
     near = [f for f in origins if f.name != world or _is_near(f.T[:3, 3], extent)]
     extent = np.concatenate([extent, *(f.T[None, :3, 3] for f in near)])
     size = max(float(np.ptp(extent, axis=0).max()), SMALLEST_M)
-    boards = tuple(_boards(frames, evidence, PLAIN * size))
+    printed = [frame for frame in frames if frame.name not in objects_of(shown)]
+    boards = tuple(_boards(printed, evidence, PLAIN * size))
     extent = np.concatenate([extent, *(part for board in boards for part in (board.paper, *board.dark))])
+    clouds = _clouds(shown, placed.get("targets"))
+    if clouds:
+        extent = np.concatenate([extent, box_of([points for _, points in clouds])])
     low, high = extent.min(axis=0), extent.max(axis=0)
     margin = 0.04 * max(float((high - low).max()), SMALLEST_M)
     radius = float(np.sqrt(7.814727903251179 if refined is None else refined.squared_radius(3, LEVEL)))
@@ -186,7 +192,34 @@ def _scene(
         times=_magnification(frames, radius, float((high - low).max())),
         radius=radius,
         out_of_sight=tuple(f.name for f in origins if f not in near),
+        clouds=clouds,
     )
+
+
+def scene_of_clouds(scene: Scene) -> Scene:
+    """The clouds of a scene alone, from near."""
+    low, high = box_of([points for _, points in scene.clouds])
+    margin = 0.15 * float((high - low).max())
+    within = (f for f in scene.frames if ((low < f.T[:3, 3]) & (f.T[:3, 3] < high)).all())
+    frames = tuple(replace(frame, covariance=None) for frame in within)  # an ellipsoid would hide the clouds
+    alone = replace(scene, frames=frames, views=(), boards=(), path=np.zeros((0, 7)))
+    return replace(alone, low=low - margin, high=high + margin)
+
+
+def _clouds(shown: ShownResult, placed: Array | None) -> tuple[tuple[str, Array], ...]:
+    """Names and points of views, in the scene."""
+    if shown.evidence is None or shown.evidence.clouds is None or placed is None:
+        return ()
+    several = len({one.sensor for one in shown.evidence.clouds.clouds}) > 1
+    return tuple(
+        (f"{one.sensor}, {one.name}" if several else one.name, np.array(one.points) @ placed[:3, :3].T + placed[:3, 3])
+        for one in shown.evidence.clouds.clouds
+    )
+
+
+def objects_of(shown: ShownResult) -> set[str]:
+    """Targets that were seen in clouds."""
+    return {one["target"] for one in shown.tree.get("log", {}).get("detection", {}).get("objects", ())}
 
 
 def _frames(shown: ShownResult, side: Side, placed: Array) -> Iterator[Frame]:

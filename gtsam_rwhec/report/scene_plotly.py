@@ -5,14 +5,14 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator, Sequence
 from functools import cache
-from itertools import combinations
+from itertools import combinations, cycle
 from typing import Any
 
 import numpy as np
 
 from gtsam_rwhec.files.terminal_text import printable
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, shortened
+from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, VIEW_COLOURS, shortened
 from gtsam_rwhec.report.scene_model import Line, Scene, labels_of
 
 #: With more names than this, they are seen on request only.
@@ -34,7 +34,7 @@ Trace = dict[str, Any]
 
 def traces_of(scene: Scene, lines: Sequence[Line]) -> tuple[Trace, ...]:
     """The traces; ``meta`` has the group of each."""
-    of_scene = (_boards, _views, _path, _ellipsoids, _axes, _origins)
+    of_scene = (_boards, _clouds, _views, _path, _ellipsoids, _axes, _origins)
     traces = [trace for made in of_scene for trace in made(scene)]
     return (*traces, *_lines(scene, lines), *_names(scene, lines))
 
@@ -48,6 +48,16 @@ def _boards(scene: Scene) -> Iterator[Trace]:
     if paper and not scene.has_many:
         closed = [np.vstack([polygon, polygon[:1]]) for polygon in paper]
         yield _strokes("boards", "boards, edges", closed, scene, colour=GREY, width=2, showlegend=False)
+
+
+def _clouds(scene: Scene) -> Iterator[Trace]:
+    size = 1.5 if len(scene.path) else 1.2
+    for (name, points), colour in zip(scene.clouds, cycle(VIEW_COLOURS), strict=False):
+        marker = {"size": size, "color": colour, "opacity": 0.8}
+        yield _trace(
+            "scatter3d", "clouds", _safe(shortened(name)), points, DIGITS, mode="markers", marker=marker,
+            hoverinfo="name",
+        )  # fmt: skip
 
 
 def _views(scene: Scene) -> Iterator[Trace]:
@@ -95,7 +105,7 @@ def _ellipsoids(scene: Scene) -> Iterator[Trace]:
 
 
 def _axes(scene: Scene) -> Iterator[Trace]:
-    for k, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True)):
+    for k, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True) if scene.frames else ()):
         yield _strokes("axes", name, scene.axes(k), scene, colour=colour, width=5)
 
 
@@ -130,7 +140,8 @@ def _lines(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
 def _names(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
     """Names of frames, and labels of directions at the first frame that has them."""
     few = len(scene.frames) <= MOST_NAMES
-    yield _texts("names", [(frame.name, frame.T[:3, 3]) for frame in scene.frames], INK, is_visible=few)
+    if scene.frames:
+        yield _texts("names", [(frame.name, frame.T[:3, 3]) for frame in scene.frames], INK, is_visible=few)
     labels = labels_of(lines)
     if labels:
         yield _texts("directions", list(labels.items()), PURPLE, is_visible=True)
@@ -242,6 +253,7 @@ BUTTONS = (
     ("path", "Path", 0.145),
     ("ellipsoids", "Ellipsoids", 0.225),
     ("boards", "Boards", 0.19),
+    ("clouds", "Clouds", 0.19),
     ("names", "Names", 0.19),
 )
 #: A pressed button of plotly is nearly white on any page, so that all have dark words.
@@ -317,7 +329,12 @@ def near_sensors(scene: Scene) -> dict[str, Any] | None:
 
 def _spread(scene: Scene) -> Array:
     places = np.concatenate(
-        [scene.path[:, :3], *(f.T[None, :3, 3] for f in scene.frames), *(v.rim for v in scene.views)]
+        [
+            scene.path[:, :3],
+            *(f.T[None, :3, 3] for f in scene.frames),
+            *(v.rim for v in scene.views),
+            *(points[:: max(1, len(points) // 9)] for _, points in scene.clouds),
+        ]
     )
     return np.asarray(np.cov(places.T)) if len(places) > 1 else np.eye(3)
 

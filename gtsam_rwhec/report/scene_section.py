@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.report.figures import AXIS_COLOURS, AXIS_NAMES, GREY, INK, ORANGE, PURPLE, SKY, shortened, svg_figure
+from gtsam_rwhec.report.figures import (
+    AXIS_COLOURS,
+    AXIS_NAMES,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VIEW_COLOURS,
+    shortened,
+    svg_figure,
+)
 from gtsam_rwhec.report.report_blocks import Block, Drawing, Listing, Paragraph, Section, Table, Words, worded
 from gtsam_rwhec.report.scene_model import (
     MANY,
@@ -18,7 +31,9 @@ from gtsam_rwhec.report.scene_model import (
     carrier,
     labels_of,
     lines_of,
+    objects_of,
     scene_of_carrier,
+    scene_of_clouds,
     scene_of_rig,
 )
 from gtsam_rwhec.report.scene_plotly import DARK, EARLY, LATE, MOST_NAMES, PAPER, first_view, layout_of, traces_of
@@ -34,6 +49,8 @@ WITHOUT_PATH = (
     "Not shown: how the two carriers stand to each other, boards, views and path, for the result has no evidence.json "
     "beside it with measurements. Each carrier is drawn alone."
 )
+#: One point of so many of a view is drawn beside the whole rig.
+FEWER = 5
 #: A target is said to be farther off the axis by the poses than as measured above this, degrees.
 OFF_DEG = 5.0
 
@@ -47,7 +64,15 @@ def scene_section(shown: ShownResult) -> Section:
     if evidence is not None:
         scene = scene_of_rig(shown, evidence)
         lines = lines_of(shown, scene)
-        blocks += [_drawing("rig", "The rig", scene, lines, _about_rig(evidence, scene, lines)), *_list_of(lines)]
+        coarse = replace(scene, clouds=tuple((name, points[::FEWER]) for name, points in scene.clouds))
+        blocks += [_drawing("rig", "The rig", coarse, lines, _about_rig(evidence, scene, lines)), *_list_of(lines)]
+        if scene.clouds:
+            assert shown.evidence is not None
+            assert shown.evidence.clouds is not None
+            near, of = scene_of_clouds(scene), shown.evidence.clouds.of
+            says = f"The clouds of {len(scene.clouds)} of {of} views, each in its colour, where the calibrated poses "
+            says += "put them: where these are right, they lie on one surface."
+            blocks.append(_drawing("clouds", "The clouds in one frame", near, (), says))
         blocks += [*_facts(shown, evidence), *_turned_away(shown, evidence), *_heights(shown)]
         return Section("scene", TITLE, tuple(blocks))
     for kind in ("targets", "sensors"):
@@ -77,8 +102,9 @@ def _about_rig(evidence: SceneEvidence, scene: Scene, lines: tuple[Line, ...]) -
     says = f"{stands}; {scene.moving} is at the typical one of its poses, with {poses}. "
     if scene.views:
         says += "Cameras' views reach as far as the typical distance of what they saw. "
-    without = [one for one in evidence.targets.values() if one.board is None]
-    if without:
+    if scene.clouds:
+        says += "The points are clouds of the sensors, each view in its colour. "
+    if scene.boards and any(one.board is None for one in evidence.targets.values()):
         says += "Squares stand for targets whose shape the result's inputs do not state. "
     return says + _of_ellipsoids(scene, lines)
 
@@ -179,7 +205,8 @@ def _heights(shown: ShownResult) -> list[Block]:
             cells.append("-" if seen is None else shown.evident(*at, "tilt_deg", spec=".1f"))
             has_view = seen is not None and seen.oblique_deg is not None
             cells += shown.evidents(*at, "oblique_deg", spec=".0f") if has_view else ("-", "-")
-            cells.append("not known" if seen is None or seen.board is None else seen.board.words)
+            unknown = "an object" if name in objects_of(shown) else "not known"
+            cells.append(unknown if seen is None or seen.board is None else seen.board.words)
         found.append(tuple(cells))
     more = () if evidence is None else ("tilt°", "seen from, median°", "largest°", "what it is")
     legend = f"Above: along the z axis of {where}."
@@ -223,6 +250,10 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
         axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=GREY, linewidths=widths, zorder=1))
     for view in scene.views:
         axes.add_collection(LineCollection([edge @ P.T for edge in view.edges], colors=SKY, linewidths=0.9, zorder=2))
+    size = 1.5 if len(scene.path) else 3.0
+    for (_, points), colour in zip(scene.clouds, cycle(VIEW_COLOURS), strict=False):
+        within = ((points > scene.low) & (points < scene.high)).all(axis=1)
+        axes.plot(*(points[within] @ P.T).T, ".", color=colour, markersize=size, markeredgewidth=0, rasterized=True)
     if len(scene.path):
         shades = LinearSegmentedColormap.from_list("path", [EARLY, LATE])
         x, y = P @ scene.path[:, :3].T
@@ -231,7 +262,7 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     for k, colour in enumerate(AXIS_COLOURS):
         strokes = [stroke @ P.T for stroke in scene.axes(k)]
         axes.add_collection(LineCollection(strokes, colors=colour, linewidths=1.6, zorder=4))
-    places = np.array([frame.T[:3, 3] for frame in scene.frames]) @ P.T
+    places = np.array([frame.T[:3, 3] for frame in scene.frames]).reshape(-1, 3) @ P.T
     axes.plot(*places.T, "o", color=INK, markersize=2.5, zorder=5)
     for line in lines:
         first, *heads = (piece @ P.T for piece in line.pieces)
@@ -290,6 +321,8 @@ def _legend(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
         handles.append(
             Line2D([], [], color=LATE, marker="o", ls="", markersize=3, label=f"path of {shortened(scene.moving, 20)}")
         )
+    for (name, _), colour in zip(scene.clouds, cycle(VIEW_COLOURS), strict=False):
+        handles.append(Line2D([], [], color=colour, marker="o", ls="", markersize=3, label=shortened(name, 20)))
     if scene.ellipsoids:
         larger = f" x {scene.times:,.0f}" if scene.times > 1.0 else ""
         handles.append(Patch(facecolor=ORANGE, alpha=0.45, label=f"95 % ellipsoids{larger}"))

@@ -21,6 +21,7 @@ from gtsam_rwhec.files.whole_files import read_whole, write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.results.cloud_evidence import CloudsEvidence
 from gtsam_rwhec.results.contribution import ContributionEvidence, contribution_of
 from gtsam_rwhec.results.derived import Derived, derived_of
 from gtsam_rwhec.results.detection_evidence import SeenEvidence, seen_in_problem
@@ -50,6 +51,7 @@ class Evidence(FileRecord):
     proof: Proof | None = None  #: Gap and spectrum of the certificate
     weak: tuple[WeakDirection, ...] = ()  #: Least known directions, the worst first
     scene: SceneEvidence | None = None  #: What is needed to draw the rig in space
+    clouds: CloudsEvidence | None = None  #: Clouds of some views in one frame
     seen: SeenEvidence | None = None  #: Detections, removed measurements, corners, images
     residuals: ResidualsEvidence | None = None  #: What is left, and what it says of the noise
     contribution: ContributionEvidence | None = None  #: How much each image told

@@ -131,6 +131,30 @@ class OutlierCount(_Count):
     left_out: Count = Field(default=0, description="measurements that were left out as outliers")
 
 
+class RegisteredPair(FileRecord):
+    """Two clouds of a sensor that were registered with each other."""
+
+    first: str = Field(description="name of a cloud")
+    second: str = Field(description="name of the other")
+    overlap: NotNegative = Field(description="share of the second cloud's points that lie on the first")
+    off_mm: NotNegative = Field(description="how far the registration is from where the carriers' poses put it, mm")
+    off_deg: NotNegative = Field(description="the same of its rotation, degrees")
+    slides: Count = Field(description="number of directions, of six, along which the two slide on each other")
+
+
+class ObjectReport(FileRecord):
+    """What the registration of a sensor's clouds gave."""
+
+    target: str = Field(description="the object's name")
+    sensor: str = Field(description="the sensor's name")
+    views: Count = Field(description="clouds with a pose of the carriers")
+    used: Count = Field(description="clouds that were registered with others")
+    noise_mm: NotNegative = Field(description="standard deviation of points of two clouds across the surface, mm")
+    spacing_mm: Positive = Field(description="distance of neighbouring points after thinning, mm")
+    registrations: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
+    remarks: tuple[str, ...] = Field(default=(), description="what is wrong with single clouds, in words")
+
+
 class DetectionReport(FileRecord):
     """What the detection stage reports."""
 
@@ -146,6 +170,7 @@ class DetectionReport(FileRecord):
         default=(), description="why targets were not read where most were not: what some of the images show, and cures"
     )
     remarks: tuple[str, ...] = Field(default=(), description="what was found out about targets, in words")
+    objects: tuple[ObjectReport, ...] = Field(default=(), description="registrations of the clouds of each sensor")
     blurred: tuple[str, ...] = Field(
         default=(), description="sensors with many images in which no target is read since they are blurred, in words"
     )

@@ -26,6 +26,7 @@ from gtsam_rwhec.rig.carrier_roles import (
     origin_of,
     rest_of,
 )
+from gtsam_rwhec.rig.cloud_proposal import cloud_folders, propose_cloud_rig
 from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, poses_read, read_folder, read_gray
 from gtsam_rwhec.rig.guessed_boards import STATED, guessed_intrinsics
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
@@ -51,7 +52,7 @@ ROLES = {
 def propose_folder_rig(
     folder: str | Path, path: str | Path, *, progress: Progress | None = None
 ) -> tuple[str, tuple[str, ...]]:
-    """Propose a rig file for folders of images with poses beside them; a person completes it.
+    """Propose a rig file for folders of images, or of clouds, with poses beside them; a person completes it.
 
     Paths in the rig file start from `folder`; `path` is the file that will be written, for messages. Returns the text
     of a rig file that `parse_rig` reads, and notes: what was seen, what was chosen, and what was left out.
@@ -63,6 +64,12 @@ def propose_folder_rig(
     """
     folder, tell = Path(folder), progress or silent
     notes: list[str] = []
+    of_clouds = cloud_folders(folder)
+    if of_clouds and not read_folder(folder):
+        text, of_readings = propose_cloud_rig(folder, of_clouds, tell)
+        parse_rig(text, str(path))
+        return text, of_readings
+    notes += [f"not used: {each.path}, {len(each.files)} clouds beside images" for each in of_clouds]
     cameras = _cameras(folder, notes)
     topics = []
     for camera, _ in cameras:
@@ -133,7 +140,7 @@ def _text(
     carriers, remarks["carriers", "poses"] = _carriers(reading)
     origin = origin_of([part for _, poses in cameras for part in poses.path.split("/")])
     notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
-    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets={**targets})
     return first_rig_text("folder", folder.resolve().name, rig, remarks, "# Paths start from that folder.\n")
 
 

@@ -24,9 +24,9 @@ from gtsam_rwhec.rig.target_sections import (
     CharucoTarget,
     CheckerboardTarget,
     CircleGridTarget,
+    PrintedTarget,
     TagGridTarget,
     TagTarget,
-    TargetSection,
 )
 
 #: Metres. A tag's side has this value in a first rig file, until a person measures it.
@@ -52,7 +52,7 @@ class Guess:
     """A guess of a target: its name, its section, and the comment beside it."""
 
     name: str
-    section: TargetSection
+    section: PrintedTarget
     remark: str
 
 
@@ -82,7 +82,7 @@ def targets_seen(images: Sequence[ImageTopic], drivers: Iterable[DriverTopic]) -
 
 def first_targets(
     images: Sequence[ImageTopic], drivers: Iterable[DriverTopic], taken: set[str]
-) -> tuple[dict[str, TargetSection], dict[KeyPath, str], list[str]]:
+) -> tuple[dict[str, PrintedTarget], dict[KeyPath, str], list[str]]:
     """Guesses of all targets by free names, the comments beside them, and notes; an example if nothing was seen."""
     guesses, notes = targets_seen(images, drivers)
     guesses += boards_guessed(images)
@@ -101,7 +101,7 @@ def first_targets(
     return {name: guess.section for name, guess in named.items()}, remarks, notes
 
 
-def take_sizes(targets: dict[str, TargetSection], remarks: dict[KeyPath, str], sizes: Mapping[str, float]) -> None:
+def take_sizes(targets: dict[str, PrintedTarget], remarks: dict[KeyPath, str], sizes: Mapping[str, float]) -> None:
     """Multiply lengths that nobody stated by what the motion says: true over guessed length, by target."""
     for name, factor in sizes.items():
         if TODO in remarks["targets", name] and OF_DRIVER not in remarks["targets", name]:
@@ -124,7 +124,7 @@ def boards_guessed(images: Iterable[ImageTopic]) -> list[Guess]:
         passed = f"{across} x {down} passed every test in {number} of {of} images"
         board = views[0][1].board
         if isinstance(board, Checkerboard):
-            section: TargetSection = CheckerboardTarget(
+            section: PrintedTarget = CheckerboardTarget(
                 type="checkerboard", inner_corners=(across, down), square_m=SQUARE_M
             )
             name, remark = "board", f"{TODO} a square; {passed} (inner corners, not squares)"
@@ -159,7 +159,7 @@ def _has_markers(board: BoardSeen, tags: Sequence[Sequence[SeenTag]]) -> bool:
     return 2 * inside > len(board.images)
 
 
-def with_size(section: TargetSection, factor: float) -> TargetSection:
+def with_size(section: PrintedTarget, factor: float) -> PrintedTarget:
     """The section with its lengths multiplied by this factor, to four digits."""
     lengths = {
         name: float(f"{getattr(section, name) * factor:.4g}")
@@ -206,7 +206,7 @@ def _of_layout(family: str, ids: list[int], layout: Layout) -> Guess:
     counts, gap, first = (layout.columns, layout.rows), 1.0 / layout.share - 1.0, ids[0]
     if layout.kind == "charuco":
         marker_m = float(f"{SQUARE_M * layout.share:.3g}")
-        section: TargetSection = CharucoTarget(
+        section: PrintedTarget = CharucoTarget(
             type="charuco", family=family, squares=counts, square_m=SQUARE_M, marker_m=marker_m, first_id=first
         )
         name, lengths = f"board_{family.removeprefix('aruco_')}", "a square and a marker"

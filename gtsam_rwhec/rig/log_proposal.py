@@ -114,7 +114,7 @@ def _text(log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Came
             f"TODO errors of these poses, a guess: {of_log.origin.words}. Leave the line out if you do not know them: "
             "residuals tell too"
         )
-    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets={**targets})
     return first_rig_text("log", log.files[0].path.name, rig, remarks)
 
 

@@ -20,9 +20,9 @@ from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.rig.odometry_sections import GivenSection, OdometrySensor, odometry_contradictions, with_what_follows
 from gtsam_rwhec.rig.section_types import Name, Section, needed, optional
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
-from gtsam_rwhec.rig.target_sections import TargetSection
+from gtsam_rwhec.rig.target_sections import ObjectTarget, PrintedTarget, TargetSection
 
-#: Sensors that see targets have images or detections; others have odometry.
+#: Sensors that see targets have images, detections or clouds; others have odometry.
 AnySensor: TypeAlias = Annotated[
     Annotated[Sensor, UnionTag("sees")] | Annotated[OdometrySensor, UnionTag("moves")],
     Discriminator(
@@ -47,7 +47,7 @@ class RigFile(Section):
     carriers: Carriers = needed("the frames that carry the sensors and the targets, and their poses")
     all_sensors: dict[Name, AnySensor] = Field(
         alias="sensors",
-        description="by name, each with images or detections of targets, or with the odometry of its own motion",
+        description="by name, each with images, detections or clouds of targets, or with odometry, its own motion",
     )
     targets: dict[Name, TargetSection] = needed(
         "by name, each with type and sizes; sensors that all have odometry need none"
@@ -98,9 +98,19 @@ class RigFile(Section):
         return tuple(name for name in self.all_sensors if name != self.reference)
 
     @cached_property
+    def printed(self) -> dict[str, PrintedTarget]:
+        """The targets that images show, by name: all but objects."""
+        return {name: one for name, one in self.targets.items() if not isinstance(one, ObjectTarget)}
+
+    @cached_property
     def target_list(self) -> tuple[Target, ...]:
-        """The targets with their names, in the order of the file, for the vision package."""
-        return tuple(section.target(name) for name, section in self.targets.items())
+        """The printed targets with their names, in the order of the file, for the vision package."""
+        return tuple(section.target(name) for name, section in self.printed.items())
+
+    @cached_property
+    def object(self) -> str | None:
+        """The target that clouds show; None without one."""
+        return next((name for name in self.targets if name not in self.printed), None)
 
     @property
     def corner_px(self) -> float | None:
@@ -190,11 +200,12 @@ def contradictions(rig: RigFile) -> Iterator[Fault]:
         yield ("targets",), "none; give at least one target"
     if rig.targets and rig.all_sensors and not rig.sensors:
         yield ("targets",), "no sensor sees them: all have odometry; leave targets out, or give a camera"
-    for name, section in rig.targets.items():
+    for name, section in rig.printed.items():
         try:
             printed.append(section.target(name))
         except TargetError as error:
             yield ("targets", name), error.fault
+    yield from _clouds(rig)
     yield from _names(rig)
     yield from _detection(rig.detection)
     yield from _lookalikes(printed)
@@ -217,7 +228,7 @@ def _carriers(carriers: Carriers) -> Iterator[Fault]:
 def _sensors(rig: RigFile) -> Iterator[Fault]:
     if not rig.all_sensors:
         yield ("sensors",), "none; give at least one sensor"
-    for key in ("images", "detections"):
+    for key in ("images", "detections", "clouds"):
         first: dict[str, str] = {}
         for name, sensor in rig.sensors.items():
             topic = getattr(sensor, key)
@@ -238,9 +249,28 @@ def _sensors(rig: RigFile) -> Iterator[Fault]:
         if sensor.poses is not None and rig.carriers.poses.frames is None:
             yield (
                 ("sensors", name, "poses"),
-                "poses in files beside images, and carriers.poses is of a log; write carriers.poses: "
-                "{frames: [parent, child]} for these files",
+                f"poses in files beside {'images' if sensor.images else 'clouds'}, and carriers.poses is of a log; "
+                "write carriers.poses: {frames: [parent, child]} for these files",
             )
+
+
+def _clouds(rig: RigFile) -> Iterator[Fault]:
+    """Sensors with clouds that have nothing to see, and the reverse."""
+    of_clouds = [name for name, sensor in rig.sensors.items() if sensor.clouds is not None]
+    objects = [name for name in rig.targets if name not in rig.printed]
+    if of_clouds and not objects:
+        words = "clouds, and no target that they show; give one: targets: {object: {type: object}}"
+        yield ("sensors", of_clouds[0], "clouds"), words
+    for name in objects[1:]:
+        yield (
+            ("targets", name),
+            f"clouds show one object, and {objects[0]} is one; all that stands still is that object",
+        )
+    if objects and not of_clouds and rig.sensors:
+        yield (
+            ("targets", objects[0], "type"),
+            "an object is seen in clouds, and no sensor has any; give one: clouds: PATH",
+        )
 
 
 def _names(rig: RigFile) -> Iterator[Fault]:

@@ -316,7 +316,7 @@ def _lines(items: Iterable[tuple[str, Any]], path: KeyPath = ()) -> Iterator[tup
             yield here, f"{indent}{key}: {ESTIMATE if in_short else in_yaml(value)}"
 
 
-TemplateName = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "odometry"]
+TemplateName = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "clouds", "odometry"]
 #: Names of the templates.
 TEMPLATES: tuple[TemplateName, ...] = get_args(TemplateName)
 _FOLDER = Path(__file__).with_name("template_files")

@@ -17,6 +17,7 @@ from gtsam_rwhec.cameras.unknown_intrinsics import Lens
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import to_rotations
+from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.rig.section_types import (
     EulerAxes,
     FramePair,
@@ -195,7 +196,8 @@ class PoseSource(Section):
         "tf", "topic", "frames",
         together=(
             ("topic", "parent", "child"), ("parent", "topic"), ("child", "topic"), ("quaternion", "frames"),
-            ("euler", "frames"), ("angles", "frames"), ("length", "frames"), ("one_instant", "frames"),
+            ("euler", "frames"), ("angles", "frames"), ("columns", "frames"), ("length", "frames"),
+            ("one_instant", "frames"),
         ),
     )  # fmt: skip
 
@@ -217,12 +219,23 @@ class PoseSource(Section):
         "ZYX",
     )
     angles: Literal["degrees", "radians"] | None = optional("with euler: the unit of the files' angles", "degrees")
+    columns: tuple[Text, ...] | None = optional(
+        "with frames: what the columns of a table without a line of names are: tx, ty, tz with qx, qy, qz, qw, or with "
+        "rx, ry, rz; without it a position, then a rotation",
+        ["rx", "ry", "rz", "tx", "ty", "tz"],
+    )
     length: Literal["m", "mm"] | None = optional(
         "with frames: the unit of the files' positions; without it names of columns tell, else m", "mm"
     )
     one_instant: bool | None = optional(
         "with frames, images taken at rest: whether images of one name, of different cameras, are of one instant", True
     )
+
+    @property
+    def stated(self) -> PoseStatement:
+        """How the numbers of files are meant."""
+        columns = None if self.columns is None else " ".join(self.columns)
+        return PoseStatement(self.quaternion, self.euler, self.angles, self.length, columns)
 
     @property
     def parent_and_child(self) -> tuple[str, str]:
@@ -240,7 +253,7 @@ class PoseSource(Section):
             raise ValueError(f"{self._given('tf', 'frames')[0]} names both frames already; leave parent and child out")
         if self.topic is not None and len(self._given("parent", "child")) < 2:
             raise ValueError(f"name the frames of the poses of {self.topic}: parent: ..., child: ...")
-        of_files = self._given("quaternion", "euler", "angles", "length", "one_instant")
+        of_files = self._given("quaternion", "euler", "angles", "columns", "length", "one_instant")
         if of_files and self.frames is None:
             raise ValueError(f"{', '.join(of_files)}: only for poses in files, with frames: [parent, child]")
         return self
@@ -296,22 +309,32 @@ def _frame_or_section(given: Any) -> Any:
 
 
 class Sensor(Section):
-    """A camera with images, or with the detections of a driver."""
+    """A camera with images, or with the detections of a driver; or a 3D camera or LiDAR with clouds of points."""
 
-    model_config = one_of("images", "detections", together=(("images", "intrinsics"), ("poses", "images")))
+    model_config = one_of("images", "detections", "clouds", together=(("images", "intrinsics"), ("unit_m", "clouds")))
 
     images: Text | None = optional(
         "topic of the camera's images; of a folder of images, their path in it", "/cam_left/image"
     )
+    clouds: Text | None = optional(
+        "topic of a 3D camera's or a LiDAR's clouds (PointCloud2, Foxglove's PointCloud), or of depth images; of a "
+        "folder, the path or the pattern of files of clouds: PCD, PLY, NumPy, .bin, or depth images of 16 bits",
+        "/camera/depth/points",
+    )
+    unit_m: Positive | None = optional(
+        "with clouds: metres of one unit of theirs; without it 1, and 0.001 for depth images of whole numbers",
+        0.001,
+        unit="m",
+    )
     poses: Text | None = optional(
-        "with images in a folder: path of the carriers' poses, one file for all images, a folder with a file an "
+        "with images or clouds in a folder: path of the carriers' poses, one file for all, a folder with a file an "
         "image, or an index",
         "poses.csv",
     )
     detections: Text | None = optional("topic of a driver's detections, in place of images", "/tag_detections")
     intrinsics: IntrinsicsOrText | None = optional(
         "with images: a file, a section, or the word estimate, which needs no calibration but images of a board; "
-        "detections with poses need none",
+        "detections with poses need none, and of clouds only depth images do",
         "left.yaml",
         {"topic": "/cam_left/camera_info"},
         "estimate",
@@ -341,12 +364,16 @@ class Sensor(Section):
     @model_validator(mode="after")
     def _is_one(self) -> Sensor:
         self._need_one(
-            self._given("images", "detections"),
-            "images (a topic of a log, or a path in a folder) and detections (a topic); a sensor that knows only its "
-            "own motion has odometry",
+            self._given("images", "detections", "clouds"),
+            "images (a topic of a log, or a path in a folder), detections (a topic) and clouds (a topic or a path); a "
+            "sensor that knows only its own motion has odometry",
         )
-        if self.poses is not None and self.images is None:
-            raise ValueError("poses go with images in a folder; poses of detections are in the log")
+        if self.poses is not None and self.detections is not None:
+            raise ValueError("poses go with images or clouds in a folder; poses of detections are in the log")
+        if self.unit_m is not None and self.clouds is None:
+            raise ValueError("unit_m is the unit of clouds; lengths of targets are in metres")
+        if self.clouds is not None and self.time_offset == "estimate":
+            raise ValueError("a clock is not estimated from clouds; take them at rest, or state the offset in seconds")
         if self.images is not None and self.intrinsics is None:
             raise ValueError(
                 "images without intrinsics; give FILE, {topic: ...}, {kalibr: ..., camera: ...} or numbers, "
@@ -354,7 +381,8 @@ class Sensor(Section):
             )
         if self.images is None and self.intrinsics is not None and self.intrinsics.estimate is not None:
             raise ValueError(
-                "intrinsics: estimate needs images, and a driver's detections do not say their size; state intrinsics"
+                "intrinsics: estimate needs images of a board, which neither a driver's detections nor clouds are; "
+                "state intrinsics"
             )
         return self
 

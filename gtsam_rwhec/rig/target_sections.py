@@ -166,10 +166,16 @@ class CircleGridTarget(_TargetSection):
     )
 
 
-TargetSection: TypeAlias = Annotated[
-    TagTarget | CharucoTarget | AprilGridTarget | TagGridTarget | BundleTarget | CheckerboardTarget | CircleGridTarget,
-    Field(discriminator="type"),
-]
+class ObjectTarget(Section):
+    """Anything that stands there, in front of a 3D camera or a LiDAR: its clouds are registered with each other."""
+
+    type: Literal["object"]
+
+
+PrintedTarget: TypeAlias = (
+    TagTarget | CharucoTarget | AprilGridTarget | TagGridTarget | BundleTarget | CheckerboardTarget | CircleGridTarget
+)
+TargetSection: TypeAlias = Annotated[PrintedTarget | ObjectTarget, Field(discriminator="type")]
 
 
 #: The section of each type of target.

@@ -12,7 +12,7 @@ from gtsam_rwhec.rig.sections import Sensor
 from gtsam_rwhec.runs.run_log import read_embedded_rig
 
 #: Detection depends on these keys of a sensor's section.
-DETECTED_BY = ("images", "detections", "intrinsics")
+DETECTED_BY = ("images", "detections", "clouds", "unit_m", "intrinsics")
 #: Cleaning depends on these keys of the section of the carriers.
 CLEANED_BY = ("sensors", "targets", "poses", "max_gap_s")
 #: A message names at most this many differences.

@@ -163,7 +163,8 @@ def clean_track(track: MeasuredPairs, path: Trajectory, rig: Rig, offset_s: floa
         )
         pairs = pairs.marked(moved, at)
     at = np.flatnonzero(pairs.used)
-    if len(at) == 1 or (options.consensus and len(at)):  # nothing can validate a single measurement
+    # Nothing can validate a single measurement. Clouds agreed when they were registered, some in few directions only.
+    if len(at) == 1 or (options.consensus and len(at) and track.target != rig.object):
         found = find_consensus(A[at], pairs.B[at], stamps[at], ConsensusOptions(scale_known=rig.sizes == "known"))
         pairs = pairs.marked(found.kept, at)
     return pairs

@@ -1,4 +1,4 @@
-"""The first stage: from images, or from the detections of a driver, to a log with the poses of the targets."""
+"""The first stage: from images, clouds, or a driver's detections, to a log with the poses of the targets."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
+from gtsam_rwhec.runs.cloud_detections import detect_in_clouds
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
@@ -51,10 +52,10 @@ def check_image_options(
         raise OptionError(
             f"{given} counts only for images, and no sensor of the rig file has images: leave the option out"
         )
-    if images == "copy" and not any(topic.has_images for topic in log.topics()):
+    if images == "copy" and not any(topic.has_images or topic.has_clouds for topic in log.topics()):
         other = "the raw log, if it has images" if rig is None else "a log with images"
         raise OptionError(
-            f'images="copy" (--images): {path} has no images to copy. Leave the option out, or give {other}'
+            f'images="copy" (--images): {path} has no images or clouds to copy. Leave the option out, or give {other}'
         )
 
 
@@ -141,7 +142,14 @@ def detected(
     for sensor, source in rig.sensors.items():
         if source.detections is not None:
             found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
+    registered = {
+        sensor: detect_in_clouds(log, rig, sensor, cameras.pop(sensor, None), motion, progress=tell, kept=kept)
+        for sensor, source in rig.sensors.items()
+        if source.clouds is not None
+    }
+    found |= {sensor: of_clouds.seen for sensor, of_clouds in registered.items()}
     report = detection_report(log, rig, found)
+    report = report.model_copy(update={"objects": tuple(of_clouds.report for of_clouds in registered.values())})
     has_sheet = False
     if sheet is not None:
         tell("drawing the contact sheet")
@@ -157,7 +165,8 @@ def detected(
         shown = f" {sheet} shows some of the images." if has_sheet else ""
         raise LogError(f"{no_detections(log, report)}{shown}")
     stages = LogMetadata(rig, cameras, report, image_names=image_names(log))
-    return RunLog.with_detections(log, stages, {sensor: of.records for sensor, of in found.items()})
+    clouds = [of_clouds.clouds for of_clouds in registered.values()]
+    return RunLog.with_detections(log, stages, {sensor: of.records for sensor, of in found.items()}, clouds)
 
 
 def sheet_beside(out_path: str | Path) -> Path:

@@ -26,7 +26,8 @@ from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.whole_files import appending_stream, write_atomically
-from gtsam_rwhec.logs import ImageRecord, Log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.results.log_history import ObjectReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA
 
@@ -50,9 +51,11 @@ def inputs_of(log: Log, rig: Rig, cameras: Mapping[str, Camera], folder: Path | 
         of_image = log.metadata().get(IMAGES_METADATA, {})
         inputs |= {_FILE + name: f"{_state(folder / name)}{_STAMP}{key}" for key, name in of_image.items()}
     for name, sensor in rig.sensors.items():
-        if sensor.images is not None:
+        if sensor.clouds is not None:
+            inputs |= {f"sensors.{name}.clouds": sensor.clouds, f"sensors.{name}.unit_m": repr(sensor.unit_m)}
+        if name in cameras and sensor.detections is None:
             camera, place = cameras[name], f"sensors.{name}"
-            inputs[f"{place}.images"] = sensor.images
+            inputs[f"{place}.images"] = str(sensor.images)
             inputs[f"{place}.intrinsics"] = f"{camera.model} {camera.K.tolist()} {camera.D.tolist()}"
             inputs[f"{place}.size"] = f"{camera.width} x {camera.height}"
     for name, section in rig.targets.items():
@@ -98,7 +101,7 @@ def _values(place: str, of: object) -> dict[str, str]:
 
 
 #: The kinds of objects that a line has, by the names that it has for them.
-_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection)}
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection, DetectionRecord)}
 #: Arrays may have these types.
 _DTYPES = ("<f8", "<f4", "<i8", "<i4")
 
@@ -113,6 +116,8 @@ class KeptDetections:
         self.is_whole = False  #: whether no image is missing
         #: Where the line of each batch begins, its length, and how many images it has.
         self._places: dict[int, tuple[int, int, int]] = {}
+        #: Where the line of each sensor's registered clouds begins, and its length.
+        self._objects: dict[str, tuple[int, int]] = {}
         self._stream: BinaryIO | None = None
 
     @property
@@ -130,6 +135,8 @@ class KeptDetections:
                     break
                 if "batch" in content:
                     self._places[int(content["batch"])] = end, len(line), int(content["count"])
+                elif "object" in content:
+                    self._objects[str(content["object"])] = end, len(line)
                 else:
                     self.is_whole = content.get("whole") == self.done
                 end += len(line)
@@ -152,6 +159,18 @@ class KeptDetections:
         """Append what was found in the batch of this number."""
         place = self._append({"batch": number, "count": len(found), "images": _plain(found)})
         self._places[number] = *place, len(found)
+
+    def known_object(self, sensor: str, of: str) -> tuple[list[DetectionRecord], ObjectReport] | None:
+        """What the registration of a sensor's clouds gave; None if the file lacks it, or it is `of` other inputs."""
+        content = self._line_at(*self._objects[sensor]) if sensor in self._objects else None
+        if content is None or content["of"] != of:
+            return None
+        return content["records"], ObjectReport.model_validate_json(content["report"])
+
+    def keep_object(self, sensor: str, of: str, records: list[DetectionRecord], report: ObjectReport) -> None:
+        """Append what the registration of a sensor's clouds gave; `of` is a checksum of its inputs."""
+        line = {"object": sensor, "of": of, "records": _plain(records), "report": report.model_dump_json()}
+        self._objects[sensor] = self._append(line)
 
     def finish(self) -> None:
         """Write the last line, which says that no image is missing."""
@@ -181,14 +200,18 @@ class KeptDetections:
 
     def _read(self, number: int) -> list[DetectedImage]:
         start, length, _ = self._places[number]
+        content = self._line_at(start, length)
+        found: list[DetectedImage] = [] if content is None else content["images"]
+        return found
+
+    def _line_at(self, start: int, length: int) -> dict[str, Any] | None:
         try:
             with self.path.open("rb") as stream:
                 stream.seek(start)
                 content = _content(stream.read(length))
-            found: list[DetectedImage] = [] if content is None else _object(content["images"])
+            return None if content is None else {key: _object(value) for key, value in content.items()}
         except (OSError, LookupError, TypeError, ValueError) as error:
             raise LogError(f"{self.path} cannot be read: {error!r}. Remove this file, and start again") from error
-        return found
 
 
 def kept_inputs(path: Path) -> dict[str, str] | None:

@@ -14,18 +14,20 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.clouds.named_fields import cloud_of_record
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import decode_gray
 from gtsam_rwhec.detect.pictures import draw_errors, jpeg_of
 from gtsam_rwhec.errors import ImageError, LogError, LogWarning, TargetError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.report.html_page import write_page
 from gtsam_rwhec.report.report_page import report_page
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results import Evidence, write_evidence
+from gtsam_rwhec.results.cloud_evidence import CloudsEvidence, clouds_of
 from gtsam_rwhec.results.contribution import contribution_of
 from gtsam_rwhec.results.derived import derived_of
 from gtsam_rwhec.results.detection_evidence import (
@@ -65,6 +67,7 @@ from gtsam_rwhec.runs.run_log import (
     EVIDENCE_FILE,
     REPORT_FILE,
     RESULT_FILE,
+    clouds_topic,
     detections_topic,
     image_name,
     image_names,
@@ -123,7 +126,9 @@ def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
     path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
-    boards = {name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X}
+    boards = {
+        name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X if name in targets
+    }
     wanted = ("", RemovalReason.OUTLIER)
     is_used = {
         (pair, stamp): not reason
@@ -187,7 +192,7 @@ def seen_in_log(solved: Solved, log: Log, pictures: Pictures | None) -> SeenEvid
         found,
         lambda target, sensor: of_tracks.get(f"{target}/{sensor}") if found is None else found.corner_px,
     )
-    topics = {sensor: source.images or "" for sensor, source in solved.rig.sensors.items()}
+    topics = {sensor: source.images or source.clouds or "" for sensor, source in solved.rig.sensors.items()}
     topics |= dict.fromkeys(solved.rig.odometries, "")
 
     worst = worst_views(rated)
@@ -330,11 +335,29 @@ def evidence_of_log(
         proof=proof_of(calibrated.solution, calibrated.problem),
         weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
         scene=scene_of(calibrated.calibration, rows_of_log(calibrated), carriers, calibrated.cameras, targets),
+        clouds=_clouds(calibrated, log) if pictures is not None and pictures.may_show else None,
         seen=seen_in_log(calibrated, log, pictures),
         residuals=None if model is None else residuals_of(model, calibrated.calibration),
         contribution=None if model is None else contribution_of(model),
         inputs=inputs.with_options(calibrated.calibration.options),
     )
+
+
+def _clouds(calibrated: Calibrated, log: Log) -> CloudsEvidence | None:
+    """Thinned clouds of a log, which detection kept, in one frame."""
+    names = image_names(log)
+    kept = {
+        sensor: {
+            record.stamp_ns: (
+                PurePosixPath(image_name(names, of.clouds, record.stamp_ns)).name,
+                cloud_of_record(record).points,
+            )
+            for record in records_of(log, [clouds_topic(sensor)], CloudRecord)
+        }
+        for sensor, of in calibrated.rig.sensors.items()
+        if of.clouds is not None
+    }
+    return clouds_of(rows_of_log(calibrated), calibrated.refined.Y, kept)
 
 
 def rows_of_log(calibrated: Solved) -> dict[Pair, MeasuredRows]:

@@ -92,8 +92,8 @@ def detected_pairs(log: Log, rig: Rig, sensor: str) -> list[MeasuredPairs]:
     for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
         stamps.append(record.stamp_ns)
         target = target_of(record, targets)
-        if target is not None:
-            of_target[target.name].append(record)
+        if target is not None or record.id == rig.object:
+            of_target[record.id if target is None else target.name].append(record)
     # All tags of an image have the same stamp.
     check_order(np.array([stamp for stamp, _ in groupby(stamps)], dtype=np.int64), f"detections of {sensor}")
     return [_of_detections(name, sensor, of_target[name]) for name in sorted(of_target)]
@@ -252,6 +252,7 @@ def problem_of(
                 measured.B[used],
                 stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
                 source="the cleaned log",
+                directional=pair.target == rig.object and "covariances" in weights,  # clouds slide on each other
                 **weights,  # type: ignore[arg-type]
             )
         except NoiseError as error:

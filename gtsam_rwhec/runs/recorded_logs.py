@@ -1,7 +1,8 @@
-"""A log made of folders of images with poses beside them, as a rig file describes them.
+"""A log made of folders of images or clouds with poses beside them, as a rig file describes them.
 
 The log has the images of each sensor on a topic that has the name of their path, and T_parent_child on ``/tf``; so the
-same rig file serves for the folder and for the log. There are two kinds of folders:
+same rig file serves for the folder and for the log. Clouds are points in their files' unit. There are two kinds of
+folders:
 
 - The images' names are stamps. Poses come at these stamps or at another rate, and are interpolated.
 - Any other names: the robot stood still for each image. Each image gets a stamp of its own, a second after the one
@@ -19,13 +20,17 @@ from pathlib import Path
 
 import numpy as np
 
-from gtsam_rwhec.errors import FileFormatError, LogError, LogWarning, NotUniqueWarning
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud_files import read_cloud
+from gtsam_rwhec.clouds.named_fields import record_of_cloud
+from gtsam_rwhec.errors import CloudError, FileFormatError, LogError, LogWarning, NotUniqueWarning
 from gtsam_rwhec.files.progress import Counted, Progress, silent
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs.hand_eye_samples import HandEyeSamples, is_samples_file, read_hand_eye_samples
 from gtsam_rwhec.logs.image_folder import (
+    CLOUD_FORMATS,
     FORMATS,
     LARGEST_IMAGE,
     SAME_POSE,
@@ -36,7 +41,7 @@ from gtsam_rwhec.logs.image_folder import (
     read_poses,
 )
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.pose_tables import NamedPoses, PoseStatement, stem_of
+from gtsam_rwhec.logs.pose_tables import NamedPoses, stem_of
 from gtsam_rwhec.logs.records import Array, DetectionRecord
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
@@ -65,7 +70,8 @@ def is_folder_of_images(path: object, rig: Rig | None) -> bool:
     """Whether a path is a folder for a rig file with poses in files: with its images, or at least without a log."""
     if rig is None or rig.carriers.poses.frames is None or not isinstance(path, str | Path) or not Path(path).is_dir():
         return False
-    has_images = any(of.images is not None and (Path(path) / of.images).is_dir() for of in rig.sensors.values())
+    folders = [of.images or of.clouds for of in rig.sensors.values()]
+    has_images = any(each is not None and (Path(path) / each).is_dir() for each in folders)
     return has_images or not any(Path(path).glob("*.mcap"))
 
 
@@ -95,10 +101,10 @@ def check_is_no_other_folder(path: object, rig: Rig | None) -> None:
 def write_folder_log(
     folder: str | Path, rig: Rig, path: str | Path, *, progress: Progress | None = None
 ) -> tuple[int, int]:
-    """Write the images and poses of a folder as one log, for the same rig file.
+    """Write the images, or clouds, and poses of a folder as one log, for the same rig file.
 
     The paths of the rig file start from `folder`; the poses of its carriers are ``frames``, and its sensors have images
-    and poses. Returns how many images and how many poses were written.
+    or clouds, and poses. Returns how many images and clouds, and how many poses were written.
 
     Raises
     ------
@@ -120,18 +126,20 @@ def write_folder_log(
         (stamp, each.sensor, file) for each in stamped for stamp, file in zip(each.image_ns, each.files, strict=True)
     )
     with LogWriter(path) as out:
+        topics = {name: str(sensor.images or sensor.clouds) for name, sensor in rig.sensors.items()}
         names = {
-            image_key(str(rig.sensors[sensor].images), stamp): f"{rig.sensors[sensor].images}/{file.name}"
-            for stamp, sensor, file in images
+            image_key(topics[sensor], stamp): file.relative_to(folder).as_posix() for stamp, sensor, file in images
         }
         out.metadata(IMAGES_METADATA, names)
         for stamp, T in sorted(poses.items()):
             out.transforms("/tf", stamp, [(parent, child, T)])
         for done, (stamp, sensor, file) in enumerate(images, start=1):
-            topic = rig.sensors[sensor].images
-            assert topic is not None
-            out.compressed_image(topic, stamp, rig.frame_of(sensor), FORMATS[file.suffix.lower()], _content(file))
-            tell(Counted("reading images:", done, len(images)))
+            topic, frame = topics[sensor], rig.frame_of(sensor)
+            if file.suffix.lower() in FORMATS:
+                out.compressed_image(topic, stamp, frame, FORMATS[file.suffix.lower()], _content(file))
+            else:
+                out.point_cloud(record_of_cloud(_cloud(file), topic, stamp, frame))
+            tell(Counted("reading images:" if rig.sensors[sensor].images else "reading clouds:", done, len(images)))
     return len(images), len(poses)
 
 
@@ -144,6 +152,15 @@ def _content(file: Path) -> bytes:
         return b""
 
 
+def _cloud(file: Path) -> Cloud | None:
+    """The cloud of a file, in the file's unit; None if it cannot be read, so that only this cloud is lost."""
+    try:
+        return read_cloud(file)
+    except (FileFormatError, CloudError) as error:
+        warnings.warn(f"{error}. It counts as a cloud that cannot be used", LogWarning, stacklevel=3)
+        return None
+
+
 @contextmanager
 def _said_with(rig: Rig, path: KeyPath) -> Iterator[None]:
     """Add the rig file's line to an error of files that it names."""
@@ -154,20 +171,21 @@ def _said_with(rig: Rig, path: KeyPath) -> Iterator[None]:
 
 
 def _stamped(folder: Path, rig: Rig) -> list[_Stamped]:
-    source = rig.carriers.poses
-    stated = PoseStatement(source.quaternion, source.euler, source.angles, source.length)
+    stated = rig.carriers.poses.stated
     read: dict[Path, NamedPoses] = {}
     found: list[tuple[str, list[Path], NamedPoses]] = []
     for name, sensor in rig.sensors.items():
-        if sensor.images is None:
+        key = "images" if sensor.images is not None else "clouds"
+        place: str | None = getattr(sensor, key)
+        if place is None:
             raise LogError(f"{rig.source.place(('sensors', name))}: a folder has images, and no topic of detections")
         if sensor.poses is None:
             raise LogError(
                 f"{rig.source.place(('sensors', name))}: no poses. Name the file or the folder of the poses at which "
-                "the images were taken: poses: PATH"
+                f"the {key} were taken: poses: PATH"
             )
-        with _said_with(rig, ("sensors", name, "images")):
-            files = images_in(checked_path(folder / sensor.images))
+        with _said_with(rig, ("sensors", name, key)):
+            files = images_in(checked_path(folder / place), FORMATS if key == "images" else CLOUD_FORMATS)
         where = checked_path(folder / sensor.poses)
         if where not in read:
             with _said_with(rig, ("sensors", name, "poses")):
@@ -286,7 +304,7 @@ def samples_of_rig(path: str | Path, rig: Rig) -> tuple[HandEyeSamples, bool]:
 
     Raises `LogError` as `read_hand_eye_samples`; or the rig file has more sensors or targets, or another setup.
     """
-    source, (parent, child) = rig.carriers.poses, rig.carriers.poses.parent_and_child
+    parent, child = rig.carriers.poses.parent_and_child
     if len(rig.sensors) != 1 or len(rig.targets) != 1:
         raise LogError(
             f"{rig.source.place(('sensors',), ('targets',))}: {len(rig.sensors)} sensors and {len(rig.targets)} "
@@ -298,7 +316,7 @@ def samples_of_rig(path: str | Path, rig: Rig) -> tuple[HandEyeSamples, bool]:
             f"{rig.source.place(('sensors', name))}: the samples in {path} have no images. Write detections: /samples "
             "in place of images"
         )
-    samples = read_hand_eye_samples(path, PoseStatement(source.quaternion, source.euler, source.angles, source.length))
+    samples = read_hand_eye_samples(path, rig.carriers.poses.stated)
     on_hand = rig.carriers.sensors == child
     if samples.is_on_hand not in (None, on_hand) and samples.is_of_carriers:
         setup = "on the hand" if samples.is_on_hand else "fixed"

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, PairRecord, Record
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, Log, LogWriter, PairRecord, Record
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.logs.records import MEASURED_PAIR, TAG_DETECTIONS, Topic, transforms
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
@@ -36,7 +36,7 @@ Report = TypeVar("Report", bound=BaseModel)
 #: This topic has the calibrated frames as static transforms, which viewers show at any time.
 SOLUTION_TOPIC = "/calibration/tf_static"
 #: Detection writes topics with these names.
-_OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses|odometry)")
+_OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses|clouds|odometry)")
 #: Cleaning and solving write topics with these names.
 _OF_CLEANING_AND_SOLVING = re.compile(r"/calibration/(.+/pairs|tf_static)")
 
@@ -89,6 +89,11 @@ def annotations_topic(sensor: str) -> str:
 def poses_topic(sensor: str) -> str:
     """Topic of the poses of a sensor's used detections, for viewers (``foxglove.PosesInFrame``)."""
     return f"/calibration/{sensor}/poses"
+
+
+def clouds_topic(sensor: str) -> str:
+    """Topic of a sensor's clouds, thinned, in its frame (``sensor_msgs/msg/PointCloud2``)."""
+    return f"/calibration/{sensor}/clouds"
 
 
 def pairs_topic(sensor: str) -> str:
@@ -198,9 +203,16 @@ class RunLog(Log):
         self.found, self.detections = found, detections
 
     @staticmethod
-    def with_detections(log: Log, stages: LogMetadata, records: Mapping[str, Sequence[DetectionRecord]]) -> RunLog:
-        """A recorded log with the detections of each sensor."""
-        found = {detections_topic(sensor): _as_read(detections_topic(sensor), of) for sensor, of in records.items()}
+    def with_detections(
+        log: Log,
+        stages: LogMetadata,
+        records: Mapping[str, Sequence[DetectionRecord]],
+        clouds: Iterable[Sequence[CloudRecord]] = (),
+    ) -> RunLog:
+        """A recorded log with the detections of each sensor, and the thinned clouds of those that have clouds."""
+        found: dict[str, Sequence[Record]] = {of[0].topic: of for of in clouds if of}
+        for sensor, of_sensor in records.items():
+            found[detections_topic(sensor)] = _as_read(detections_topic(sensor), of_sensor)
         return RunLog(log, raw_topics(log), stages, found, records)
 
     @staticmethod
@@ -216,9 +228,12 @@ class RunLog(Log):
 
     def topics(self) -> tuple[Topic, ...]:
         """Every topic, by name."""
-        schemas = {DetectionRecord: TAG_DETECTIONS, PairRecord: MEASURED_PAIR}
+        kinds = {
+            DetectionRecord: (TAG_DETECTIONS, "json"), PairRecord: (MEASURED_PAIR, "json"),
+            CloudRecord: ("sensor_msgs/msg/PointCloud2", "cdr"),
+        }  # fmt: skip
         found = [
-            Topic(name, schemas[type(of[0])], "json", len(of), of[0].logged_ns, of[-1].logged_ns, "")
+            Topic(name, *kinds[type(of[0])], len(of), of[0].logged_ns, of[-1].logged_ns, "")
             for name, of in self.found.items()
             if of
         ]
@@ -253,9 +268,11 @@ def write_up_to_detection(log: Log, out: LogWriter, images: Images) -> None:
     """Write what was recorded, with odometries that are in files, and what was detected in it."""
     write_files(out, log, read_embedded_rig(log))
     if not isinstance(log, RunLog):
-        out.copy(log, topics_up_to_detection(log), images)
+        out.copy(log, topics_up_to_detection(log), images, of_stages=_OF_DETECTION)
         return
-    out.copy(log.recorded, log.kept, images)
+    out.copy(log.recorded, log.kept, images, of_stages=_OF_DETECTION)
+    for cloud in records_of(log, log.found, CloudRecord):
+        out.point_cloud(cloud)
     for sensor, records in log.detections.items():
         of_image: dict[int, list[DetectionRecord]] = defaultdict(list)
         for record in records:

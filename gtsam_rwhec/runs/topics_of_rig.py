@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, IntrinsicsRecord, Log
 from gtsam_rwhec.logs.records import TAG_DETECTIONS, TF_TOPICS
 from gtsam_rwhec.logs.ros2_messages import DETECTIONS
 from gtsam_rwhec.rig import Rig
@@ -16,6 +16,10 @@ from gtsam_rwhec.runs.run_log import detections_topic, pairs_topic
 #: The types of messages that are read, by what the rig file takes from them.
 READ = {
     "images": ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"),
+    "clouds": (
+        "sensor_msgs/PointCloud2", "foxglove.PointCloud", "sensor_msgs/Image", "sensor_msgs/CompressedImage",
+        "foxglove.RawImage", "foxglove.CompressedImage",
+    ),
     "detections": (*DETECTIONS, TAG_DETECTIONS),
     "intrinsics": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
     "poses": (
@@ -89,7 +93,7 @@ def _check_types(log: Log, rig: Rig) -> None:
 def named_topics(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
     """The topics of sensors and where the rig file names them."""
     for name, sensor in rig.sensors.items():
-        for key, topic in (("images", sensor.images), ("detections", sensor.detections)):
+        for key, topic in (("images", sensor.images), ("detections", sensor.detections), ("clouds", sensor.clouds)):
             if topic is not None:
                 yield ("sensors", name, key), topic
         if sensor.intrinsics is not None and sensor.intrinsics.topic is not None:
@@ -103,7 +107,7 @@ def _frame_of(log: Log, topic: str) -> str:
     """The frame of a topic's first message; empty if the topic has no message or cannot be read."""
     if any(each.name == topic and each.unreadable for each in log.topics()):
         return ""
-    kinds = (ImageRecord, IntrinsicsRecord, DetectionRecord)
+    kinds = (ImageRecord, IntrinsicsRecord, DetectionRecord, CloudRecord)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LogWarning)  # the reader of the whole topic warns
         first = next((record for record in log.records([topic]) if isinstance(record, kinds)), None)

@@ -14,3 +14,6 @@ from .simulation import FrameDistance as FrameDistance
 from .simulation import PosesAndScale as PosesAndScale
 from .simulation import Simulation as Simulation
 from .simulation import frame_distance as frame_distance
+from .simulated_clouds import Shape as Shape
+from .simulated_clouds import SimulatedClouds as SimulatedClouds
+from .simulated_clouds import clouds_of_thing as clouds_of_thing

@@ -85,6 +85,8 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
             translation = translation[:, SWAPPED[:, None], SWAPPED]
             rotation = rotation.transpose(0, 2, 1)
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
+        for k, directed in part.directed_at(at):
+            of_translations[k], of_rotations[k], _ = directed.forms(*part.centres(directed.e), 0.0)
         has_both, frames = coupled[at], slots.frames[at].T
         of_both = of_translations + of_rotations
         for form, numbers in zip(forms, slots.forms(at, of_both, of_rotations), strict=True):
@@ -231,6 +233,9 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
     v[:, 16:25] = 0.5 * np.repeat(square[:, T_B], 3, axis=1)
     v *= 16.0
     v[:, 7:] += (moments.kappa * (1.5 * unit + off))[:, None]
+    reach = rounding_of_fixed(part).sum(axis=(1, 2)) / gamma(1)
+    for e, directed in part.directed_at(slice(0, len(v))):
+        v[e] = directed.forms(*part.centres(e), float(reach[e]))[2] * (1.0 + 2.0 * meeting[e] / directed.count)
     return v
 
 

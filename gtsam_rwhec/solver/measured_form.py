@@ -328,8 +328,9 @@ class MeasuredForm:
         begin, end = at.start, at.start + E
         first, last = (bisect_left(self.given.batches, e, key=lambda batch: batch[0]) for e in (begin, end))
         batches = [(e - begin, raw) for e, raw in self.given.batches[first:last]]
+        directed = list(self.part.directed_at(slice(begin, end)))
         shared = [own for each in self.given.shared if (own := each.of(begin, end)) is not None]
-        return Measured(batches, a, c, self.part.kind == "inverse", shared), coefficients
+        return Measured(batches, a, c, self.part.kind == "inverse", shared, directed), coefficients
 
     # -- results ------------------------------------------------------------------------------------------------
 

@@ -48,6 +48,7 @@ except rw.errors.MissingPackageError as error:
 def test_each_package_is_in_the_extra_that_is_named() -> None:
     distributions = {
         "PIL": "pillow", "cv2": "opencv-python-headless", "distributed": "dask", "google": "protobuf",
+        "lzf": "python-neo-lzf", "small_gicp": "small-gicp",
         "mcap_protobuf": "mcap-protobuf-support", "yaml": "pyyaml",
     }  # fmt: skip
     text = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")

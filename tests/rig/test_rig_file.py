@@ -386,8 +386,8 @@ def test_each_is_a_whole_rig_file_with_marks(name: TemplateName) -> None:
     rig = parse_rig(text, name)
     jsonschema.validate(yaml.safe_load(text), rig_file_schema(), jsonschema.Draft7Validator)
     marked = {line.key for line in todo_lines(text)}
-    assert set(rig.targets) <= marked, "the targets' sizes are marked"
-    assert {"images", "detections", *rig.sensors} & marked, "where the images are is marked"
+    assert set(rig.printed) <= marked, "the targets' sizes are marked"
+    assert {"images", "clouds", "detections", *rig.sensors} & marked, "where the images are is marked"
     assert "gtsam-rwhec calibrate" in text
     assert max(map(len, text.splitlines())) <= 120
 

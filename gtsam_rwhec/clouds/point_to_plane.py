@@ -1,0 +1,157 @@
+"""What one surface tells of its pose to another: points across tangent planes, with the information that they have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.clouds.surfaces import Surface
+from gtsam_rwhec.geometry.poses import Array
+
+#: Normals of points that match differ by less than 37 degrees.
+ALIKE = 0.95
+#: Neighbours lie beside each other by less than this share of the gate.
+ASIDE = 0.5
+#: Cauchy's constant, in deviations: 95 % efficiency for Gaussian noise.
+CAUCHY = 2.385
+#: What all points of faces, and of edges, are off by together, in their deviations. An edge is seen up to a whole point
+#: inside of where it is, and how far depends on how steep it is seen.
+SHARED = (0.2, 0.5)
+#: Information of a direction counts if it is so many of its own deviations above zero.
+SIGNIFICANT = 4.0
+#: And if it is at least this share of the largest: surfaces are round or flat to no better, as sensors see them.
+LEAST_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Points (m, 3) of a surface that lie on another, and how far off.
+
+    ``residuals`` (m,) are distances across the mean of both normals, in metres: where a surface is curved, neighbours that
+    lie beside each other are off the tangent plane of either, but not of this mean (Rusinkiewicz 2019, "A symmetric
+    objective function for ICP"). ``rows`` (m, 6) are derivatives by a right perturbation of T_other_surface (rotation
+    first) across the other's normals, ``own_rows`` across the surface's own. ``kind`` is 0 for faces and 1 for edges;
+    ``at`` are places among the surface's faces, then edges.
+    """
+
+    points: Array
+    residuals: Array
+    rows: Array
+    own_rows: Array
+    kind: np.ndarray
+    at: np.ndarray
+    #: The share of the surface's faces that match.
+    overlap: float
+
+
+def matches(surface: Surface, other: Surface, T_other_surface: Array, gate_m: float) -> Matches:
+    """The points of a surface that have a neighbour on another within a gate, with a normal like its own."""
+    R, t = T_other_surface[:3, :3], T_other_surface[:3, 3]
+    found, counts = [], []
+    first = 0
+    for kind, (own, its) in enumerate(((surface.faces, other.faces), (surface.edges, other.edges))):
+        distances, nearest = its.tree.query(own.points @ R.T + t, distance_upper_bound=gate_m)
+        at = np.flatnonzero(np.isfinite(distances))
+        normals = its.normals[nearest[at]] @ R
+        cosine = np.einsum("ij,ij->i", normals, own.normals[at])
+        alike = cosine > ALIKE if kind else np.abs(cosine) > ALIKE
+        at, normals, sign = at[alike], normals[alike], np.sign(cosine[alike])[:, None]
+        points = own.points[at]
+        both = 0.5 * (normals + sign * own.normals[at])
+        apart = points - (its.points[nearest[at]] - t) @ R
+        residuals = np.einsum("ij,ij->i", both, apart)
+        # Farther aside than any neighbour within a surface: the point is beyond the end of the other.
+        within = (apart**2).sum(axis=1) - residuals**2 < (ASIDE * gate_m) ** 2
+        at, normals, sign, points, residuals = at[within], normals[within], sign[within], points[within], residuals[within]
+        rows = [np.hstack([np.cross(points, n), n]) for n in (normals, sign * own.normals[at])]
+        found.append((points, residuals, *rows, np.full(len(at), kind), first + at))
+        counts.append(len(at))
+        first += len(own.points)
+    return Matches(*(np.concatenate(part) for part in zip(*found, strict=True)), counts[0] / len(surface.faces.points))
+
+
+def sigmas(several: Sequence[Matches], spacing_m: float) -> Array:
+    """Robust deviations (2,) of the residuals of faces and of edges over several pairs, m."""
+    result = []
+    for kind in range(2):
+        residuals = np.concatenate([np.zeros(0), *(each.residuals[each.kind == kind] for each in several)])
+        result.append(1.4826 * np.median(np.abs(residuals)) if len(residuals) else spacing_m)
+    return np.maximum(result, 1e-4 * spacing_m)
+
+
+def joined(several: Sequence[Matches]) -> Matches:
+    """Matches of one surface with several others."""
+    names = ("points", "residuals", "rows", "own_rows", "kind", "at")
+    return Matches(*(np.concatenate([getattr(each, name) for each in several]) for name in names), several[0].overlap)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What matches tell of T_other_surface by a right perturbation, rotation first; it adds a guess where they slide.
+
+    ``information`` (6, 6) has nothing along what slides, ``covariance`` there the size of the thing. ``step`` (6,) is the
+    perturbation that matches give, and ``of_guess`` (6, 6) the part of a guess that stays.
+    """
+
+    information: Array
+    covariance: Array
+    step: Array
+    of_guess: Array
+
+
+def units(points: Array) -> tuple[Array, float]:
+    """The perturbation (6, 6) that a unit in each direction is, and the size of points (m, 3) in metres.
+
+    About the points' centre, and with turns in units of their size, turns and shifts move points alike.
+    """
+    size = float(np.sqrt(points.var(axis=0).sum()))
+    result = np.eye(6)
+    result[:3, :3] /= size
+    result[3:, :3] = se3.hat(points.mean(axis=0)) / size
+    return result, size
+
+
+def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
+    """What matches tell, with deviations (2,) of faces and edges.
+
+    ``counts`` (m,) divide the weight of each match: a point that many views match is still one point. Noise of normals
+    looks like information where a surface slides, as rows are squared: so rows by one surface's normals are multiplied
+    by those of the other's, whose noise is independent, and directions that are not significant count as nothing.
+    """
+    from_unit, size = units(found.points)
+    to_unit = np.linalg.inv(from_unit)
+    sigma = sigma_m[found.kind]
+    weights = 1.0 / (counts * sigma**2 * (1.0 + (found.residuals / (CAUCHY * sigma)) ** 2))
+    one, two = found.rows @ from_unit, found.own_rows @ from_unit
+    gradient, certain = np.zeros(6), np.zeros((6, 6))
+    for kind in range(2):
+        mine = found.kind == kind
+        a, b, w = one[mine], two[mine], weights[mine]
+        values, vectors = np.linalg.eigh(_symmetric(a.T @ (b * w[:, None])))
+        spread = np.sqrt(((w[:, None] * (a @ vectors) * (b @ vectors)) ** 2).sum(axis=0))
+        kept = (values > SIGNIFICANT * spread) & (values > LEAST_SHARE * values.max())
+        values, vectors = values[kept], vectors[:, kept]
+        # All points of one kind share an error, so their information has a limit.
+        limit = 1.0 / (1.0 + values * (SHARED[kind] * sigma_m[kind]) ** 2)
+        certain += (vectors * values * limit) @ vectors.T
+        gradient += (vectors * limit) @ (vectors.T @ (0.5 * (a + b).T @ (w * found.residuals[mine])))
+    values, vectors = np.linalg.eigh(_symmetric(certain))
+    certain = np.maximum(values, 0.0)
+    total = certain + 1.0 / size**2  # a guess is off by the size of the thing
+    step = -vectors @ (vectors.T @ gradient / total)
+    information, covariance, of_guess = (
+        (vectors * d) @ vectors.T for d in (certain, 1.0 / total, 1.0 - certain / total)
+    )
+    return Known(
+        _symmetric(to_unit.T @ information @ to_unit),
+        _symmetric(from_unit @ covariance @ from_unit.T),
+        from_unit @ step,
+        from_unit @ of_guess @ to_unit,
+    )
+
+
+def _symmetric(M: Array) -> Array:
+    return np.asarray(0.5 * (M + M.T))

@@ -1,0 +1,270 @@
+"""A first rig file for a folder of clouds: of all readings of the poses, the one that lets the clouds agree."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.calibration.trial_fits import Spread, fitted
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud_files import read_cloud
+from gtsam_rwhec.clouds.first_registration import first_poses
+from gtsam_rwhec.clouds.object_views import ObjectOptions, seen_object
+from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
+from gtsam_rwhec.errors import CloudError, FileFormatError, RigError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.terminal_text import natural_key, rounded
+from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs.image_folder import CLOUD_FORMATS, FORMATS, TABLES
+from gtsam_rwhec.logs.pose_tables import PoseStatement
+from gtsam_rwhec.logs.pose_trees import TREES
+from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.rig.carrier_roles import Role
+from gtsam_rwhec.rig.folder_contents import DEPTH, FolderPoses, poses_read
+from gtsam_rwhec.rig.log_contents import camera_name, free_name
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.rig.rig_file import first_rig_text
+from gtsam_rwhec.rig.section_types import is_text
+from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
+from gtsam_rwhec.rig.target_sections import ObjectTarget
+
+#: Endings of files that are clouds and nothing else.
+ENDINGS = tuple(ending for ending in CLOUD_FORMATS if ending not in FORMATS)
+#: A folder of clouds has at least this number.
+LEAST_CLOUDS = 3
+#: Readings are judged by at most this number of clouds, spread evenly.
+LOOKED_AT = 12
+#: A reading lets clouds agree if their points are nearer to each other than this share of the gate's square.
+AGREES = 0.45
+#: Another reading explains the registered clouds as well if its residuals' product is below this many times the best.
+AS_WELL = 2.0
+#: Clouds of which the median point is farther away than this many units are in millimetres.
+FAR_UNITS = 50.0
+#: Names for the frames of a folder's poses; files do not name them.
+PARENT, CHILD, OBJECT = "base", "flange", "object"
+#: Units that files may leave open, in the order in which they are tried.
+LENGTHS: tuple[Literal["mm"] | None, ...] = (None, "mm")
+ANGLES: tuple[Literal["radians", "degrees"], ...] = ("radians", "degrees")
+#: Conventions of three angles, the commonest first.
+AXES = ("xyz", "ZYX", "XYZ", "rotation_vector", "ZYZ", "zyx")
+
+
+@dataclass(frozen=True)
+class CloudFolder:
+    """Clouds of one sensor."""
+
+    path: str  #: Or pattern, from the folder that was looked at
+    files: tuple[Path, ...]  #: In natural order
+    unit_m: float  #: Metres of one unit, as far away as the points are
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """How the poses are read, which carrier has the sensor, and the poses T_parent_child (n, 4, 4) of the clouds."""
+
+    poses: FolderPoses
+    role: Role
+
+    @property
+    def A(self) -> Array:
+        """T_sensorcarrier_targetcarrier of each cloud."""
+        return se3.inverse(self.poses.T) if self.role == "child" else self.poses.T
+
+    def __str__(self) -> str:
+        said = self.poses.stated
+        words = ["three angles"] if said.euler else ["matrices or quaternions"]
+        if said.euler:
+            words = [f"angles {said.euler} in {said.angles}" + (" before the position" if said.columns else "")]
+        if said.quaternion:
+            words = [f"quaternions {said.quaternion}"]
+        return f"{words[0]}, {'mm' if said.length else 'm'}, the sensor on {CHILD if self.role == 'child' else PARENT}"
+
+
+def cloud_folders(folder: Path) -> list[CloudFolder]:
+    """The folders in a folder that have clouds, in natural order."""
+    found = []
+    for place, below, names in os.walk(folder):
+        inside = Path(place).relative_to(folder)
+        below[:] = [] if len(inside.parts) >= DEPTH else [name for name in below if not name.startswith(".")]
+        for ending in ENDINGS:
+            of_ending = sorted((name for name in names if name.lower().endswith(ending)), key=natural_key)
+            if len(of_ending) >= LEAST_CLOUDS and (cloud := _read(Path(place) / of_ending[0])) is not None:
+                is_far = float(np.median(np.linalg.norm(cloud.points, axis=1))) > FAR_UNITS
+                files = tuple(Path(place) / name for name in of_ending)
+                several = any(Path(name).suffix.lower() in CLOUD_FORMATS for name in names if name not in of_ending)
+                path = inside.as_posix() if not several else (inside / f"*{ending}").as_posix()
+                found.append(CloudFolder(path, files, 1e-3 if is_far else 1.0))
+    return sorted(found, key=lambda each: natural_key(each.path))
+
+
+def _read(file: Path, unit_m: float = 1.0) -> Cloud | None:
+    try:
+        return read_cloud(file, unit_m=unit_m)
+    except (CloudError, FileFormatError):
+        return None
+
+
+def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> tuple[str, tuple[str, ...]]:
+    """The text of a first rig file for folders of clouds with poses beside them, and notes: what was seen and chosen.
+
+    Raises
+    ------
+    RigError
+        No file of poses fits the clouds.
+    """
+    notes: list[str] = []
+    taken = {PARENT, CHILD, OBJECT}
+    sensors: dict[str, Sensor] = {}
+    chosen: tuple[_Reading, str, bool] | None = None
+    for clouds in found:
+        tables = list(_tables(folder, clouds))
+        if not tables or not is_text(clouds.path):
+            notes.append(f"not used: {clouds.path}, no poses fit its {len(clouds.files)} clouds")
+            continue
+        if chosen is None:
+            tell(f"trying readings of the poses of {clouds.path}")
+            chosen = _best(folder, clouds, tables, tell)
+        poses = chosen[0].poses if chosen[0].poses.path in tables else None
+        path = tables[0] if poses is None else poses.path
+        name = free_name("camera" if clouds.path in (".", "*") else camera_name(clouds.path, ""), taken)
+        sensors[name] = Sensor(clouds=clouds.path, poses=path, unit_m=clouds.unit_m if clouds.unit_m != 1.0 else None)
+        notes.append(f"sensor {clouds.path}: {len(clouds.files)} clouds, poses in {path}")
+        if clouds.unit_m != 1.0:
+            notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
+    if chosen is None:
+        raise RigError(
+            f"{folder}: clouds in {', '.join(each.path for each in found[:5])}, and no file of poses that fits them. "
+            "Put the robot's pose at each cloud beside them, as poses.csv with a line a cloud: name, x, y, z, qx, qy, "
+            "qz, qw (metres)"
+        )
+    reading, words, is_sure = chosen
+    notes.append(words)
+    said = reading.poses.stated
+    source = PoseSource(
+        frames=(PARENT, CHILD), quaternion=said.quaternion, euler=said.euler, angles=said.angles,
+        columns=None if said.columns is None else tuple(said.columns.split()), length=said.length,
+    )  # fmt: skip
+    on_hand = reading.role == "child"
+    carriers = Carriers(sensors=CHILD if on_hand else PARENT, targets=PARENT if on_hand else CHILD, poses=source)
+    remark = words if is_sure else f"TODO {words}"
+    if is_sure:
+        remark += (
+            f". If the files have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above: no "
+            "measurement tells these apart"
+        )
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets={OBJECT: ObjectTarget(type="object")})
+    remarks: dict[KeyPath, str] = {("carriers", "poses"): remark}
+    remarks["targets", OBJECT] = "anything that stood still in front of the sensor"
+    head = "# Paths start from that folder.\n"
+    return first_rig_text("folder", folder.resolve().name, rig, remarks, head), tuple(notes)
+
+
+def _tables(folder: Path, clouds: CloudFolder) -> Iterator[str]:
+    """Files, or folders of files, of poses that fit the clouds, as paths from the folder; the nearest first."""
+    places = [clouds.files[0].parent]
+    while places[-1] != folder:
+        places.append(places[-1].parent)
+    for place in places:
+        near = sorted(place.iterdir(), key=lambda path: natural_key(path.name))
+        for path in near:
+            is_table = path.suffix.lower() in (*TREES, *TABLES) or (path.is_dir() and "pose" in path.name.lower())
+            if is_table and next(_statements(folder, clouds, path), None) is not None:
+                yield path.relative_to(folder).as_posix()
+
+
+def _statements(folder: Path, clouds: CloudFolder, path: Path) -> Iterator[FolderPoses]:
+    """The poses of a file under each statement by which it can be read; angles within a turn are radians."""
+    read = partial(poses_read, folder, clouds.files, path)
+    plain = next((poses for length in LENGTHS if (poses := read(PoseStatement(length=length))) is not None), None)
+    if plain is not None:
+        yield plain
+        other = read(replace(plain.stated, quaternion="wxyz"))
+        if other is not None and not np.allclose(other.T, plain.T, rtol=0.0, atol=1e-9, equal_nan=True):
+            yield other
+        return
+    for axes in AXES:
+        about = "xyz" if axes == "rotation_vector" else axes.lower()
+        names = " ".join([*(f"r{axis}" for axis in about), "tx ty tz"])
+        for columns in (None,) if len(set(about)) < 3 else (None, names):  # the position first, or the angles
+            statements = (
+                PoseStatement(euler=axes, angles=angles, length=length, columns=columns)
+                for angles in ANGLES
+                for length in LENGTHS
+            )
+            first = next((poses for stated in statements if (poses := read(stated)) is not None), None)
+            if first is not None:
+                yield first
+
+
+def _readings(folder: Path, clouds: CloudFolder, tables: Sequence[str]) -> Iterator[_Reading]:
+    """All readings that differ, those with the sensor on the child first."""
+    every = [poses for path in tables for poses in _statements(folder, clouds, folder / path)]
+    different: list[FolderPoses] = []
+    for poses in every:
+        if not any(np.allclose(poses.T, other.T, rtol=0.0, atol=1e-9, equal_nan=True) for other in different):
+            different.append(poses)
+    for role in ("child", "parent"):
+        yield from (_Reading(poses, role) for poses in different)
+
+
+def _best(folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progress) -> tuple[_Reading, str, bool]:
+    """The reading that lets the clouds agree, with words, and whether it is sure.
+
+    A start is searched for under one reading after the other, until one explains the clouds. With it they are
+    registered, and all readings are compared by how they explain the registrations.
+    """
+    readings = list(_readings(folder, clouds, tables))
+    posed = np.flatnonzero(np.isfinite(readings[0].poses.T[:, 0, 0]))
+    at = posed[np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).round().astype(int))]
+    seen = {int(i): cloud for i in at if (cloud := _read(clouds.files[i], clouds.unit_m)) is not None}
+    at = np.array(list(seen))
+    spacing = spacing_of([cloud.points for cloud in seen.values()])
+    surfaces = [surface_of(cloud, clouds.files[i].name, spacing) for i, cloud in seen.items()]
+    misfits = []
+    for number, reading in enumerate(readings, start=1):
+        tell(f"reading the poses as {reading} ({number} of {len(readings)})")
+        start = first_poses(surfaces, reading.A[at], spacing.faces_m)[0]
+        misfits.append(start.misfit)
+        if start.misfit > AGREES:
+            continue
+        registered = seen_object(seen.values(), reading.A[at], ObjectOptions(start=start.T_sensorcarrier_sensor))
+        used = registered.used
+        residuals = [_residual(other.A[at][used], registered.T_sensor_object[used]) for other in readings]
+        products = np.array([spread.rotation_rad * spread.translation_m for spread in residuals])
+        best = int(np.argmin(products))
+        others = np.delete(products, best)
+        words = (
+            f"of {len(readings)} readings of the poses, {readings[best]}, lets the clouds agree: "
+            f"{_figures(residuals[best])}"
+        )
+        if not len(others):
+            return readings[best], words, True
+        second = int(np.argsort(products)[1])
+        words += f" (the next, {readings[second]}: {_figures(residuals[second])})"
+        return readings[best], words, bool(others.min() > AS_WELL * products[best])
+    best = int(np.argmin(misfits))
+    words = (
+        f"none of {len(readings)} readings of the poses lets the clouds agree; {readings[best]} is a guess. State "
+        "euler, angles, length, and which frame carries the sensor; look whether the thing stood still, and whether "
+        "neighbouring clouds share a third of what they see"
+    )
+    return readings[best], words, False
+
+
+def _residual(A: Array, B: Array) -> Spread:
+    """The residuals of a robust fit of registered clouds under a reading; infinite without an answer."""
+    fit = fitted(Problem(), {Pair(OBJECT, "sensor"): (A, B)})
+    return Spread(np.inf, np.inf) if fit is None else fit.residual
+
+
+def _figures(spread: Spread) -> str:
+    return f"{rounded(np.degrees(spread.rotation_rad), 2)} degrees and {rounded(1e3 * spread.translation_m, 2)} mm"

@@ -1,0 +1,203 @@
+"""What a sensor with clouds saw of an object: its clouds, registered with each other, and what is kept of them."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.named_fields import METRE, cloud_of_depth, cloud_of_record, record_of_cloud
+from gtsam_rwhec.clouds.object_views import SeenObject, seen_object
+from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.errors import CloudError, LogError, LogWarning
+from gtsam_rwhec.files.progress import Counted, Progress, Remark
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, Log, Record
+from gtsam_rwhec.results.log_history import ObjectReport, RegisteredPair
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
+from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.run_log import clouds_topic, detections_topic, image_name, image_names
+from gtsam_rwhec.runs.sensor_detections import SensorDetections, message_count
+
+#: Points of a view that are kept, for people who look at the log and for the report.
+KEPT_POINTS = 2000
+#: Two clouds slide along a direction that has less than this share of the information of the best known one.
+NOTHING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class CloudDetections:
+    """The detections of one sensor with clouds."""
+
+    seen: SensorDetections
+    report: ObjectReport
+    clouds: list[CloudRecord]  #: Thinned clouds, in the sensor's frame, metres, on the topic that is kept
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Where a sensor's clouds are in a log, and how they are read."""
+
+    log: Log
+    topic: str
+    camera: Camera | None
+    unit_m: float | None
+    names: Mapping[str, str]
+
+    def name(self, stamp_ns: int) -> str:
+        """The name of a cloud's file, else its stamp."""
+        return image_name(self.names, self.topic, stamp_ns)
+
+    def each(self) -> Iterator[tuple[int, Cloud | CloudError]]:
+        """Stamp and cloud of each message, in the order of the log, or why it is none."""
+        for record in self.log.records([self.topic]):
+            try:
+                cloud = replace(self._cloud(record), source=self.name(record.stamp_ns))
+            except CloudError as error:
+                yield record.stamp_ns, error
+            else:
+                yield record.stamp_ns, cloud
+
+    def _cloud(self, record: Record) -> Cloud:
+        if isinstance(record, CloudRecord):
+            return cloud_of_record(record, self.unit_m or METRE, source=self.name(record.stamp_ns))
+        if not isinstance(record, ImageRecord):
+            raise LogError(f"topic {self.topic} has no clouds but {type(record).__name__}s")
+        if self.camera is None:
+            raise LogError(f"topic {self.topic} has depth images, which need intrinsics; state them for this sensor")
+        return cloud_of_depth(record, self.camera, self.unit_m, source=self.name(record.stamp_ns))
+
+
+def detect_in_clouds(
+    log: Log,
+    rig: Rig,
+    sensor: str,
+    camera: Camera | None,
+    motion: CarrierMotion,
+    *,
+    progress: Progress,
+    kept: KeptDetections | None = None,
+) -> CloudDetections:
+    """Register the clouds of a sensor; what `kept` has of the same clouds and poses is not registered again.
+
+    Raises
+    ------
+    LogError
+        The topic has no clouds, or depth images without intrinsics; or no cloud can be used.
+    StampError
+        As `check_order`.
+    CloudError
+        As `seen_object`: views do not overlap, or too few are left.
+    """
+    section = rig.sensors[sensor]
+    topic, target, frame = section.clouds, rig.object, rig.frame_of(sensor)
+    assert topic is not None
+    assert target is not None
+    assert section.time_offset != "estimate"
+    source = _Source(log, topic, camera, section.unit_m, image_names(log))
+    total = message_count(log, topic)
+    drawn, faults = dict[int, CloudRecord](), []
+    for done, (stamp, cloud) in enumerate(source.each(), start=1):
+        progress(Counted("reading clouds:", done, total))
+        if isinstance(cloud, Cloud):
+            drawn.setdefault(stamp, record_of_cloud(_thinned(cloud), clouds_topic(sensor), stamp, frame))
+        else:
+            faults.append(str(cloud))
+            warnings.warn(f"{cloud}. It counts as a cloud that cannot be used", LogWarning, stacklevel=3)
+    stamps = np.array(list(drawn), dtype=np.int64)
+    check_order(stamps, f"topic {topic}")
+    if not drawn:
+        why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
+        path = log.files[0].path
+        raise LogError(f"{path}, topic {topic}: none of the {total} clouds of {sensor} can be used; {why}")
+    A = motion.A_where_known(stamps + round(1e9 * float(section.time_offset)), rig.carriers.max_gap_s)
+    known = np.isfinite(A[:, 0, 0])
+    inputs = hashlib.sha256(stamps.tobytes() + A.tobytes()).hexdigest()
+    found = None if kept is None else kept.known_object(sensor, inputs)
+    if found is None:
+        progress(f"registering {int(known.sum())} clouds of {sensor}")
+        wanted = dict.fromkeys(stamps[known].tolist())
+        seen = seen_object(_once(source, wanted), A[known])
+        found = (
+            _records(seen, detections_topic(sensor), frame, target, list(wanted)),
+            _report(seen, target, sensor, [source.name(stamp) for stamp in wanted]),
+        )
+        if kept is not None:
+            kept.keep_object(sensor, inputs, *found)
+    else:
+        progress(Remark(f"going on with an unfinished run: the clouds of {sensor} are registered"))
+    records, report = found
+    nowhere = [
+        DetectionRecord(stamp, stamp, detections_topic(sensor), frame, "", target, reason=Rejection.NO_POSE)
+        for stamp in stamps[~known].tolist()
+    ]
+    of_sensor = SensorDetections([*records, *nowhere], total, Counter(), tuple(faults), remarks=report.remarks)
+    return CloudDetections(of_sensor, report, list(drawn.values()))
+
+
+def _once(source: _Source, wanted: dict[int, None]) -> Iterator[Cloud]:
+    """The wanted clouds by stamp, each the first of its stamp, one after the other: not all fit into memory."""
+    waiting = set(wanted)
+    for stamp, cloud in source.each():
+        if isinstance(cloud, Cloud) and stamp in waiting:
+            waiting.remove(stamp)
+            yield cloud
+
+
+def _thinned(cloud: Cloud) -> Cloud:
+    """At most `KEPT_POINTS` of a cloud, drawn at random: every stride of an image has a pattern."""
+    if len(cloud) > KEPT_POINTS:
+        cloud = cloud.selected(np.sort(np.random.default_rng(0).permutation(len(cloud))[:KEPT_POINTS]))
+    points = cloud.points.astype(np.float32).astype(np.float64)
+    return replace(cloud, points=points, shape=None, rings=None, times_s=None, intensities=None)
+
+
+def _records(seen: SeenObject, topic: str, frame: str, target: str, stamps_ns: Sequence[int]) -> list[DetectionRecord]:
+    """The object's pose in each view, as a detection."""
+    records = []
+    for i, stamp in enumerate(stamps_ns):
+        record = DetectionRecord(stamp, stamp, topic, frame, "", target, reason=Rejection.NOT_REGISTERED)
+        if seen.used[i]:
+            T, covariance = seen.T_sensor_object[i], seen.covariances[i]
+            record = replace(record, T_camera_tag=T, covariance=covariance, reason="")
+        records.append(record)
+    return records
+
+
+def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) -> ObjectReport:
+    pairs = seen.registrations
+    # The carriers' poses and the certified pose of the sensor predict each registration.
+    T_target_sensor = se3.inverse(seen.A) @ seen.T_sensorcarrier_sensor
+    predicted = se3.inverse(T_target_sensor[pairs.i]) @ T_target_sensor[pairs.j]
+    off = se3.logmap(se3.inverse(predicted) @ pairs.B)
+    tells = np.linalg.eigvalsh(pairs.information)
+    slides = (tells <= NOTHING * tells[:, -1:]).sum(axis=1)
+    return ObjectReport(
+        target=target,
+        sensor=sensor,
+        views=len(names),
+        used=int(seen.used.sum()),
+        noise_mm=1e3 * float(seen.sigma_m[0]),
+        spacing_mm=1e3 * seen.spacing_m,
+        registrations=tuple(
+            RegisteredPair(
+                first=names[i],
+                second=names[j],
+                overlap=float(overlap),
+                off_mm=1e3 * float(np.linalg.norm(xi[3:])),
+                off_deg=float(np.degrees(np.linalg.norm(xi[:3]))),
+                slides=free,
+            )
+            for i, j, overlap, xi, free in zip(
+                pairs.i.tolist(), pairs.j.tolist(), pairs.overlap, off, slides.tolist(), strict=True
+            )
+        ),
+        remarks=tuple(f"{finding}." for finding in (*seen.left_out.values(), *seen.findings)),
+    )
