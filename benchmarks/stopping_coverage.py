@@ -22,6 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 from bars import Row, Share, each_done, keep_line, kept_lines, run_script
 from numpy.typing import NDArray
@@ -167,12 +168,17 @@ def at_stop(cell: Cell, answer: Answer, takes: int, widening: float, *, naive: b
 def moved(cell: Cell, answer: Answer, sensor: str) -> Array:
     """(3,): how far off the point in front of a sensor is, m."""
     place = np.r_[0.0, 0.0, WANTED.distance_m, 1.0]
-    return ((answer.Y[sensor].matrix() - cell.Y[sensor]) @ place)[:3]
+    return ((poses_of(answer)[sensor].matrix() - cell.Y[sensor]) @ place)[:3]
+
+
+def poses_of(answer: Answer) -> dict[str, gtsam.Pose3]:
+    """The sensors' best poses."""
+    return answer.Y if answer.refined is None else answer.refined.Y
 
 
 def off_mm(cell: Cell, answer: Answer) -> float:
     """The same of the worst sensor, mm; infinite without an answer."""
-    return max((1e3 * float(np.linalg.norm(moved(cell, answer, name))) for name in answer.Y), default=math.inf)
+    return max((1e3 * float(np.linalg.norm(moved(cell, answer, name))) for name in poses_of(answer)), default=math.inf)
 
 
 def rows(cells: int, seed: int, jobs: int, road: str, keep: str) -> list[Row]:

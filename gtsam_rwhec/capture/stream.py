@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -216,6 +217,7 @@ class Stream:
     def _updated(self, number: int | None, start: float, differ: np.ndarray) -> StreamUpdate:
         store, answers = self._store, self._answers
         rows, knowledge = store.rows, store.knowledge
+        is_estimated = self.options.noise == "estimate" and len(rows) > 0
         X, Y, scales = poses_of(answers, knowledge)
         scale: float | dict[str, float] = 1.0
         if knowledge.scale == "shared":
@@ -245,6 +247,8 @@ class Stream:
             _noise=self._noise,
             _carriers=Carriers(knowledge.sensor_carrier, knowledge.target_carrier),
             _scale_mode=knowledge.scale,
+            _counting=partial(store.as_now().problem, np.flatnonzero(rows["counts"])) if is_estimated else None,
+            _is_whole=store.is_whole,
         )
 
     def _answer(self, changed: set[Pair]) -> None:
