@@ -64,8 +64,15 @@ class TrueCell:
         return pixels[0] if is_whole[0] else None
 
     def sees(self, A: Array) -> NDArray[np.bool_]:
-        """Whether any camera sees any board, at A (N, 4, 4)."""
-        return np.any([self.whole(target, sensor, A)[1] for target in self.X for sensor in self.Y], axis=0)
+        """Whether any camera sees any board, which is not tilted too much, at A (N, 4, 4)."""
+        found = np.zeros(len(A), dtype=bool)
+        for target, X in self.X.items():
+            for sensor, Y in self.Y.items():
+                B = se3.inverse(Y) @ A @ X
+                ray = B[:, :3, 3] / np.linalg.norm(B[:, :3, 3], axis=1)[:, None]
+                is_upright = -np.einsum("ni,ni->n", B[:, :3, 2], ray) >= np.cos(np.radians(TILT_DEG))
+                found |= is_upright & self.whole(target, sensor, A)[1]
+        return found
 
     def take(self, problem: rw.Problem, A: Array, stamp: int) -> int:
         """Measure at a pose; how many boards were seen."""

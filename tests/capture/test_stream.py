@@ -179,6 +179,23 @@ def test_late_verdicts_take_early_ones_back() -> None:
     assert stream.last.is_settled
 
 
+def test_a_search_goes_on_over_updates_and_over_a_removal() -> None:
+    every = ones_of(general(3, 3, seed=13, number_of_measurements=12, noise=NOISE).problem)
+    order = np.random.default_rng(0).permutation(len(every)).tolist()
+    wrong = set(range(0, 50, 3))
+    stream, settled = rw.Stream(), []
+    for k, i in enumerate(order):
+        update = add(stream, every[i].off_by([0.0, 0.3, 0.0, 0.1, 0.0, 0.0]) if k in wrong else every[i])
+        settled.append(update.is_settled)
+        if k == 64:  # of the search that began at 64
+            stream.remove(39)
+    assert not any(settled[63:67])
+    assert settled[-1]
+    left_out = {outlier.number for outlier in stream.last.outliers}
+    assert wrong - {39} <= left_out
+    assert len(left_out) <= len(wrong) + 1
+
+
 def test_a_wrong_measurement_is_left_out_when_it_comes_and_the_answer_stays() -> None:
     every = ones(5, 15)
     stream = streamed(every[:-1])
