@@ -169,7 +169,7 @@ def most_gain(cell: Cell, stream: rw.Stream) -> View:
 def plan_options(cell: Cell) -> rw.PlanOptions:
     """What the operator tells a planner."""
     return rw.PlanOptions(
-        point_m=WANTED.distance_m, near_m=AWAY_M[0], far_m=AWAY_M[1], tilt_deg=TILT_DEG, stated="exact",
+        wanted=WANTED, near_m=AWAY_M[0], far_m=AWAY_M[1], tilt_deg=TILT_DEG, stated="exact",
         moves="targets" if cell.kind == "eye to hand" else "sensors",
     )  # fmt: skip
 
@@ -206,7 +206,7 @@ def run(kind: str, seed: int, road: str, operator: str = "random") -> dict[str, 
 
 def is_small(answer: Answer) -> bool:
     """Whether the covariance looks small enough, by a chi-square quantile."""
-    place = [0.0, 0.0, WANTED.distance_m]
+    place = WANTED.place_m
     every = [answer.uncertainty_at(place, name).covariance_m2 for name in answer.Y]
     return all(
         np.isfinite(c).all() and ball_radius(np.linalg.eigvalsh(c), WANTED.level) <= WANTED.radius_m for c in every
@@ -216,7 +216,7 @@ def is_small(answer: Answer) -> bool:
 def at_stop(cell: Cell, answer: Answer, takes: int, widening: float, *, naive: bool) -> dict[str, Any]:
     """What is true of the first camera, and of the worst one, at the moment of stopping."""
     refined = answer.refined
-    point = answer.uncertainty_at([0.0, 0.0, WANTED.distance_m], "cam_0")
+    point = answer.uncertainty_at(WANTED.place_m, "cam_0")
     errors = (
         ("inside", error_of(refined.Y["cam_0"], cell.Y["cam_0"]), refined.covariance("cam_0")),
         ("inside_of_point", moved(cell, answer, "cam_0"), point.covariance_m2),
@@ -230,7 +230,7 @@ def at_stop(cell: Cell, answer: Answer, takes: int, widening: float, *, naive: b
 
 def moved(cell: Cell, answer: Answer, sensor: str) -> Array:
     """(3,): how far off the point in front of a sensor is, m."""
-    place = np.r_[0.0, 0.0, WANTED.distance_m, 1.0]
+    place = np.r_[WANTED.place_m, 1.0]
     return ((poses_of(answer)[sensor].matrix() - cell.Y[sensor]) @ place)[:3]
 
 

@@ -22,6 +22,7 @@ from loky import ProcessPoolExecutor, cpu_count
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.capture.accuracy import Accuracy
 from gtsam_rwhec.capture.live_answer import Answer, answer_of, calibrated
 from gtsam_rwhec.capture.live_streams import Seen, SensorStream, Stillness, StillOptions, Streams
 from gtsam_rwhec.capture.live_takes import CALIBRATION, RECORDED, RIG_FILE, TAKES, Takes
@@ -29,7 +30,6 @@ from gtsam_rwhec.capture.sources import FollowedFile, ReplayedLog, Source, is_of
 from gtsam_rwhec.capture.sources_camera import PREFIX, STANDARD_INPUT, CameraSource
 from gtsam_rwhec.capture.sources_folder import FolderSource
 from gtsam_rwhec.capture.sources_foxglove import FoxgloveSource
-from gtsam_rwhec.capture.stopping import Accuracy
 from gtsam_rwhec.detect.many_images import ONE_THREAD, quiet_on_one_thread
 from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.geometry.poses import Array
