@@ -44,7 +44,7 @@ class TrueCell:
     def options(self) -> rw.PlanOptions:
         """What the operator tells the planner."""
         return rw.PlanOptions(
-            point_m=WANTED_AT_M, tilt_deg=TILT_DEG, turn_deg=TURN_DEG,
+            wanted=rw.Accuracy(distance_m=WANTED_AT_M), tilt_deg=TILT_DEG, turn_deg=TURN_DEG,
             box_m=tuple(tuple(self._moving(self.present)[:3, 3] + side) for side in (-BOX_M, BOX_M)),
             present=self.present, guesses=self.guesses, guess_deg=float(np.degrees(GUESS_RAD)), guess_m=GUESS_M,
             corner_px=self.corner_px, carrier_noise=self.noise,
@@ -63,9 +63,16 @@ class TrueCell:
         pixels, is_whole = self.whole(target, sensor, A[None])
         return pixels[0] if is_whole[0] else None
 
-    def sees(self, A: Array) -> NDArray[np.bool_]:
-        """Whether any camera sees any board, at A (N, 4, 4)."""
-        return np.any([self.whole(target, sensor, A)[1] for target in self.X for sensor in self.Y], axis=0)
+    def sees(self, A: Array, tilt_deg: float = 90.0) -> NDArray[np.bool_]:
+        """Whether any camera sees any board, tilted by at most so much, at A (N, 4, 4)."""
+        found = np.zeros(len(A), dtype=bool)
+        for target, X in self.X.items():
+            for sensor, Y in self.Y.items():
+                B = se3.inverse(Y) @ A @ X
+                ray = B[:, :3, 3] / np.linalg.norm(B[:, :3, 3], axis=1)[:, None]
+                is_upright = -np.einsum("ni,ni->n", B[:, :3, 2], ray) >= np.cos(np.radians(tilt_deg))
+                found |= is_upright & self.whole(target, sensor, A)[1]
+        return found
 
     def take(self, problem: rw.Problem, A: Array, stamp: int) -> int:
         """Measure at a pose; how many boards were seen."""
@@ -102,7 +109,7 @@ class TrueCell:
             )
             place = T_now[:3, 3] + self.rng.uniform(-BOX_M, BOX_M, (BATCH, 3))
             T = se3.pose(T_now[:3, :3] @ Rotation.from_rotvec(turns).as_matrix(), place)
-            found += [*(A := self._moving(T))[self.sees(A)]]
+            found += [*(A := self._moving(T))[self.sees(A, TILT_DEG)]]
         return np.array(found[:count])
 
     def _moving(self, T: Array) -> Array:

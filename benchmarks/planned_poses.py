@@ -142,12 +142,12 @@ def said_after(case: str, seed: int) -> int:
     from pathlib import Path
 
     true, problem = cell("hand", 20_000 + seed), rw.Problem()
-    options = replace(true.options, wanted_mm=0.5)
+    options = replace(true.options, wanted=rw.Accuracy(5e-4, WANTED_AT_M))
     if case == "no target within the box":
         place = se3.inverse(true.present)[:3, 3] + 3.0
         options = replace(options, box_m=(tuple(place), tuple(place + 0.5)))
     elif case == "an accuracy beyond the arm":
-        options = replace(options, wanted_mm=0.001)
+        options = replace(options, wanted=rw.Accuracy(1e-6, WANTED_AT_M))
     else:
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
             Path(file.name).write_text(GANTRY)

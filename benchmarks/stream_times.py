@@ -10,6 +10,7 @@ same moments. Nothing is lazy in an update but ``refined``, the joint covariance
 
 from __future__ import annotations
 
+import gc
 import time
 import tracemalloc
 import warnings
@@ -85,6 +86,7 @@ def of_memory(came: list[One]) -> Row:
     for _ in range(2):
         for one in came[:256]:
             add(stream, one)
+        gc.collect()  # what nobody holds any more
         held.append(tracemalloc.get_traced_memory()[0] / 1e6)
     tracemalloc.stop()
     words = f"{held[0]:.2f} and {held[1]:.2f} MB"

@@ -14,7 +14,7 @@ from .plan_files import print_plan as print_plan
 from .plan_files import write_plan as write_plan
 
 # The answer after each measurement, and when it is good enough.
-from .stopping import Accuracy as Accuracy
+from .accuracy import Accuracy as Accuracy
 from .stopping import StopDecision as StopDecision
 from .stopping import StoppingRule as StoppingRule
 from .stopping import Why as Why

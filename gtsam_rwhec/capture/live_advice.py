@@ -10,9 +10,10 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.capture.accuracy import Accuracy
 from gtsam_rwhec.capture.plan_options import PlanOptions
 from gtsam_rwhec.capture.plan_poses import Plan, PlannedPose, plan
-from gtsam_rwhec.capture.stopping import Accuracy, StopDecision, StoppingRule
+from gtsam_rwhec.capture.stopping import StopDecision, StoppingRule
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.rig import Rig
 
@@ -49,7 +50,7 @@ def next_pose(
     # Poses are of what moves, in what stands: a hand's in its base.
     options = PlanOptions(poses=AHEAD, moves="targets" if child == rig.carriers.targets else "sensors")
     if wanted is not None:
-        options = replace(options, wanted_mm=1e3 * wanted.radius_m, point_m=wanted.distance_m, level=wanted.level)
+        options = replace(options, wanted=wanted)
     try:
         found = plan(known, options, rig=rig, cameras=cameras)
     except OptionError:  # no camera whose intrinsics are known, and nothing was measured: there is nothing to plan with

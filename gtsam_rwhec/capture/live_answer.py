@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,8 +15,9 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.cameras.camera import Camera
+from gtsam_rwhec.capture.accuracy import Accuracy
 from gtsam_rwhec.capture.live_advice import Decision, Proposal, next_pose, stop_decision
-from gtsam_rwhec.capture.stopping import Accuracy, StoppingRule
+from gtsam_rwhec.capture.stopping import StoppingRule
 from gtsam_rwhec.detect.many_images import DetectedImage
 from gtsam_rwhec.errors import RwhecError, RwhecWarning
 from gtsam_rwhec.logs import ImageRecord
@@ -27,6 +28,7 @@ from gtsam_rwhec.results.image_errors import cells_with_corners
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import detected
+from gtsam_rwhec.runs.kept_detections import KeptOfLog
 from gtsam_rwhec.runs.run_log import RunLog
 from gtsam_rwhec.runs.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.runs.whole_runs import calibrate_log
@@ -70,10 +72,10 @@ class Answer:
     decision: Decision | None = None
 
 
-class _Known:
+class _Known(KeptOfLog):
     """Detections of the takes that were searched before, in this process."""
 
-    done, is_whole = 0, False
+    done, is_whole = 0, False  # each take is another log
 
     def __init__(self) -> None:
         self._of: dict[tuple[str, int], DetectedImage] = {}
@@ -86,6 +88,10 @@ class _Known:
     def keep(self, number: int, found: list[DetectedImage]) -> None:
         """Keep the detections of a batch."""
         self._of.update({(image.topic, image.stamp_ns): image for image in found})
+
+    def all(self) -> Iterator[DetectedImage]:
+        """What was found in all images so far."""
+        yield from self._of.values()
 
     def finish(self) -> None:
         """Nothing: the next take has more."""
@@ -108,7 +114,7 @@ def answer_of(takes: Sequence[Path], rig: Rig, wanted: Accuracy | None) -> Answe
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # the verdict and the report say them
             with open_log(takes) as log:
-                found = detected(log, rig, workers=1, keep=lambda cameras: known)  # type: ignore[arg-type, return-value]
+                found = detected(log, rig, workers=1, keep=lambda cameras: known)
                 cells, pairs, cameras = _cells(found), _pairs(found), found.stages.cameras
                 solved = solve_log(cleaned(found, rig), None)
                 proposal, outlook = next_pose(solved.calibration, rig, cameras, wanted)
@@ -175,6 +181,5 @@ def _points(solved: Calibrated, wanted: Accuracy | None) -> tuple[PointRow, ...]
     if wanted is None:
         points = list(calibration.points.values())
     else:
-        at = [0.0, 0.0, wanted.distance_m]
-        points = [calibration.uncertainty_at(at, name, level=wanted.level) for name in calibration.points]
+        points = [calibration.uncertainty_at(wanted.place_m, name, level=wanted.level) for name in calibration.points]
     return tuple(PointRow(one.frame, float(np.linalg.norm(one.point_m)), one.radius_mm) for one in points)

@@ -22,13 +22,14 @@ from loky import ProcessPoolExecutor, cpu_count
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.capture.accuracy import Accuracy
 from gtsam_rwhec.capture.live_answer import Answer, answer_of, calibrated
 from gtsam_rwhec.capture.live_streams import Seen, SensorStream, Stillness, StillOptions, Streams
 from gtsam_rwhec.capture.live_takes import CALIBRATION, RECORDED, RIG_FILE, TAKES, Takes
 from gtsam_rwhec.capture.sources import FollowedFile, ReplayedLog, Source, is_of_transforms
+from gtsam_rwhec.capture.sources_camera import PREFIX, STANDARD_INPUT, CameraSource
 from gtsam_rwhec.capture.sources_folder import FolderSource
 from gtsam_rwhec.capture.sources_foxglove import FoxgloveSource
-from gtsam_rwhec.capture.stopping import Accuracy
 from gtsam_rwhec.detect.many_images import ONE_THREAD, quiet_on_one_thread
 from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.geometry.poses import Array
@@ -443,10 +444,11 @@ class Session:
         self._stopping.set()
 
 
-def source_of(name: str, rig: Rig, speed: float | None = None) -> Source:
-    """The source of a name: ``ws://HOST:PORT``, a folder of images, an MCAP file that grows, or one to replay.
+def source_of(name: str, rig: Rig, speed: float | None = None, poses: str = STANDARD_INPUT) -> Source:
+    """The source of a name: ``ws://HOST:PORT``, ``camera:0``, a folder, an MCAP file that grows, or one to replay.
 
-    A file that its recorder has closed, and any with a speed, is replayed.
+    A file that its recorder has closed, and any with a speed, is replayed. Beside a camera of this machine ``poses`` is
+    a file of lines that grows, or "-", standard input.
 
     Raises
     ------
@@ -455,13 +457,15 @@ def source_of(name: str, rig: Rig, speed: float | None = None) -> Source:
     """
     if name.startswith(("ws://", "wss://")):
         return FoxgloveSource(name, rig)
+    if name.startswith(PREFIX):
+        return CameraSource(name, rig, poses)
     path = Path(name)
     if path.is_dir() and rig.carriers.poses.frames is not None:
         return FolderSource(name, rig)
     if path.is_dir() or speed is not None or _is_closed(path):
         return ReplayedLog(path, rig, speed or 1.0)
     if path.suffix.lower() != ".mcap":
-        raise LogError(f"{name} is no source: give ws://HOST:PORT, an MCAP file, or a folder of images")
+        raise LogError(f"{name} is no source: give ws://HOST:PORT, camera:0, an MCAP file, or a folder of images")
     return FollowedFile(path, rig)
 
 

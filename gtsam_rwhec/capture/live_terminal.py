@@ -94,7 +94,7 @@ def drawn(state: dict[str, Any]) -> RenderableType:
 @contextmanager
 def _keys(session: Session) -> Iterator[None]:
     """Let single keys be commands while the block runs, if standard input is a terminal."""
-    if not sys.stdin.isatty():
+    if not (session.source.reads_keys and sys.stdin.isatty()):
         yield
         return
     descriptor, loop = sys.stdin.fileno(), asyncio.get_running_loop()

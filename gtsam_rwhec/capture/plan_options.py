@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.calibration.point_uncertainty import checked_level
+from gtsam_rwhec.capture.accuracy import Accuracy
 from gtsam_rwhec.capture.plan_arm import Arm
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
@@ -29,14 +29,8 @@ class PlanOptions:
     #: So many poses are proposed, out of so many candidates that are seen and can be reached.
     poses: int = 12
     candidates: int = 200
-    #: The wanted accuracy: with the probability ``level`` a point at ``point_m`` before a sensor is within this
-    #: distance of its true place (mm). Without it the plan says what each pose leaves.
-    wanted_mm: float | None = None
-    #: The distance of that point, m; None: where the sensor sees its targets.
-    point_m: float | None = None
-    level: float = 0.95
-    #: The sensor that counts; None: all, and the worst of them.
-    sensor: str | None = None
+    #: The wanted accuracy, and of which point. Of several sensors the worst counts.
+    wanted: Accuracy = field(default_factory=Accuracy)
     #: Detection: the nearest and the farthest target (m; None: as the image and ``spacing_px`` allow), the most that a
     #: board is tilted (degrees), pixels between neighbouring corners, and the share of the image at its border that
     #: stays free.
@@ -66,12 +60,13 @@ class PlanOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        checked_level(self.level)
+        if not isinstance(self.wanted, Accuracy):
+            raise OptionError(f"PlanOptions.wanted={brief(self.wanted)}; give a gtsam_rwhec.Accuracy")
         check_choices(self, {"moves": Moving, "stated": Stated})
         for name, most in (("poses", MOST_POSES), ("candidates", MOST_CANDIDATES)):
             if not (is_whole(value := getattr(self, name), 1) and value <= most):
                 raise OptionError(f"PlanOptions.{name}={brief(value)}; give a whole number from 1 to {most}")
-        optional = {"wanted_mm", "point_m", "near_m", "far_m"}
+        optional = {"near_m", "far_m"}
         for one in fields(self):
             value = getattr(self, one.name)
             is_length = one.name in optional or one.type == "float"

@@ -228,19 +228,17 @@ def plan(
 def _task(cell: Cell, options: PlanOptions) -> Task:
     """The point before each sensor that counts: where it is wanted, or where the sensor sees its targets."""
     sensors = [name for name in cell.Y if any(pair.sensor == name for pair in cell.pairs)]
-    if options.sensor is not None:
-        if options.sensor not in sensors:
-            raise FrameError(
-                f"sensor={brief(options.sensor)} is none that sees a target; there are {', '.join(sensors)}"
-            )
-        sensors = [options.sensor]
+    strange = [name for name in options.wanted.sensors if name not in sensors]
+    if strange:
+        raise FrameError(f"{brief(strange[0])} is wanted, and none that sees a target; there are {', '.join(sensors)}")
+    sensors = list(options.wanted.sensors) or sensors
     distances = []
     for name in sensors:
         A = cell.measured if len(cell.measured) else present_pose(cell, options)[None]
         places = [predicted(cell, pair, A)[:, :3, 3] for pair in cell.pairs if pair.sensor == name]
         usual = float(np.median(np.linalg.norm(np.concatenate(places), axis=1))) if places else USUAL_M
-        distances.append(options.point_m or usual)
-    return Task.of(cell, sensors, distances, options.level)
+        distances.append(options.wanted.distance_m or usual)
+    return Task.of(cell, sensors, distances, options.wanted.level)
 
 
 def _first(cell: Cell, options: PlanOptions) -> tuple[Candidates | None, Array]:
@@ -294,7 +292,8 @@ def _outlook(
         freedom += (ranking.degrees_of_freedom - freedom) * measurements / count if np.isfinite(freedom) else 0.0
         return task.radius_mm(cell, np.linalg.inv(cell.known + rough + measurements / count * added), freedom)[0]
 
-    wanted, needed, free = options.wanted_mm, None, free_frames(cell, np.linalg.inv(ranking.information))
+    wanted = 1e3 * options.wanted.radius_m if np.isfinite(options.wanted.radius_m) else None
+    needed, free = None, free_frames(cell, np.linalg.inv(ranking.information))
     least = after(ENDLESS) if number else now
     floor = max(1e3 * ball_radius(np.maximum(of, 0.0), task.level) for of in task.variances(cell.floor))
     if not number:
@@ -318,4 +317,4 @@ def _outlook(
             needed = high
         reason = Reason.TOO_MANY if needed is None else Reason.ENOUGH
     distance = task.distances_m[task.sensors.index(sensor)]
-    return Outlook(reason, sensor, distance, options.level, wanted, now, planned, least, needed, free)
+    return Outlook(reason, sensor, distance, task.level, wanted, now, planned, least, needed, free)

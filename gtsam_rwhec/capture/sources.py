@@ -6,9 +6,10 @@ import asyncio
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -20,6 +21,7 @@ from gtsam_rwhec.logs.foxglove_messages import Decoder, decoder_for
 from gtsam_rwhec.logs.mcap_file import Block, GrowingFile, McapFile
 from gtsam_rwhec.logs.mcap_index import MAGIC
 from gtsam_rwhec.logs.mcap_reader import open_log
+from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import TF_TOPICS, TRANSFORM_SCHEMAS, Record
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.topics_of_rig import check_topics, named_topics, wanted_topics
@@ -61,6 +63,8 @@ class Source(ABC):
     is_at_rest = False
     #: Whether it has an end, as a log has that is replayed.
     is_finite = False
+    #: Whether keys that are pressed at the terminal are commands; else standard input is the source's.
+    reads_keys = True
 
     def __init__(self, name: str, rig: Rig) -> None:
         self.name, self.rig = name, rig
@@ -130,6 +134,16 @@ def messages_of_block(file: McapFile, block: Block) -> Iterator[Message]:
         if channel is not None:
             data = bytes(found.data[found.start[i] : found.end[i]])
             yield Message(channel, file.schemas.get(channel.schema_id), int(found.heads["log_time"][i]), data)
+
+
+def written_messages(write: Callable[[LogWriter], None]) -> list[Message]:
+    """What somebody writes to a log, as its messages."""
+    with TemporaryDirectory() as temporary:
+        path = Path(temporary) / "instant.mcap"
+        with LogWriter(path) as out:
+            write(out)
+        with open_log(path) as log:
+            return [message for block in log.files[0].blocks for message in messages_of_block(log.files[0], block)]
 
 
 class ReplayedLog(Source):

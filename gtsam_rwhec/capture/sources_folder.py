@@ -7,13 +7,11 @@ import time
 import warnings
 from collections.abc import AsyncIterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from gtsam_rwhec.capture.sources import POLL_S, Message, Source, messages_of_block
+from gtsam_rwhec.capture.sources import POLL_S, Message, Source, written_messages
 from gtsam_rwhec.errors import FileFormatError, LogError, LogWarning
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, images_in, match, read_poses
-from gtsam_rwhec.logs.mcap_reader import open_log
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.pose_tables import stem_of
 from gtsam_rwhec.logs.records import Array
@@ -84,20 +82,19 @@ class FolderSource(Source):
 
     def _as_messages(self, stamp: int, images: list[tuple[str, Path, Array]]) -> list[Message]:
         parent, child = self.rig.carriers.poses.parent_and_child
-        with TemporaryDirectory() as temporary:
-            path = Path(temporary) / "instant.mcap"
-            with LogWriter(path) as out:
-                out.transforms("/tf", stamp, [(parent, child, images[0][2])])
-                for name, file, _ in images:
-                    try:
-                        data = read_whole(file, LARGEST_IMAGE, "An image was")
-                    except FileFormatError as error:
-                        self.say("images that cannot be read", str(error))
-                        data = b""
-                    topic, encoding = str(self.rig.sensors[name].images), FORMATS[file.suffix.lower()]
-                    out.compressed_image(topic, stamp, self.rig.frame_of(name), encoding, data)
-            with open_log(path) as log:
-                return [message for block in log.files[0].blocks for message in messages_of_block(log.files[0], block)]
+
+        def write(out: LogWriter) -> None:
+            out.transforms("/tf", stamp, [(parent, child, images[0][2])])
+            for name, file, _ in images:
+                try:
+                    data = read_whole(file, LARGEST_IMAGE, "An image was")
+                except FileFormatError as error:
+                    self.say("images that cannot be read", str(error))
+                    data = b""
+                topic, encoding = str(self.rig.sensors[name].images), FORMATS[file.suffix.lower()]
+                out.compressed_image(topic, stamp, self.rig.frame_of(name), encoding, data)
+
+        return written_messages(write)
 
 
 def _is_settled(file: Path) -> bool:

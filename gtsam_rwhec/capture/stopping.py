@@ -39,13 +39,14 @@ import numpy as np
 from scipy.special import chdtr, fdtri, gammaln
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
-from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, ball_radius, checked_level, jacobian_of_point
+from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, ball_radius, jacobian_of_point
 from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.capture.accuracy import Accuracy
 from gtsam_rwhec.capture.stream_update import StreamUpdate
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
+from gtsam_rwhec.geometry.real_numbers import is_whole
 
 #: With fewer degrees of freedom the rule does not stop: F quantiles are large there, and models of noise undecided.
 FEWEST_FREEDOM = 12
@@ -59,29 +60,6 @@ SEED = 20_260_101
 WRONGLY_NEVER = 0.05
 #: The mixture's a: the bound is tightest at about twice as many degrees of freedom.
 MIXTURE = 4.0
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """What is wanted: a point in front of a sensor is within ``radius_m`` of its true place on the sensor's carrier.
-
-    The point is ``distance_m`` along z of each sensor, or of those in ``sensors``; with probability ``level``.
-    """
-
-    radius_m: float
-    distance_m: float
-    level: float = 0.95
-    sensors: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("radius_m", "distance_m"):
-            value = getattr(self, name)
-            if not (is_real(value) and 0.0 < value < 1e6):
-                raise OptionError(f"Accuracy.{name}={brief(value)}; give a positive number, metres")
-        checked_level(self.level)
-
-    def __str__(self) -> str:
-        return f"{rounded(1e3 * self.radius_m)} mm at {rounded(self.distance_m)} m with {100 * self.level:g} %"
 
 
 class Why(StrEnum):
@@ -144,11 +122,12 @@ class StoppingRule:
     """
 
     def __init__(self, wanted: Accuracy, *, most_takes: int = 100, accepts_care: bool = False) -> None:
-        if not isinstance(wanted, Accuracy):
-            raise OptionError(f"wanted is a {type(wanted).__name__}; give a gtsam_rwhec.Accuracy")
+        if not isinstance(wanted, Accuracy) or math.isinf(wanted.radius_m):
+            raise OptionError(f"wanted is {brief(wanted)}; give a gtsam_rwhec.Accuracy with a radius and a distance")
         if not is_whole(most_takes, 1) or not isinstance(accepts_care, bool):
             raise OptionError(f"most_takes={brief(most_takes)} is a whole number from 1, accepts_care True or False")
         self.wanted, self.most_takes, self.accepts_care = wanted, most_takes, accepts_care
+        self._place = wanted.place_m
         self._takes = 0
         self._first_freedom: float | None = None  #: at the first look that may stop
 
@@ -186,8 +165,7 @@ class StoppingRule:
             raise FrameError(
                 f"{brief(strange[0])} is wanted, but no sensor of this answer; there are {', '.join(refined.Y)}"
             )
-        place = [0.0, 0.0, self.wanted.distance_m]
-        points = {name: answer.uncertainty_at(place, name, level=self.wanted.level) for name in names}
+        points = {name: answer.uncertainty_at(self._place, name, level=self.wanted.level) for name in names}
         if not np.isfinite([point.radius_mm for point in points.values()]).all():
             return self._without(Why.FREE_DIRECTION)
         if self._first_freedom is None and nu >= FEWEST_FREEDOM:
@@ -195,7 +173,7 @@ class StoppingRule:
         factor = widening(int(min(self._first_freedom or FEWEST_FREEDOM, 10_000)), self.wanted.level)
         widened = {name: _widened(point, factor) for name, point in points.items()}
         worst = max(widened, key=lambda name: widened[name].radius_mm)
-        constant, is_sure = _constant_of(answer, worst, place)
+        constant, is_sure = _constant_of(answer, worst, self._place)
         decision = StopDecision(False, Why.MORE_TAKES, self.wanted, self._takes, widened, factor, None)
         wanted = self.wanted.radius_m
         if nu >= FEWEST_FREEDOM and decision.reached_m <= wanted:

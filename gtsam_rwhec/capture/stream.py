@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -19,12 +20,13 @@ from gtsam_rwhec.capture.stream_answer import NoiseShown, PartAnswer, answered, 
 from gtsam_rwhec.capture.stream_store import STATED, Store
 from gtsam_rwhec.capture.stream_update import StreamUpdate, poses_of
 from gtsam_rwhec.errors import OptionError, RwhecError, ScaleError, UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.admission import DOF, inlier_threshold, rejected_share
 from gtsam_rwhec.fitting.fit_options import check_choices
-from gtsam_rwhec.fitting.robust_solution import SPARE, TruncatedLeastSquares
+from gtsam_rwhec.fitting.robust_solution import SPARE, Steps, TruncatedLeastSquares
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, rows_of, slots_of
+from gtsam_rwhec.fitting.weighted_fit import WeightedFit
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
@@ -46,8 +48,9 @@ STEP = 1.25
 BACK = 0.8
 #: All measurements are judged again when their number has grown by this share since, so that each costs the same.
 JUDGED_AGAIN = 1.0 / 64.0
-#: Outliers are looked for without regard to the last answer at so many measurements, and whenever these doubled.
-FIRST_SEARCH = 8
+#: Outliers are looked for without regard to the last answer at so many measurements, and whenever these doubled. It
+#: takes some dozens of fits: an update makes one, or more where frames, and so many measurements, are together fewer.
+FIRST_SEARCH, SLICE, AS_A_FRAME = 8, 32, 256
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ class Stream:
         self._parts: dict[tuple[str, ...], PartAnswer | str] = {}
         self._rotations: dict[str, Array] = {}
         self._judged_at = self._searched_at = 0
+        #: A search that is under way, and the numbers of the measurements in it, in the order of its problem.
+        self._search: tuple[Steps[tuple[WeightedFit, np.ndarray]], np.ndarray] | None = None
         self._removed, self._is_settled = 0, True
         self._last = self._updated(None, time.perf_counter(), np.empty(0))
 
@@ -202,8 +207,9 @@ class Stream:
         if store.choose_gauge():
             changed |= set(store.pairs)
         self._answer(changed)
-        changed = self._judge_again()
-        if self._weights_follow():
+        reweighted = self._weights_follow()
+        changed = self._judge_again(search=not reweighted)
+        if reweighted:
             changed = set(store.pairs)
         self._is_settled = not changed  # else the next update judges at once
         if changed:
@@ -216,6 +222,7 @@ class Stream:
     def _updated(self, number: int | None, start: float, differ: np.ndarray) -> StreamUpdate:
         store, answers = self._store, self._answers
         rows, knowledge = store.rows, store.knowledge
+        is_estimated = self.options.noise == "estimate" and len(rows) > 0
         X, Y, scales = poses_of(answers, knowledge)
         scale: float | dict[str, float] = 1.0
         if knowledge.scale == "shared":
@@ -236,7 +243,7 @@ class Stream:
             noise_factors=self._weights,
             left_out=tuple(differ["number"][~differ["counts"]].tolist()) if len(differ) else (),
             taken_back=tuple(differ["number"][differ["counts"]].tolist()) if len(differ) else (),
-            is_settled=self._is_settled,
+            is_settled=self._is_settled and self._search is None,
             seconds=time.perf_counter() - start,
             _out=store.left_out(),
             _pairs=tuple(store.pairs),
@@ -245,6 +252,8 @@ class Stream:
             _noise=self._noise,
             _carriers=Carriers(knowledge.sensor_carrier, knowledge.target_carrier),
             _scale_mode=knowledge.scale,
+            _counting=partial(store.as_now().problem, np.flatnonzero(rows["counts"])) if is_estimated else None,
+            _is_whole=store.is_whole,
         )
 
     def _answer(self, changed: set[Pair]) -> None:
@@ -341,15 +350,23 @@ class Stream:
         own: Array = self._store.measurements(places).covariance_of_B() * deviation[:, None] * deviation
         return own
 
-    def _judge_again(self) -> set[Pair]:
-        """Judge all measurements by the answer, if it is time to; the pairs of which some verdicts changed."""
+    def _judge_again(self, *, search: bool) -> set[Pair]:
+        """Judge all measurements by the answer, if it is time to; the pairs of which some verdicts changed.
+
+        A search that is under way goes on if ``search``.
+        """
         store, now = self._store, len(self._store.rows)
         if not self._can_judge or not now:
             return set()
-        counts = None
         if self.options.keep == "measurements" and now >= max(FIRST_SEARCH, 2 * self._searched_at):
             self._searched_at = now
-            counts = self._searched()
+            order = np.concatenate([places for _, places in store.sorted_rows()])
+            work = TruncatedLeastSquares(store.problem(), self.options.inlier_confidence)
+            self._search = work.run(self.options.noise), store.rows["number"][order]
+            self._judged_at = 0  # all are judged once it has ended
+        counts = self._searched_on() if self._search is not None and search else None
+        if self._search is not None:
+            return set()
         if counts is None:
             if self._is_settled and self._judged_at <= now < self._judged_at * (1.0 + JUDGED_AGAIN):
                 return set()
@@ -379,13 +396,24 @@ class Stream:
         counts[known] = square <= self._threshold(store.number) * np.where(own["counts"], 1.0, BACK)
         return counts
 
-    def _searched(self) -> np.ndarray | None:
-        """Which rows agree by a search without regard to the last answer; None where it finds no answer."""
-        work = TruncatedLeastSquares(self._store.problem(), self.options.inlier_confidence, silent)
+    def _searched_on(self) -> np.ndarray | None:
+        """Which rows agree, once a search without regard to the last answer has ended; None on its way.
+
+        What came since it began keeps its verdict: it is judged by the new answer next.
+        """
+        assert self._search is not None
+        (steps, numbers), rows = self._search, self._store.rows
+        work = 1 + len(self._rotations) + len(numbers) // AS_A_FRAME
         try:
-            _, keep = work.run("given" if self.options.noise == "given" else "estimate")
+            for _ in range(max(1, SLICE // work)):
+                next(steps)
+        except StopIteration as end:
+            self._search = None
+            counts = rows["counts"].copy()
+            place = np.minimum(np.searchsorted(rows["number"], numbers), len(rows) - 1)
+            there = rows["number"][place] == numbers  # others were removed
+            counts[place[there]] = end.value[1][there]
+            return counts
         except (RwhecError, np.linalg.LinAlgError):  # too few agree: the verdicts so far stay
-            return None
-        counts = np.ones(len(self._store.rows), dtype=bool)
-        counts[np.concatenate([places for _, places in self._store.sorted_rows()])] = keep
-        return counts
+            self._search = None
+        return None

@@ -99,7 +99,7 @@ class Store:
     def choose_gauge(self) -> bool:
         """Choose the reference points of the sums anew where it is time to, and sum everything again."""
         size = self._size
-        if not size or self._folded.count.any() or GAUGE_AGAIN ** round(np.log(size) / np.log(GAUGE_AGAIN)) != size:
+        if not size or not self.is_whole or GAUGE_AGAIN ** round(np.log(size) / np.log(GAUGE_AGAIN)) != size:
             return False
         counting = self.rows[self.rows["counts"]]
         if len(counting):
@@ -112,6 +112,7 @@ class Store:
     def forget(self, place: int) -> None:
         """Take a row out as if it had never come."""
         e = int(self.rows["pair"][place])
+        self._rows = self._rows.copy()  # what `as_now` gave stays
         self._rows[place : self._size - 1] = self._rows[place + 1 : self._size]
         self._size -= 1
         self._sum_again(np.array([e]))
@@ -126,7 +127,7 @@ class Store:
             if len(counting):
                 self._folded.add_to(np.array([e]), self._summed(self.pairs[e], self.measurements(counting)))
         self._size -= self.window
-        self._rows[: self._size] = self._rows[self.window : self.window + self._size].copy()
+        self._rows = np.roll(self._rows, -self.window)  # anew: what `as_now` gave stays
 
     # -- what it holds --------------------------------------------------------------------------------------------
 
@@ -143,6 +144,11 @@ class Store:
     def count(self) -> int:
         """How many measurements count."""
         return int(self._sums.count.sum())
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all that counts is kept."""
+        return not self._folded.count.any()
 
     @property
     def is_relative(self) -> bool:
@@ -174,22 +180,33 @@ class Store:
         )
         return of_moments(self.knowledge, [self.pairs[e] for e in there], weighed, self._gauge)
 
-    def sorted_rows(self) -> list[tuple[Pair, np.ndarray]]:
-        """By pair, in the order of names: the places of its rows by stamp, or by arrival where there are no stamps."""
+    def as_now(self) -> Store:
+        """What is kept now, to be read: poses are shared, and what comes later does not change it."""
+        now = copy.copy(self)
+        now._rows, now.pairs = self.rows, list(self.pairs)
+        return now
+
+    def sorted_rows(self, places: np.ndarray | None = None) -> list[tuple[Pair, np.ndarray]]:
+        """By pair, in the order of names: the places of its rows by stamp, or by arrival where there are no stamps.
+
+        All of them, or those among some ``places``.
+        """
         if not self._size:
             return []
         order = np.lexsort((self.rows["number"], self.rows["stamp_ns"]))
+        if places is not None:
+            order = order[np.isin(order, places)]
         of_order = self.rows["pair"][order]
         pairs = sorted(enumerate(self.pairs), key=lambda item: [natural_key(name) for name in item[1]])
         by_pair = ((pair, order[of_order == e]) for e, pair in pairs)
         return [(pair, places) for pair, places in by_pair if len(places)]
 
-    def problem(self) -> Problem:
-        """A problem of all rows, also of those that do not count: the same in whatever order they came."""
+    def problem(self, places: np.ndarray | None = None) -> Problem:
+        """A problem of all rows, also of those that do not count, or of some: the same in whatever order they came."""
         stated = self._stated or frozenset()
         result = copy.deepcopy(self.knowledge)  # which has no measurements
-        for pair, places in self.sorted_rows():
-            raw = self.measurements(places)
+        for pair, own in self.sorted_rows(places):
+            raw = self.measurements(own)
             add = partial(result.add_motion, pair.sensor) if pair.is_motion else partial(result.add, *pair)
             add(raw.A, raw.B, **{name: getattr(raw, name) for name in stated})
         return result

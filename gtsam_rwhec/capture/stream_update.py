@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, PointUncertainty, point_uncertainty
 from gtsam_rwhec.capture.stream_answer import NoiseShown, PartAnswer
+from gtsam_rwhec.capture.stream_noise import larger_by, under_shared_noise
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.refined import PairNoise, RefinedPoses
@@ -75,6 +76,9 @@ class StreamUpdate:
     _noise: NoiseShown | None
     _carriers: Carriers
     _scale_mode: ScaleMode
+    #: Makes a problem of the measurements that are kept and count, where their noise is estimated; whether they are all
+    _counting: Callable[[], Problem] | None
+    _is_whole: bool
 
     @property
     def is_unique(self) -> bool:
@@ -97,12 +101,20 @@ class StreamUpdate:
         """The poses with their joint covariance, computed when asked for; None while the noise is not known.
 
         The covariance is that of the certified answer under the noise that its residuals show (or that was stated, with
-        ``noise="given"``), one factor for all rotations and one for all translations: errors of measurements count as
-        independent, also of those at one stamp, which share the error of A. ``Stream.calibrate`` asks for that noise
-        too, for drift, and for errors of the configuration.
+        ``noise="given"``), one factor for all rotations and one for all translations. Where measurements share a pose
+        of the carriers, they share its error: then these are the best poses under noise of A and of B, as ``calibrate``
+        finds it. With ``keep="moments"`` variances are larger by the factor that measurements show which are kept.
+        ``Stream.calibrate`` also asks for drift and for errors of the configuration.
         """
         if self._noise is None or not self._parts:
             return None
+        larger = 1.0
+        if self._counting is not None and self.is_unique:
+            kept = self._counting()
+            shared = under_shared_noise(kept)
+            if shared is not None and self._is_whole:
+                return shared
+            larger = 1.0 if shared is None else larger_by(shared, kept)
         noise = np.array(self._noise.factors)
         f = noise / np.array(self.noise_factors)
         of_pairs: dict[Pair, PairNoise] = {}
@@ -113,7 +125,7 @@ class StreamUpdate:
                 of_pairs[pair] = PairNoise(r, t, self._noise.degrees_of_freedom)
         joint = JointCovariance(
             slots_of(unknown for p in self._parts for unknown in p.unknowns),
-            block_diag(*(p.covariance(f) for p in self._parts)),
+            larger * block_diag(*(p.covariance(f) for p in self._parts)),
             block_diag(*(p.free for p in self._parts)),
             np.concatenate([p.unit for p in self._parts]),
         )

@@ -19,8 +19,8 @@ def live(
     source: Annotated[
         str,
         typer.Argument(
-            help="ws://HOST:8765 (foxglove_bridge), an MCAP file that a recorder writes, one to replay, or a folder "
-            "that images and poses fall into."
+            help="ws://HOST:8765 (foxglove_bridge), an MCAP file that a recorder writes, one to replay, a folder "
+            "that images and poses fall into, or camera:0, a camera of this machine beside --poses."
         ),
     ],
     rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).")],
@@ -40,6 +40,10 @@ def live(
     when_still: Annotated[
         bool, typer.Option("--when-still", help="Take by itself wherever the robot stands still at a new pose.")
     ] = False,
+    poses: Annotated[
+        str,
+        typer.Option(help="Beside camera:0: a file that poses are written to, a line each; -: they are typed here."),
+    ] = "-",
     publish: Annotated[str, typer.Option(help="Topic on which the next pose is proposed, with ws://... only.")] = "",
     host: Annotated[str, typer.Option(help="Address of this machine on which the page is served.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page.", show_default="a free one")] = 0,
@@ -54,7 +58,7 @@ def live(
     described = rw.rig.read_rig(rig)
     wanted = None if wanted_mm is None else rw.Accuracy(1e-3 * wanted_mm, at_m)
     options = rw.capture.LiveOptions(wanted=wanted, takes_when_still=when_still, publish=publish)
-    session = rw.capture.Session(rw.capture.source_of(source, described, speed), described, output, options)
+    session = rw.capture.Session(rw.capture.source_of(source, described, speed, poses), described, output, options)
     server = None if terminal else rw.capture.PageServer(session, host, port)
     if server is not None:
         say(f"The page: {server.address}", to_errors=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -92,8 +93,10 @@ def plan(
         arm = rw.capture.Arm.read(
             urdf, base_link or fixed, tip_link or moving, None if joints is None else _numbers(joints)
         )
+    radius_m = math.inf if wanted_mm is None else 1e-3 * wanted_mm
+    wanted = rw.Accuracy(radius_m, point_m, sensors=() if sensor is None else (sensor,))
     options = rw.PlanOptions(
-        poses=poses, wanted_mm=wanted_mm, point_m=point_m, sensor=sensor, near_m=near_m, far_m=far_m, tilt_deg=tilt_deg,
+        poses=poses, wanted=wanted, near_m=near_m, far_m=far_m, tilt_deg=tilt_deg,
         turn_deg=turn_deg, box_m=None if box is None else (box[:3], box[3:]), present=now, arm=arm,
         moves="sensors" if sensors_move else "targets",
     )  # fmt: skip

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from rwhec_factors.batch import BatchResiduals
+from rwhec_factors.batch import BatchResiduals, Placed, linearized_together
 from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.fitting.weighted_fit import Measured, WeightedFit
@@ -118,14 +118,15 @@ def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple
     owners = [name for name in owners if name not in problem.fixed_scales]
     shared = problem.scale == "shared"
     scales = {name: DOF * len(free) + (0 if shared else i) for i, name in enumerate(owners)}
-    pairs = []
+    placed = {}
     for pair, rows in zip(measured.pairs, measured.rows, strict=True):
         alpha = fit.alpha.get(pair.target, np.nan)
-        if pair.target not in fit.poses or pair.sensor not in fit.poses or not (np.isfinite(alpha) and alpha > 0.0):
-            continue
-        at = BatchResiduals(measured.A[rows], measured.B[rows]).linearize(
-            fit.poses[pair.target], fit.poses[pair.sensor], alpha
-        )
+        if pair.target in fit.poses and pair.sensor in fit.poses and np.isfinite(alpha) and alpha > 0.0:
+            batch = BatchResiduals(measured.A[rows], measured.B[rows])
+            placed[pair] = rows, Placed(batch, fit.poses[pair.target], fit.poses[pair.sensor], alpha)
+    together = linearized_together([place for _, place in placed.values()])
+    pairs = []
+    for (pair, (rows, _)), at in zip(placed.items(), together, strict=True):
         blocks: dict[int, Array] = {}
         for name, J in ((pair.target, at.target), (pair.sensor, at.sensor)):  # of a motion one frame is both
             if name in first:

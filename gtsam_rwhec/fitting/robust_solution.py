@@ -20,10 +20,10 @@ Every stage has a bound on its number of fits, so that no measurements make it r
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Generator
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from scipy.special import chdtr, chdtri
@@ -42,6 +42,9 @@ from gtsam_rwhec.solver.solution import Solution, solve
 NoiseScale = Literal["given", "estimate"]
 #: By pair, (N,) booleans: which measurements count.
 Inliers = dict[Pair, np.ndarray]
+Found = TypeVar("Found")
+#: A stage, fit by fit: it yields what it has done, in words, and returns what it found.
+Steps = Generator[str, None, Found]
 
 #: Mu grows by this factor in an iteration (the paper's value).
 GRADUATION = 1.4
@@ -118,9 +121,9 @@ def robust_solution(
         that agree, and the other poses do not use the rejected ones.
     """
     tell = progress or silent
-    work = TruncatedLeastSquares(problem, confidence, tell)
+    work = TruncatedLeastSquares(problem, confidence)
     try:
-        _, keep = work.run(noise_scale)
+        _, keep = done(work.run(noise_scale), tell)
         tell("certifying the inliers' solution")
         inliers = work.measured.by_pair(keep)
         weights = {pair: mask.astype(np.float64) for pair, mask in inliers.items()}
@@ -184,11 +187,13 @@ def _doubts(work: TruncatedLeastSquares, inliers: Inliers, noise_scale: NoiseSca
 
 @dataclass
 class TruncatedLeastSquares:
-    """The stages of the minimisation and their common state: ``factors`` and ``threshold`` (c^2) change on the way."""
+    """The stages of the minimisation and their common state: ``factors`` and ``threshold`` (c^2) change on the way.
+
+    Each stage goes on fit by fit, so that who has little time may do some now and the others later.
+    """
 
     problem: Problem
     confidence: float
-    tell: Progress
     factors: VarianceFactors = AS_STATED
 
     def __post_init__(self) -> None:
@@ -201,23 +206,25 @@ class TruncatedLeastSquares:
             QUIETEST**2 / float(np.median(self.measured.sigma)) ** 2,
         )
 
-    def run(self, noise_scale: NoiseScale) -> tuple[WeightedFit, np.ndarray]:
+    def run(self, noise_scale: NoiseScale) -> Steps[tuple[WeightedFit, np.ndarray]]:
         """The best answer and its inliers (N,)."""
-        self.tell("rejecting outliers: the fit to all measurements")
+        yield "rejecting outliers: the fit to all measurements"
         everyone = np.ones(len(self.measured.A), dtype=bool)
         everything = self.fit(everyone, None)
         self.searches = noise_scale == "given" or self.spare_equations >= SPARE
         if not self.searches or self.is_clean(everything, everyone, noise_scale):
             return everything, everyone
         if not everything.has_positive_scales and self.problem.scale == "per_target":
-            everything = with_scales_of_targets_alone(self.problem, self.confidence, noise_scale, self.tell)
+            everything = yield from with_scales_of_targets_alone(self.problem, self.confidence, noise_scale)
         if noise_scale == "given":
-            fit, _ = self.best([partial(self.graduate, everything)])
+            fit, _ = yield from self.best(everything)
             self.threshold = inlier_threshold(self.confidence, len(everyone))
-            return self.settle(fit)
-        fit, _ = self.settle(self.trim(everything), estimates=True)
-        fit, _ = self.best([partial(self.graduate, everything), lambda: fit])
-        return self.admit(*self.settle(fit, estimates=True))
+            return (yield from self.settle(fit))
+        trimmed = yield from self.trim(everything)
+        fit, _ = yield from self.settle(trimmed, estimates=True)
+        fit, _ = yield from self.best(everything, fit)
+        fit, keep = yield from self.settle(fit, estimates=True)
+        return (yield from self.admit(fit, keep))
 
     @property
     def free_frames(self) -> list[str]:
@@ -249,7 +256,7 @@ class TruncatedLeastSquares:
         self.threshold = inlier_threshold(self.confidence, count)
         return True
 
-    def admit(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
+    def admit(self, fit: WeightedFit, keep: np.ndarray) -> Steps[tuple[WeightedFit, np.ndarray]]:
         """Judge every measurement anew, under the noise by axis that the inliers show, until the inliers stay.
 
         The noise is that of the inliers of graduation throughout. If it followed the admitted ones, heavy tails would
@@ -259,6 +266,7 @@ class TruncatedLeastSquares:
         self.threshold = inlier_threshold(self.confidence, len(keep))
         for step in range(1, MAX_ADMISSIONS + 1):
             agrees = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first)
+            yield f"rejecting outliers: judging anew, step {step} of at most {MAX_ADMISSIONS}"
             if (agrees == keep).all():
                 break
             try:
@@ -266,22 +274,27 @@ class TruncatedLeastSquares:
             except (UnderdeterminedError, CountError):
                 break
             keep = agrees
-            self.say("admitting", step, MAX_ADMISSIONS, self.distances(fit))
+            yield self.words("admitting", step, MAX_ADMISSIONS, self.distances(fit))
         self.factors = self._from_inliers(self.measured.squares(fit), keep)
         return fit, keep
 
-    def best(self, starts: list[Callable[[], WeightedFit]]) -> tuple[WeightedFit, np.ndarray]:
-        """The best fit of all starts, each settled to weights of 0 and 1; a start with too few inliers is left out."""
-        ends: list[tuple[WeightedFit, np.ndarray]] = []
-        for number, start in enumerate(starts, 1):
-            try:
-                ends.append(self.settle(start()))
-            except (UnderdeterminedError, CountError):
-                if number == len(starts) and not ends:
-                    raise
-        return self.vote(*min(ends, key=lambda end: self.truncated(self.distances(end[0]))))
+    def best(self, everything: WeightedFit, *known: WeightedFit) -> Steps[tuple[WeightedFit, np.ndarray]]:
+        """The best fit by graduation from that to everything, and of those that are known.
 
-    def vote(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
+        Each is settled to weights of 0 and 1; one with too few inliers is left out.
+        """
+        ends: list[tuple[WeightedFit, np.ndarray]] = []
+        for number, start in enumerate((None, *known)):
+            try:
+                begun = start or (yield from self.graduate(everything))
+                ends.append((yield from self.settle(begun)))
+            except (UnderdeterminedError, CountError):
+                if number == len(known) and not ends:
+                    raise
+        best = min(ends, key=lambda end: self.truncated(self.distances(end[0])))
+        return (yield from self.vote(*best))
+
+    def vote(self, fit: WeightedFit, keep: np.ndarray) -> Steps[tuple[WeightedFit, np.ndarray]]:
         """Move frames with outliers to where more of their measurements agree, where this lowers the cost."""
         for _ in range(MAX_VOTES):
             least = self.truncated(self.distances(fit))
@@ -291,13 +304,13 @@ class TruncatedLeastSquares:
                 good, total = inlier_count(name, inliers)
                 if good >= VOTED * total:
                     continue
-                self.tell(f"rejecting outliers: the measurements of {name} vote, {good} of {total} agree")
+                yield f"rejecting outliers: the measurements of {name} vote, {good} of {total} agree"
                 moved, less = by_vote(name, self.problem, moved, self.factors, self.threshold)
                 saved += less
             if saved <= 0.0:
                 break
             try:
-                candidate, kept = self.settle(moved)
+                candidate, kept = yield from self.settle(moved)
             except (UnderdeterminedError, CountError):
                 break
             if self.truncated(self.distances(candidate)) >= least * (1.0 - PAYS):
@@ -325,12 +338,12 @@ class TruncatedLeastSquares:
         """sum min(d^2, c^2)."""
         return float(np.minimum(distances, self.threshold).sum())
 
-    def say(self, stage: str, step: int, most: int, distances: Array) -> None:
-        """Tell of a fit: its stage, its step, and how many measurements agree."""
+    def words(self, stage: str, step: int, most: int, distances: Array) -> str:
+        """Of a fit: its stage, its step, and how many measurements agree."""
         inliers = int((distances <= self.threshold).sum())
-        self.tell(f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree")
+        return f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree"
 
-    def graduate(self, fit: WeightedFit) -> WeightedFit:
+    def graduate(self, fit: WeightedFit) -> Steps[WeightedFit]:
         """From least squares to truncated least squares with growing mu (Remark 5 and eq. 14 of the paper)."""
         d = self.distances(fit)
         c2 = self.threshold
@@ -345,13 +358,13 @@ class TruncatedLeastSquares:
                 break
             fit = self.fit(w / w.max(), fit)  # all are small at first, and priors would dominate
             d = self.distances(fit)
-            self.say("graduating", step, MAX_GRADUATIONS, d)
+            yield self.words("graduating", step, MAX_GRADUATIONS, d)
             mu *= growth
             if mu > LAST_MU * growth or not ((w > 0.0) & (w < 1.0)).any():
                 break
         return fit
 
-    def trim(self, fit: WeightedFit) -> WeightedFit:
+    def trim(self, fit: WeightedFit) -> Steps[WeightedFit]:
         """Least trimmed squares: the better half of each pair under the median's noise, until it stays the same."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
         for step in range(1, MAX_FITS + 1):
@@ -367,10 +380,10 @@ class TruncatedLeastSquares:
                 break
             keep = half
             fit = self.fit(keep, fit)
-            self.say("trimming", step, MAX_FITS, self.distances(fit))
+            yield self.words("trimming", step, MAX_FITS, self.distances(fit))
         return fit
 
-    def settle(self, fit: WeightedFit, *, estimates: bool = False) -> tuple[WeightedFit, np.ndarray]:
+    def settle(self, fit: WeightedFit, *, estimates: bool = False) -> Steps[tuple[WeightedFit, np.ndarray]]:
         """Weights of 0 and 1 until they stay the same: a local minimum of the truncated cost."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
         for step in range(1, MAX_FITS + 1):
@@ -387,7 +400,7 @@ class TruncatedLeastSquares:
                 break
             keep = inliers
             fit = self.complete(self.fit(keep, fit))
-            self.say("settling", step, MAX_FITS, self.distances(fit))
+            yield self.words("settling", step, MAX_FITS, self.distances(fit))
         return fit, keep
 
     def _from_median(self, squares: Squares) -> VarianceFactors:
@@ -413,9 +426,7 @@ class TruncatedLeastSquares:
         return VarianceFactors(max(rotation, least.rotation), max(translation, least.translation))
 
 
-def with_scales_of_targets_alone(
-    problem: Problem, confidence: float, noise_scale: NoiseScale, tell: Progress
-) -> WeightedFit:
+def with_scales_of_targets_alone(problem: Problem, confidence: float, noise_scale: NoiseScale) -> Steps[WeightedFit]:
     """A start where outliers make a scale negative: each target alone gives its scale, then all are known.
 
     Outliers pull the scales of the inverse equation to zero and below (design fact 7), and there is no way back from
@@ -424,19 +435,29 @@ def with_scales_of_targets_alone(
     known = selected(problem, {})
     owners = [name for name in dict.fromkeys(pair.target for pair in problem.pairs) if name not in problem.fixed_scales]
     for number, name in enumerate(owners, 1):
-        tell(f"rejecting outliers: the scale of {name} alone, {number} of {len(owners)}")
+        yield f"rejecting outliers: the scale of {name} alone, {number} of {len(owners)}"
         alone = Problem("shared")
         for pair in problem.pairs:
             if pair.target == name:
                 raw = problem.measurements(*pair)
                 add = alone.add_motion if pair.is_motion else partial(alone.add, pair.target)
                 add(pair.sensor, raw.A, raw.B, raw.sigma, raw.kappa)
-        fit, _ = TruncatedLeastSquares(alone, confidence, silent).run(noise_scale)
+        fit, _ = done(TruncatedLeastSquares(alone, confidence).run(noise_scale), silent)
         if not fit.has_positive_scales:
             raise CountError(f"the measurements of {name} that agree with one another give it no positive scale")
         known.fix_scale(name, fit.alpha[name])
-    fit, _ = TruncatedLeastSquares(known, confidence, tell).run(noise_scale)
+    fit, _ = yield from TruncatedLeastSquares(known, confidence).run(noise_scale)
     return fit
+
+
+def done(steps: Steps[Found], tell: Progress) -> Found:
+    """What a stage finds, all its steps at once."""
+    while True:
+        try:
+            tell(next(steps))
+        except StopIteration as end:
+            found: Found = end.value
+            return found
 
 
 def truncated_weights(d2: Array, mu: float, c2: float) -> Array:

@@ -18,7 +18,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.cloud_detections import detect_in_clouds
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
-from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.kept_detections import KeptOfLog
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
@@ -120,11 +120,11 @@ def detected(
     sheet: str | Path | None = None,
     draw: str | Path | None = None,
     progress: Progress | None = None,
-    keep: Callable[[Mapping[str, Camera]], KeptDetections] | None = None,
+    keep: Callable[[Mapping[str, Camera]], KeptOfLog] | None = None,
 ) -> RunLog:
     """The log with the detections, as `detect_log` writes it.
 
-    `keep` is called with the cameras before anything is written. It returns the file that keeps the detections so far.
+    `keep` is called with the cameras before anything is written. It returns what keeps the detections so far.
     """
     tell = progress or silent
     check_topics(log, rig)

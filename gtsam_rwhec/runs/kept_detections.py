@@ -16,14 +16,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
-from gtsam_rwhec.detect.many_images import DetectedImage
+from gtsam_rwhec.detect.many_images import DetectedImage, Kept
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.whole_files import appending_stream, write_atomically
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
@@ -104,6 +104,24 @@ def _values(place: str, of: object) -> dict[str, str]:
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection, DetectionRecord)}
 #: Arrays may have these types.
 _DTYPES = ("<f8", "<f4", "<i8", "<i4")
+
+
+class KeptOfLog(Kept, Protocol):
+    """The detections of a log that are kept, in a file or in memory."""
+
+    @property
+    def done(self) -> int:
+        """How many images are kept, so that an unfinished run goes on."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether no image is missing."""
+
+    def all(self) -> Iterator[DetectedImage]:
+        """What was found in all images."""
+
+    def finish(self) -> None:
+        """Note that no image is missing."""
 
 
 class KeptDetections:

@@ -29,7 +29,7 @@ from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.results.log_history import DetectionReport, TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
-from gtsam_rwhec.runs.kept_detections import KeptDetections
+from gtsam_rwhec.runs.kept_detections import KeptOfLog
 from gtsam_rwhec.runs.measured_pairs import target_of
 from gtsam_rwhec.runs.run_log import IMAGES_METADATA, detections_topic, image_key
 
@@ -109,7 +109,7 @@ def detect_in_log(
     *,
     workers: int | None,
     progress: Progress,
-    kept: KeptDetections | None = None,
+    kept: KeptOfLog | None = None,
 ) -> dict[str, SensorDetections]:
     """The detections of every sensor that has images; those that `kept` has are not detected again.
 
@@ -134,7 +134,7 @@ def _detected(
     *,
     workers: int | None,
     progress: Progress,
-    kept: KeptDetections | None,
+    kept: KeptOfLog | None,
 ) -> Iterator[DetectedImage]:
     """The detections of every image, in any order. Stamps are checked while images are read."""
     if not sensor_of:

@@ -36,7 +36,7 @@ def test_a_calibration_predicts_with_its_own_covariance_and_noise() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         calibration = rw.calibrate(problem, rw.CalibrateOptions(observations="poses"))
-    plan = rw.plan(calibration, replace(true.options, present=None, candidates=60, wanted_mm=1e-3))
+    plan = rw.plan(calibration, replace(true.options, present=None, candidates=60, wanted=rw.Accuracy(1e-6, 0.8)))
     now = calibration.uncertainty_at([0.0, 0.0, 0.8], "cam_0").radius_mm
     assert plan.outlook.now_mm == pytest.approx(now, rel=1e-3)
     assert plan.poses[0].deviation_mm < now
@@ -66,7 +66,7 @@ def test_a_floor_of_constant_errors_is_the_reason_why_an_accuracy_is_never_reach
         refined=replace(calibration.refined, joint=replace(calibration.refined.joint, finite=finite)),
         noise=replace(calibration.noise, model=replace(model, constant_deviations=constant)),
     )
-    plan = rw.plan(worse, replace(true.options, present=None, candidates=60, wanted_mm=0.8))
+    plan = rw.plan(worse, replace(true.options, present=None, candidates=60, wanted=rw.Accuracy(8e-4, 0.8)))
     assert plan.outlook.reason is Reason.CONSTANT
     assert plan.outlook.needed is None
     assert plan.outlook.least_mm > 0.8
@@ -94,7 +94,11 @@ def test_nothing_but_a_camera_and_a_board() -> None:
     with pytest.raises(OptionError, match="nothing to plan with"):
         rw.plan(cameras={"cam": camera})
     with pytest.raises(FrameError, match="none that sees"):
-        rw.plan(cameras={"cam": camera}, boards={"board": board}, options=rw.PlanOptions(sensor="other"))
+        rw.plan(
+            cameras={"cam": camera},
+            boards={"board": board},
+            options=rw.PlanOptions(wanted=rw.Accuracy(sensors=("other",))),
+        )
     with pytest.raises(FrameError, match="guess"):
         rw.plan(cameras={"cam": camera}, boards={"board": board}, options=rw.PlanOptions(guesses={"other": np.eye(4)}))
     with pytest.raises(OptionError, match="give a Problem"):
@@ -104,8 +108,8 @@ def test_nothing_but_a_camera_and_a_board() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"poses": 0}, {"candidates": 10**6}, {"wanted_mm": -1.0}, {"tilt_deg": 100.0}, {"turn_deg": 190.0},
-        {"level": 1.0}, {"border": 0.6}, {"near_m": 1.0, "far_m": 0.5}, {"box_m": ((0, 0, 0), (1, 1, -1))},
+        {"poses": 0}, {"candidates": 10**6}, {"wanted": 0.5}, {"tilt_deg": 100.0}, {"turn_deg": 190.0},
+        {"border": 0.6}, {"near_m": 1.0, "far_m": 0.5}, {"box_m": ((0, 0, 0), (1, 1, -1))},
         {"moves": "both"},
     ],
 )  # fmt: skip
@@ -120,7 +124,7 @@ def test_what_is_never_reached_is_said_at_once() -> None:
     far = tuple((se3.inverse(true.present)[:3, 3] + 3.0).tolist())
     for given, reason in (
         ({"box_m": (far, tuple(x + 0.1 for x in far))}, Reason.NOT_WITHIN),
-        ({"wanted_mm": 1e-4}, Reason.TOO_MANY),
+        ({"wanted": rw.Accuracy(1e-7, 0.8)}, Reason.TOO_MANY),
     ):
         plan = rw.plan(None, replace(true.options, candidates=50, **given), **kit)
         assert plan.outlook.reason is reason

@@ -74,7 +74,7 @@ def test_what_the_log_lacks_is_said_before_it_is_replayed(tmp_path: Path) -> Non
     only_images = write(tmp_path / "other.mcap", [m for m in stations(1) if m.topic != "/tf"])
     with pytest.raises(LogError, match=r"no topic of transforms\. Topics there: /cam_0/tags"):
         source_of(str(only_images), rig())
-    with pytest.raises(LogError, match="is no source: give ws://HOST:PORT"):
+    with pytest.raises(LogError, match="is no source: give ws://HOST:PORT, camera:0"):
         source_of(str(tmp_path / "nothing"), rig())
 
 

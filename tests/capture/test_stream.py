@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rwhec_factors.se3 import expmap
 from streamed import One, add, farthest, ones_of, streamed
 
 import gtsam_rwhec as rw
@@ -19,6 +22,7 @@ from gtsam_rwhec.errors import (
     StampError,
     UnderdeterminedError,
 )
+from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.simulate import Noise, general
 
@@ -100,6 +104,52 @@ def test_covariances_are_those_of_a_refinement_of_the_same_measurements() -> Non
     assert 0.1 < point.radius_mm < 10.0
 
 
+def boards_at_once(seed: int, takes: int) -> tuple[list[One], np.ndarray]:
+    """Three boards that a camera sees at each pose of an arm whose noise is larger than the camera's; the camera."""
+    simulation = general(3, 1, seed=seed, number_of_measurements=takes)
+    rng = np.random.default_rng(seed)
+    first = simulation.problem.measurements("target0", "sensor0").A
+    Y, every = simulation.Y["sensor0"], []
+    for stamp, A in enumerate(first):
+        measured = expmap(rng.normal(0.0, [2e-4] * 3 + [5e-4] * 3, (1, 6)))[0] @ A
+        for target, X in simulation.X.items():
+            B = np.linalg.inv(Y) @ A @ X @ expmap(rng.normal(0.0, [3e-4] * 3 + [1e-4] * 3, (1, 6)))[0]
+            every.append(One(target, "sensor0", measured, B, stamp, 1.0, 1.0))
+    return every, Y
+
+
+def test_measurements_of_one_stamp_share_the_arms_error() -> None:
+    squares, alones = [], []
+    for seed in range(24):
+        every, Y = boards_at_once(seed, 6)
+        update = streamed(every, robust=False).last
+        e = error_of(update.refined.Y["sensor0"], Y)
+        covariance = update.refined.covariance("sensor0")
+        squares.append(e @ np.linalg.solve(covariance, e) / update.refined.squared_radius(6))
+        alone = replace(update, _counting=None).refined
+        alones.append(e @ np.linalg.solve(alone.covariance("sensor0"), e) / alone.squared_radius(6))
+    assert np.sum(np.array(squares) <= 1.0) >= 21  # fewer by chance in 1 of 35 where 95 % is true
+    assert np.sum(np.array(alones) <= 1.0) < 18  # as if errors were independent
+
+
+def test_what_is_shared_widens_moments_too() -> None:
+    every, _ = boards_at_once(3, 40)
+    kept, flat = (
+        streamed(every, robust=False, keep=keep, window=64).last.refined for keep in ("measurements", "moments")
+    )
+    ratio = np.trace(flat.covariance("sensor0")) / np.trace(kept.covariance("sensor0"))
+    assert 0.7 < ratio < 3.0
+
+
+def test_an_update_stays_as_it_was() -> None:
+    every, _ = boards_at_once(4, 8)
+    stream, twin = (streamed(every[:20], robust=False) for _ in range(2))
+    before = stream.last
+    add(stream, every[20])
+    stream.remove(3)
+    np.testing.assert_array_equal(before.refined.covariance(), twin.last.refined.covariance())
+
+
 def test_covariances_that_are_stated_are_kept_and_judged_by() -> None:
     every = ones(12, 10)
     stated = np.diag([0.003, 0.003, 0.003, 0.001, 0.001, 0.003]) ** 2
@@ -127,6 +177,23 @@ def test_late_verdicts_take_early_ones_back() -> None:
     assert {outlier.number for outlier in stream.last.outliers} == bad
     assert all(outlier.deviations > 4.0 and outlier.judged_at <= 60 for outlier in stream.last.outliers)
     assert stream.last.is_settled
+
+
+def test_a_search_goes_on_over_updates_and_over_a_removal() -> None:
+    every = ones_of(general(3, 3, seed=13, number_of_measurements=12, noise=NOISE).problem)
+    order = np.random.default_rng(0).permutation(len(every)).tolist()
+    wrong = set(range(0, 50, 3))
+    stream, settled = rw.Stream(), []
+    for k, i in enumerate(order):
+        update = add(stream, every[i].off_by([0.0, 0.3, 0.0, 0.1, 0.0, 0.0]) if k in wrong else every[i])
+        settled.append(update.is_settled)
+        if k == 64:  # of the search that began at 64
+            stream.remove(39)
+    assert not any(settled[63:67])
+    assert settled[-1]
+    left_out = {outlier.number for outlier in stream.last.outliers}
+    assert wrong - {39} <= left_out
+    assert len(left_out) <= len(wrong) + 1
 
 
 def test_a_wrong_measurement_is_left_out_when_it_comes_and_the_answer_stays() -> None:
