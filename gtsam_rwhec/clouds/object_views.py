@@ -30,8 +30,6 @@ from gtsam_rwhec.solver.solution import solve
 
 #: Fewer views leave the sensor's pose on its carrier free.
 FEWEST_VIEWS = 3
-#: A start at which points are on average farther from other views than this share of the gate's square explains nothing.
-MISFIT = 0.45
 #: Rounds of registrations and certified solutions.
 ROUNDS = 4
 #: Gates of GICP, and of points to planes after it, in spacings.
@@ -42,6 +40,8 @@ STILL = 0.05
 TINY = 1e-12
 #: A view has moved if it is off by this many times the median of the views.
 FAR_OFF = 6.0
+#: Registrations that differ from the poses by more than this share of the thing's size are none of this thing.
+CONTRADICTION = 0.15
 #: The spacing is taken from this many views.
 SPACED = 9
 #: The name of the sensor in problems of motions.
@@ -255,7 +255,6 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
     i, j = overlapping_pairs(views.surfaces, se3.inverse(views.A) @ Y, GATE * spacing)
     starts = np.zeros((0, 4, 4))
     is_certified = False
-    middle = np.array([each.faces.points.mean(axis=0) for each in views.surfaces])
     for _ in range(ROUNDS):
         poses = se3.inverse(views.A) @ Y
         predicted = se3.inverse(poses[i]) @ poses[j]
@@ -277,11 +276,24 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
             solution = solve(problem)
         before, Y = Y, solution.Y[SENSOR].matrix()
         is_certified = solution.certificate.status is Status.CERTIFIED
-        step = se3.inverse(views.A) @ Y - se3.inverse(views.A) @ before
-        moved = np.linalg.norm(np.einsum("nij,nj->ni", step[:, :3, :3], middle) + step[:, :3, 3], axis=1)
-        if np.ptp(moved) < STILL * spacing:
+        moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
+        if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
+    off = np.linalg.norm(_at_middle(views, poses[pairs.i] @ pairs.B - poses[pairs.j], pairs.j), axis=1)
+    size = float(np.median([each.size_m for each in views.surfaces]))
+    if np.median(off) > CONTRADICTION * size:
+        raise CloudError(
+            f"registrations of the clouds contradict the poses: they differ by {1e3 * np.median(off):.1f} mm (median of "
+            f"{len(off)} pairs of views) for a thing of {1e3 * size:.0f} mm. Look whether the thing stood still, and whether "
+            "A is T_sensorcarrier_targetcarrier with the right order of angles"
+        )
     return pairs, Y, is_certified
+
+
+def _at_middle(views: _Views, change: Array, at: np.ndarray) -> Array:
+    """How far (M, 3) changes of poses (M, 4, 4) move the middle of each view, m."""
+    middle = np.array([each.faces.points.mean(axis=0) for each in views.surfaces])[at]
+    return np.asarray(np.einsum("nij,nj->ni", change[:, :3, :3], middle) + change[:, :3, 3])
 
 
 def _first(views: _Views, options: ObjectOptions) -> Start:
@@ -289,7 +301,7 @@ def _first(views: _Views, options: ObjectOptions) -> Start:
     guess = None if options.start is None else one_transform(options.start, "ObjectOptions.start")
     spacing = views.spacing.faces_m
     found = first_poses(views.surfaces, views.A, spacing, guess)
-    if found[0].misfit > MISFIT:
+    if not found[0].explains:
         raise CloudError(_unexplained(views, found[0].misfit))
     if len(found) > 1:
         words = "; ".join(
@@ -319,7 +331,7 @@ def _unexplained(views: _Views, misfit: float) -> str:
     readings = {**shifted, **scaled, "A is inverted: give T_sensorcarrier_targetcarrier": se3.inverse(views.A)}
     for words, A in readings.items():
         best = first_poses(views.surfaces, A, views.spacing.faces_m)[0]
-        if best.misfit < min(MISFIT, 0.6 * misfit):
+        if best.explains and best.misfit < 0.6 * misfit:
             return words
     names = f"{views.surfaces[0].name} to {views.surfaces[-1].name}"
     return (
@@ -344,9 +356,7 @@ def _apart(views: _Views, view: int) -> ViewFinding:
 
 def _moved(views: _Views, poses: Array, predicted: Array) -> tuple[ViewFinding, ...]:
     """Views that lie elsewhere than their A says, by far more than others."""
-    middle = np.array([each.faces.points.mean(axis=0) for each in views.surfaces])
-    step = poses - predicted
-    off = np.einsum("nij,nj->ni", step[:, :3, :3], middle) + step[:, :3, 3]
+    off = _at_middle(views, poses - predicted, np.arange(len(views.at)))
     far = np.linalg.norm(off - np.median(off, axis=0), axis=1)
     limit = max(FAR_OFF * float(np.median(far)), views.spacing.faces_m)
     return tuple(
