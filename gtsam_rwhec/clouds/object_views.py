@@ -13,7 +13,9 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.first_registration import Start, first_poses
-from gtsam_rwhec.clouds.joint_registration import joint_poses
+from gtsam_rwhec.clouds.joint_registration import JointPoses, joint_poses
+from gtsam_rwhec.clouds.moved_views import move_of
+from gtsam_rwhec.clouds.point_to_plane import units
 from gtsam_rwhec.clouds.registration import (
     Registrations,
     aligned,
@@ -38,8 +40,8 @@ WIDE, GATE = 4.0, 2.0
 STILL = 0.05
 #: Added to variances (rad^2, m^2): arms and registrations are no better.
 TINY = 1e-12
-#: A view has moved if it is off by this many times the median of the views.
-FAR_OFF = 6.0
+#: If the thing was elsewhere in a larger share of the views, nobody knows where it was.
+MOST_MOVED = 0.25
 #: Registrations that differ from the poses by more than this share of the thing's size are none of this thing.
 CONTRADICTION = 0.15
 #: The spacing is taken from this many views.
@@ -63,7 +65,7 @@ class ViewFault(StrEnum):
 
     #: It overlaps no other view where the carrier's pose puts it.
     APART = "apart"
-    #: The registration puts it elsewhere than the carrier's pose does, by far more than other views.
+    #: It shows the thing elsewhere than the carrier's pose and all other views do.
     MOVED = "moved"
     #: Too few of its points are left to tell a pose.
     FEW_POINTS = "few_points"
@@ -71,7 +73,7 @@ class ViewFault(StrEnum):
 
 @dataclass(frozen=True)
 class ViewFinding:
-    """A view that is left out, or that contradicts its pose (by ``off_m`` at the thing); ``str()`` is a sentence."""
+    """A view that is left out, and why (the thing was ``off_m`` elsewhere); ``str()`` is a sentence."""
 
     view: int
     name: str
@@ -82,8 +84,8 @@ class ViewFinding:
     def __str__(self) -> str:
         if self.fault is ViewFault.MOVED:
             return (
-                f"{self.name} fits the other clouds {1e3 * self.off_m:.1f} mm from where its pose puts it: the thing moved "
-                "before this view, or the pose is of another"
+                f"{self.name} shows the thing {1e3 * self.off_m:.1f} mm from where its pose puts it: it was elsewhere in this "
+                "view alone, or the pose is of another"
             )
         if self.fault is ViewFault.FEW_POINTS:
             return f"{self.name} has too few points to tell a pose"
@@ -110,8 +112,6 @@ class SeenObject:
         Which views are used.
     left_out : {view: ViewFinding}
         Why others are not.
-    findings : tuple of ViewFinding
-        What is wrong with views that are used.
     registrations : Registrations
         Of pairs of views.
     T_sensorcarrier_sensor : (4, 4)
@@ -129,7 +129,6 @@ class SeenObject:
     covariances: Array
     used: np.ndarray
     left_out: Mapping[int, ViewFinding]
-    findings: tuple[ViewFinding, ...]
     registrations: Registrations
     T_sensorcarrier_sensor: Array
     is_certified: bool
@@ -167,31 +166,32 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     Views are registered in pairs (Segal et al. 2009, "Generalized-ICP"; small_gicp), in turn with the certified solution of
     the motions, and then all at once by points to planes and edges.
     """
-    views, few = _prepared(clouds, A, options or ObjectOptions())
-    registrations, Y, is_certified = _in_turn(views, options or ObjectOptions())
+    views, out = _prepared(clouds, A, options or ObjectOptions())
+    registrations, Y, _ = _in_turn(views, options or ObjectOptions())
     together = largest_group(len(views.at), registrations.i, registrations.j)
-    apart = [_apart(views, k) for k in np.flatnonzero(~together)]
-    kept = views.selected(together)
+    out += [_apart(views, k) for k in np.flatnonzero(~together)]
+    kept, place = views.selected(together), np.cumsum(together) - 1
     if len(kept.at) < FEWEST_VIEWS:
-        raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, apart)))
-    inside = registrations.selected(together[registrations.i] & together[registrations.j])
-    predicted = se3.inverse(kept.A) @ Y
-    place = np.cumsum(together) - 1
-    joint = joint_poses(kept.surfaces, predicted, inside.renamed(place), GATE * views.spacing.faces_m)
+        raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
+    inside = registrations.selected(together[registrations.i] & together[registrations.j]).renamed(place)
+    joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, inside, GATE * views.spacing.faces_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
+    stays, Y, is_certified = _where_it_was(kept, joint, inside, origin)
+    out += [_moved(kept, k, far) for k, far in stays.items()]
     B = se3.inverse(joint.T_common_sensor) @ origin
     turn = se3.adjoint(se3.inverse(B))
     covariances = turn @ joint.covariances @ turn.transpose(0, 2, 1)
+    used = np.setdiff1d(np.arange(len(kept.at)), list(stays))
     transforms = as_transforms(A, None, "A")
     poses, of_poses = np.full((len(transforms), 4, 4), np.nan), np.full((len(transforms), 6, 6), np.nan)
-    poses[kept.at], of_poses[kept.at] = B, 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    poses[kept.at[used]] = B[used]
+    of_poses[kept.at[used]] = 0.5 * (covariances + covariances.transpose(0, 2, 1))[used]
     return SeenObject(
         transforms,
         poses,
         of_poses,
-        np.isin(np.arange(len(transforms)), kept.at),
-        {each.view: each for each in sorted([*few, *apart], key=lambda each: each.view)},
-        _moved(kept, joint.T_common_sensor, predicted),
+        np.isin(np.arange(len(transforms)), kept.at[used]),
+        {each.view: each for each in sorted(out, key=lambda each: each.view)},
         registrations.renamed(views.at),
         Y,
         is_certified,
@@ -265,17 +265,8 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
         if len(pairs) < FEWEST_VIEWS - 1:
             raise CloudError(_no_overlap(views, i, j))
         i, j, starts = pairs.i, pairs.j, pairs.B
-        off = se3.logmap(se3.inverse(pairs.B) @ se3.inverse(poses[i]) @ poses[j])
-        # What A is off counts as well, and is the same in all directions.
-        floor = np.median(off**2, axis=0).reshape(2, 3).mean(axis=1).repeat(3)
-        problem = Problem()
-        problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=pairs.covariances + np.diag(floor + TINY), directional=True)
-        with warnings.catch_warnings():
-            # The caller's own problem is judged by `calibrate`, with A's noise.
-            warnings.simplefilter("ignore", RwhecWarning)
-            solution = solve(problem)
-        before, Y = Y, solution.Y[SENSOR].matrix()
-        is_certified = solution.certificate.status is Status.CERTIFIED
+        before = Y
+        Y, is_certified = _certified(pairs, Y)
         moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
         if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
@@ -288,6 +279,61 @@ def _in_turn(views: _Views, options: ObjectOptions) -> tuple[Registrations, Arra
             "A is T_sensorcarrier_targetcarrier with the right order of angles"
         )
     return pairs, Y, is_certified
+
+
+def _certified(pairs: Registrations, Y: Array) -> tuple[Array, bool]:
+    """The sensor's pose (4, 4) on its carrier by motions, and whether it is certified; ``Y`` is the one before."""
+    off = se3.logmap(se3.inverse(pairs.B) @ se3.inverse(Y) @ pairs.A @ Y)
+    # What A is off counts as well, and is the same in all directions.
+    floor = np.median(off**2, axis=0).reshape(2, 3).mean(axis=1).repeat(3)
+    problem = Problem()
+    covariances = pairs.covariances + np.diag(floor + TINY)
+    problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=covariances, directional=True)
+    with warnings.catch_warnings():
+        # The caller's own problem is judged by `calibrate`, with A's noise.
+        warnings.simplefilter("ignore", RwhecWarning)
+        solution = solve(problem)
+    return solution.Y[SENSOR].matrix(), solution.certificate.status is Status.CERTIFIED
+
+
+def _where_it_was(
+    views: _Views, joint: JointPoses, pairs: Registrations, origin: Array
+) -> tuple[dict[int, float], Array, bool]:
+    """Views in which the thing was elsewhere, with the distance (m); the certified pose of the sensor by the others.
+
+    A CloudError says from which view on the thing was elsewhere, or that too many views contradict each other.
+    """
+    to_middle = se3.inverse(origin)
+    unit = np.array([units(each.faces.points)[0] for each in views.surfaces])
+    size = float(np.median([each.size_m for each in views.surfaces]))
+    moved: dict[int, float] = {}
+    Y = np.eye(4)
+    for _ in views.at:
+        still = ~np.isin(np.arange(len(views.at)), list(moved))
+        chosen = pairs.selected(still[pairs.i] & still[pairs.j])
+        Y, is_certified = _certified(chosen, Y)
+        at = np.flatnonzero(still)
+        predicted = se3.inverse(views.A[at]) @ Y
+        move = move_of(to_middle @ joint.T_common_sensor[at], to_middle @ predicted, joint.covariances[at], unit[at], size)
+        if move is None:
+            break
+        name = views.surfaces[at[move.first]].name
+        if move.stays:
+            raise CloudError(
+                f"the thing moved by {1e3 * move.distance_m:.1f} mm before {name}, and stayed there: calibrate with the views "
+                "before it, or with those from it on, or give each part a target of its own"
+            )
+        moved[int(at[move.first])] = move.distance_m
+        if len(moved) > MOST_MOVED * len(views.at):
+            raise CloudError(
+                "views contradict each other in where the thing was: "
+                + "; ".join(str(_moved(views, k, far)) for k, far in moved.items())
+            )
+    return moved, Y, is_certified
+
+
+def _moved(views: _Views, view: int, off_m: float) -> ViewFinding:
+    return ViewFinding(int(views.at[view]), views.surfaces[view].name, ViewFault.MOVED, off_m)
 
 
 def _at_middle(views: _Views, change: Array, at: np.ndarray) -> Array:
@@ -352,17 +398,6 @@ def _apart(views: _Views, view: int) -> ViewFinding:
     near = np.argsort(np.linalg.norm(turns, axis=1))[1:3]
     names = tuple(views.surfaces[k].name for k in near)
     return ViewFinding(int(views.at[view]), views.surfaces[view].name, ViewFault.APART, 0.0, names)
-
-
-def _moved(views: _Views, poses: Array, predicted: Array) -> tuple[ViewFinding, ...]:
-    """Views that lie elsewhere than their A says, by far more than others."""
-    off = _at_middle(views, poses - predicted, np.arange(len(views.at)))
-    far = np.linalg.norm(off - np.median(off, axis=0), axis=1)
-    limit = max(FAR_OFF * float(np.median(far)), views.spacing.faces_m)
-    return tuple(
-        ViewFinding(int(views.at[k]), views.surfaces[k].name, ViewFault.MOVED, float(far[k]))
-        for k in np.flatnonzero(far > limit)
-    )
 
 
 def _centre(surfaces: Sequence[Surface], poses: Array) -> Array:
