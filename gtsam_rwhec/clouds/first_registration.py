@@ -1,8 +1,8 @@
 """The start without a guess: where the sensor is on its carrier, so that the clouds of many poses show one thing.
 
-Every pose of a sensor on its carrier predicts how each view lies to another: T_i_j = Y^-1 A_i A_j^-1 Y. Rotations that
-are evenly spread over all are the starts; each is refined by what all views tell at once (points to planes), from a wide
-gate to a narrow one, and few are kept from gate to gate. Rotations: Alexa (2022), "Super-Fibonacci spirals".
+Every pose of a sensor on its carrier predicts how each view lies to another: T_i_j = Y^-1 A_i A_j^-1 Y. Starts are
+rotations that are evenly spread over all (Alexa 2022, "Super-Fibonacci spirals"). Each is refined by what all views
+tell at once (points to planes), from a wide gate to a narrow one, and few are kept from gate to gate.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LAST = (4.0, 8)
 #: Starts that differ by less than these (rad, share of the size) are one.
 SAME = (0.02, 0.05)
 #: Views show one thing if points are closer to other views than this, as shares of the gate's square: all of them, or
-#: those within the gate (wrong poses have 0.18 and more, right ones less than 0.1, however little of the views overlaps).
+#: those within the gate (wrong poses have 0.18 and more, right ones less than 0.1, however little the views overlap).
 MISFIT, CLOSE = 0.45, 0.13
 #: A start is worse than the best if it is so by this many of the deviations of pairs.
 CLEARLY = 4.0

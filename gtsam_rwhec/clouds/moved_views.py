@@ -1,8 +1,9 @@
 """Views in which the thing was elsewhere: one view alone, or all from some view on.
 
-The poses of a joint registration P and those that A predicts differ by errors of A, and by what Y and X are off. A view
-(or all from one on) whose thing has moved has six numbers of its own. They count if they explain far more than independent
-errors of A would (an F test, with the share of false alarms over all views below ``FALSE_ALARMS``), and are large.
+The poses of a joint registration and those that A predicts differ by errors of A, and by what Y and X are off. A view
+(or all from one on) whose thing has moved has six numbers of its own. They count if they explain far more than
+independent errors of A would (an F test, with the share of false alarms over all views below ``FALSE_ALARMS``), and are
+large.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from gtsam_rwhec.geometry.poses import Array
 
 #: Probability that a thing that did not move is said to have moved.
 FALSE_ALARMS = 1e-5
-#: Errors of an arm go with where it stands, and look like small moves (2.4 mm of a real arm, whichever thing it looked at):
-#: a move is larger than what is left by a factor, and than a share of the thing's size. ``calibrate`` judges smaller ones.
+#: Errors of an arm go with where it stands, and look like small moves (2.4 mm of a real arm, whichever thing it looked
+#: at): a move is larger than what is left by a factor, and than a share of the thing's size. ``calibrate`` judges
+#: smaller ones.
 FAR, LARGE = 4.0, 0.08
 #: Directions in which a pose is known to no better than this share of the thing's size tell nothing.
 UNKNOWN = 0.1
@@ -39,8 +41,8 @@ def move_of(poses: Array, predicted: Array, covariances: Array, units: Array, si
     """The move that explains most, if there is one.
 
     ``poses`` and ``predicted`` (N, 4, 4) are T_thing_sensor by the clouds and by A, about the thing's middle;
-    ``covariances`` (N, 6, 6) are of the first; ``units`` (N, 6, 6) the perturbations that move the thing by a metre in each
-    direction, and ``size_m`` is the thing's size.
+    ``covariances`` (N, 6, 6) are of the first; ``units`` (N, 6, 6) the perturbations that move the thing by a metre in
+    each direction, and ``size_m`` is the thing's size.
     """
     order = np.arange(len(poses))
     to_unit = np.linalg.inv(units)
