@@ -131,7 +131,7 @@ def _step(group: Group, total: _Sums, consistency: float) -> Array:
     ratios = found / total.expected
     size = np.sqrt(np.diagonal(total.fisher))
     if abs(total.fisher[0, 1]) < 0.05 * size[0] * size[1]:
-        # A sum below zero (rotation and translation are correlated, and far from their sizes) has no ratio: a step down.
+        # A sum below zero (rotation and translation are correlated, far from their sizes) has no ratio: a step down.
         result: Array = np.where(ratios < 0.0, 0.5, np.maximum(ratios, 1e-12))
         return result
     # Correlated: each factor changes both components' residuals. First their common size, then Fisher scoring on both.
