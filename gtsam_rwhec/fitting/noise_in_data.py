@@ -269,8 +269,7 @@ def noise_in(
     white = found.white or found
     middle, low, high = mixture.quantiles((0.5, 0.05, 0.95))
     active = found.fit.sizes.active
-    given = np.sqrt(np.einsum("nii->i", found.model.rows.given) / len(found.model.rows.given))
-    stated = {C.ROTATION: float(given[:3].mean()), C.TRANSLATION: float(given[3:].mean())}
+    stated = dict(zip((C.ROTATION, C.TRANSLATION), found.model.rows.typical_given, strict=True))
     simple = white.model.evaluate(white.fit.sizes.values(white.fit.logs)).covariance
     ratios = [0.0]
     for unknown, place in task.layout.slots.items():

@@ -200,11 +200,17 @@ class DirectedPair:
         result: Array = (rows.reshape(m, -1, 12) @ matrix).reshape(rows.shape)
         return result
 
-    def reach(self, at: slice) -> Array:
-        """(12, 12): the largest size of each entry of the rows' matrix, of some measurements."""
+    def reach(self, at: slice, sizes: Array) -> Array:
+        """Bounds on the rows' sizes from those of E row by row and e, (..., 12), of some measurements."""
         w = self.weighing
-        reach: Array = np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
-        return reach
+        result: Array = sizes @ np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0).T
+        return result
+
+    def reach_back(self, at: slice, sizes: Array) -> Array:
+        """Bounds on the sizes of what ``turned_back`` gives, from those of the rows (..., 12)."""
+        w = self.weighing
+        result: Array = sizes @ np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
+        return result
 
 
 def _turning(turns: Array, centre: Array, axes: Array) -> Array:

@@ -202,9 +202,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
             weights = np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
         else:
             directed, part = stack.directed
-            turn = directed.reach(part)
             rounded = (low + DOUBLED * _reach(r)).reshape(k, D, 12) * (1.0 + 1e-9)
-            low = np.matmul(rounded, turn.T).reshape(k, outputs)
+            low = directed.reach(part, rounded).reshape(k, outputs)
             r, weights = directed.turned(part, r, rest), directed.weights(part)[None]
         residuals = r.reshape(k, m, D, 12)
         weighted = residuals * weights[:, :, None, :]
@@ -224,8 +223,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         in_rows, rows_error = of_ones * root, of_ones * (unit * root + slack)
         if stack.directed is not None:
             flat = directed.turned_back(part, flat)
-            rows_error = np.matmul((rows_error + gamma(_FEW + 12) * in_rows) * (1.0 + 1e-9), turn)
-            in_rows = np.matmul(in_rows, turn)
+            rounded = (rows_error + gamma(_FEW + 12) * in_rows) * (1.0 + 1e-9)
+            rows_error, in_rows = directed.reach_back(part, rounded), directed.reach_back(part, in_rows)
         one_size, one_error = in_rows.reshape(k, 1, outputs), rows_error.reshape(k, 1, outputs)
         of_poses, of_errors = [], []
         for poses, rounding in ((A, off), (stack.B, np.zeros((k, 12))))[of_A_and_B]:
