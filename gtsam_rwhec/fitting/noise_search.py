@@ -398,7 +398,10 @@ def typical_sizes(
     """The components that are in the model, with their typical sizes."""
     size_r, size_t = (max(float(np.sqrt(np.median(of))), QUIETEST) for of in _measured_squares(rows))
     given = rows.typical_given
-    active: list[Component] = list(WHITE)
+    measures_turns = bool(rows.given[:, :3, :3].any())
+    if not measures_turns:  # of points: A turns them by their distance
+        size_r = size_t / max(_root_mean_square(rows.predicted[:, :3, 3]), QUIETEST)
+    active: list[Component] = [c for c in WHITE if measures_turns or c is not C.ROTATION]
     typical: dict[Component, float] = {
         C.ROTATION: size_r / given[0],
         C.TRANSLATION: size_t / given[1],
