@@ -255,7 +255,8 @@ def add_priors(
 ) -> None:
     """Priors: |t - t_0|^2 / sigma_0^2, and kappa_0 |R - R_0|_F^2 (design fact 11) or 2 kappa_0 theta^2 of the angle.
 
-    And what means nothing of a target stays where measurements were slid to: they fit as well there as anywhere.
+    And a target stays, in directions in which all its measurements slide, where these were slid to: they fit as well
+    there as anywhere.
     """
     for name, priors in problem.priors.items():
         if name in problem.fixed:
@@ -268,10 +269,11 @@ def add_priors(
                 graph.add(rotation_prior_factor(key, pose.rotation(), noise, residual=residual))
             if prior.sigma is not None:
                 graph.add(position_prior_factor(key, pose.translation(), Isotropic.Sigma(3, prior.sigma)))
-    for name, T in problem.held.items():
-        if name in variables.frames and (unseen := problem.unseen(name)).any():
-            by_axis = gtsam.noiseModel.Diagonal.Sigmas(np.where(unseen, MEANS_NOTHING, WEIGHTLESS))
-            graph.add(gtsam.PriorFactorPose3(variables.frames[name], to_pose3(T[:3, :3], T[:3, 3]), by_axis))
+    for name, (T, slides) in problem.held.items():
+        if name in variables.frames and slides.shape[1]:
+            root = slides @ slides.T / MEANS_NOTHING + np.eye(6) / WEIGHTLESS
+            by_direction = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+            graph.add(gtsam.PriorFactorPose3(variables.frames[name], to_pose3(T[:3, :3], T[:3, 3]), by_direction))
 
 
 @dataclass(frozen=True)

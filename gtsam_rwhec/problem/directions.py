@@ -11,6 +11,7 @@ of each other, so a sphere's centre counts whole, whatever the frame's origin is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -196,6 +197,20 @@ class Weighing:
         of_axes[is_plane] = 1.0 / there[is_plane, 2, 2, None] * z
         return Weighing(turns, of_turns, centre, axes, of_axes, mean)
 
+    def holding_slides(self, slides: np.ndarray, part: float) -> Weighing:
+        """The weights in which some measurements (N,) hold what they do not tell, with a part of their largest weight.
+
+        Slid to where an answer predicts it, such a residual is zero there. Without a weight the target would slide off
+        to where the rest of the noise fits better.
+        """
+        told = self.of_turns.sum(axis=1, keepdims=True) - self.of_turns
+        held = []
+        for weights in (told, self.of_axes):
+            largest = weights.max(axis=1, keepdims=True)
+            held.append(np.where(slides[:, None] & (weights < SEEN * largest), part * largest, weights))
+        of_turns = np.maximum(0.5 * held[0].sum(axis=1, keepdims=True) - held[0], 0.0)
+        return replace(self, of_turns=np.where(slides[:, None], of_turns, self.of_turns), of_axes=held[1])
+
     @property
     def equations(self) -> tuple[int, int]:
         """How many directions of rotation and of translation the measurements tell."""
@@ -251,6 +266,23 @@ def slides_of(raw: Measurements) -> Array | None:
     variances, along = np.linalg.eigh(raw.covariances[other])
     slides[other] = (along * np.where(variances >= SLIDES, variances, 0.0)[:, None, :]) @ along.transpose(0, 2, 1)
     return slides
+
+
+def common_slides(several: Sequence[Measurements]) -> Array:
+    """The directions (6, k) of a target's axes in which none of its measurements, slid to one answer, is measured."""
+    total, count = np.zeros((6, 6)), 0
+    for raw in several:
+        slides = slides_of(raw)
+        if slides is not None:
+            variances, along = np.linalg.eigh(slides)
+            total += np.einsum("nik,nk,njk->ij", along, (variances > 0.5 * SLIDES).astype(float), along)
+        count += len(raw.A)
+    shares, directions = np.linalg.eigh(total / count)
+    return directions[:, shares > ALIKE]
+
+
+#: Slides are one direction where this share of each is in it.
+ALIKE = 0.99
 
 
 def axes_seen(raw: Measurements) -> np.ndarray:

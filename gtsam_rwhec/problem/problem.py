@@ -126,8 +126,9 @@ class Problem(Knowledge):
         self.is_relative = False  # whether the noise of some measurements is not stated
         self._kind: dict[str, Literal["target", "sensor"]] = {}
         self._kept: dict[Pair, KeptMeasurements] = {}
-        #: Poses (4, 4) of targets to which measurements that weigh by direction were slid (`aligned_at`).
-        self.held: dict[str, Array] = {}
+        #: Poses (4, 4) of targets to which measurements that weigh by direction were slid (`aligned_at`), and the
+        #: directions (6, k) of their own axes in which all of them slide.
+        self.held: dict[str, tuple[Array, Array]] = {}
         self._accumulator = Accumulator()
         self._long: frozenset[str] = frozenset()  # which of "A" and "B" had the millimetre warning
 

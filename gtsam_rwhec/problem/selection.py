@@ -19,7 +19,7 @@ from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator, Row
 from gtsam_rwhec.problem.corners import candidates_of
-from gtsam_rwhec.problem.directions import aligned
+from gtsam_rwhec.problem.directions import aligned, common_slides
 from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
@@ -140,7 +140,10 @@ def aligned_at(
         alpha = scale[pair.target] if isinstance(scale, Mapping) else scale
         every[pair] = aligned(every[pair], of_target, Y[pair.sensor].matrix(), alpha)
     slid = problem.with_measurements(every)
-    slid.held = problem.held | {pair.target: X[pair.target].matrix() for pair in pairs if not pair.is_motion}
+    for name in dict.fromkeys(pair.target for pair in pairs if not pair.is_motion):
+        own = [every[pair] for pair in problem.pairs if pair.target == name]
+        if name not in problem.fixed and name not in problem.priors:
+            slid.held = slid.held | {name: (X[name].matrix(), common_slides(own))}
     return slid
 
 
