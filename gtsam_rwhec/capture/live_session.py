@@ -81,6 +81,10 @@ class Session:
 
     def __init__(self, source: Source, rig: Rig, folder: Path, options: LiveOptions) -> None:
         self.source, self.rig, self.options = source, rig, options
+        of_clouds = [name for name, sensor in rig.sensors.items() if sensor.clouds is not None]
+        if of_clouds:
+            place = rig.source.place(("sensors", of_clouds[0], "clouds"))
+            raise LogError(f"{place}: a session looks at images and detections; calibrate a log or folder of clouds")
         self.takes = Takes(folder)
         if source.is_at_rest and self.takes.all:
             raise LogError(f"{folder} has takes, and all images of {source.name} would be taken again; give another -o")

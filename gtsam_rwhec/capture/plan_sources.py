@@ -134,6 +134,12 @@ def _of_refined(
             known = np.linalg.inv(rest / unit[:, None] / unit) / unit[:, None] / unit
         else:
             floor = np.zeros_like(floor)
+    blind = sorted({pair.sensor for pair in refined.noise if pair.sensor not in kit.cameras})
+    if blind and problem is None:
+        raise OptionError(
+            f"{', '.join(blind)}: no intrinsics are known, and without them only measurements say where a sensor "
+            "looks. Give the problem of the calibration beside it, or intrinsics"
+        )
     by_corners = refined.reprojection
     if by_corners is not None:
         kit = replace(kit, corner_px=by_corners.corner_px)

@@ -21,7 +21,8 @@ def init(
     log: Annotated[
         Path | None,
         typer.Argument(
-            help="MCAP file, a folder of MCAP files (a ROS 2 bag), or a folder of images or clouds with poses beside them.",
+            help="MCAP file, a folder of MCAP files (a ROS 2 bag), or a folder of images or clouds with poses beside "
+            "them.",
             show_default=False,
         ),
     ] = None,
@@ -37,7 +38,7 @@ def init(
         bool, typer.Option("--reference", help="Print every key of rig files, as Markdown, and write nothing.")
     ] = False,
 ) -> ExitStatus:
-    """Look at a log or a folder of images or clouds, and write a first rig file. TODO marks the lines that you must complete."""
+    """Look at a log or a folder, and write a first rig file. TODO marks the lines that you must complete."""
     if schema + reference + (template is not None) + (log is not None) != 1:
         raise typer.BadParameter(
             "give one of: a log or a folder of images or clouds, --template, --schema, --reference"

@@ -1,8 +1,8 @@
 """The start without a guess: where the sensor is on its carrier, so that the clouds of many poses show one thing.
 
-Every pose of a sensor on its carrier predicts how each view lies to another: T_i_j = Y^-1 A_i A_j^-1 Y. Rotations that
-are evenly spread over all are the starts; each is refined by what all views tell at once (points to planes), from a wide
-gate to a narrow one, and few are kept from gate to gate. Rotations: Alexa (2022), "Super-Fibonacci spirals".
+Every pose of a sensor on its carrier predicts how each view lies to another: T_i_j = Y^-1 A_i A_j^-1 Y. Starts are
+rotations that are evenly spread over all (Alexa 2022, "Super-Fibonacci spirals"). Each is refined by what all views
+tell at once (points to planes), from a wide gate to a narrow one, and few are kept from gate to gate.
 """
 
 from __future__ import annotations
@@ -32,21 +32,40 @@ STAGES = ((0.8, 4, 24), (0.4, 6, 10), (0.15, 8, 6))
 LAST = (4.0, 8)
 #: Starts that differ by less than these (rad, share of the size) are one.
 SAME = (0.02, 0.05)
+#: Views show one thing if points are closer to other views than this, as shares of the gate's square: all of them, or
+#: those within the gate (wrong poses have 0.18 and more, right ones less than 0.1, however little the views overlap).
+MISFIT, CLOSE = 0.45, 0.13
 #: A start is worse than the best if it is so by this many of the deviations of pairs.
 CLEARLY = 4.0
 
 
 @dataclass(frozen=True)
 class Start:
-    """A pose T_sensorcarrier_sensor (4, 4) that explains the clouds, and how badly: the mean squared distance of points
-    from other views, as shares of the gate's square (1: they nowhere touch), by pair (P,)."""
+    """A pose T_sensorcarrier_sensor (4, 4) that may explain the clouds.
+
+    ``misfits`` (P,) are mean squared distances of points from another view, as shares of the gate's square (1: they
+    nowhere touch), by pair; ``near`` (P,) the shares of the points that have the other view within the gate.
+    """
 
     T_sensorcarrier_sensor: Array
     misfits: Array
+    near: Array
 
     @property
     def misfit(self) -> float:
+        """The mean over all points."""
         return float(self.misfits.mean())
+
+    @property
+    def closeness(self) -> float:
+        """The mean over those points that are near: how well surfaces lie on each other where they overlap."""
+        near = float(self.near.mean())
+        return (self.misfit - (1.0 - near)) / near if near else 1.0
+
+    @property
+    def explains(self) -> bool:
+        """Whether the views show one thing at this pose."""
+        return self.misfit < MISFIT or self.closeness < CLOSE
 
 
 def rotations(count: int) -> Array:
@@ -96,9 +115,9 @@ class _Search:
         misfit = ((rows @ solved - right.T) ** 2).sum(axis=0)
         return se3.pose(R, solved[:3].T)[np.argsort(misfit)[: ROTATIONS // 2]]
 
-    def look(self, Y: Array, gate: float, *, fine: bool) -> tuple[Array, Array, Array]:
-        """Misfits (H, P) of poses (H, 4, 4), gradients (H, 6) and normal matrices (H, 6, 6)."""
-        misfits = []
+    def look(self, Y: Array, gate: float, *, fine: bool) -> tuple[Array, Array, Array, Array]:
+        """Misfits and near shares (H, P) of poses (H, 4, 4), gradients (H, 6) and normal matrices (H, 6, 6)."""
+        misfits, near = [], []
         gradient, normal = np.zeros((len(Y), 6)), np.zeros((len(Y), 6, 6))
         inverse = se3.inverse(Y)
         for points, other, motion in zip(self.pairs.points, self.pairs.others, self.pairs.motions, strict=True):
@@ -108,6 +127,7 @@ class _Search:
             faces = self.fine[other] if fine else self.coarse[other]
             distances, nearest = faces.tree.query(moved, distance_upper_bound=gate)
             misfits.append((np.minimum(distances / gate, 1.0) ** 2).mean(axis=1))
+            near.append(np.isfinite(distances).mean(axis=1))
             h, n = np.nonzero(np.isfinite(distances))
             at = nearest[h, n]
             residuals = np.einsum("mi,mi->m", faces.normals[at], moved[h, n] - faces.points[at])
@@ -122,13 +142,13 @@ class _Search:
                 weighted = weights[:, None] * rows
                 gradient[filled] += np.add.reduceat(weighted * residuals[:, None], starts[filled])
                 normal[filled] += np.add.reduceat(weighted[:, :, None] * rows[:, None, :], starts[filled])
-        return np.array(misfits).T, gradient, normal
+        return np.array(misfits).T, np.array(near).T, gradient, normal
 
     def refined(self, Y: Array, gate: float, steps: int, *, fine: bool) -> tuple[Array, Array]:
         """Poses after some damped steps, and their misfits."""
         units = np.r_[np.ones(3), np.full(3, self.size)]
         for _ in range(steps):
-            _, gradient, normal = self.look(Y, gate, fine=fine)
+            _, _, gradient, normal = self.look(Y, gate, fine=fine)
             normal = normal * units[:, None] * units
             damping = 1e-3 * np.trace(normal, axis1=1, axis2=2)[:, None, None] / 6.0 + 1e-12
             x = -np.linalg.solve(normal + damping * np.eye(6), (gradient * units)[..., None])[..., 0] * units
@@ -177,18 +197,18 @@ def first_poses(surfaces: Sequence[Surface], A: Array, spacing_m: float, start: 
         Y, misfits = search.refined(Y, gate, steps, fine=share < 0.3)
         Y, misfits = search.apart(Y, misfits, most)
     gate = LAST[0] * spacing_m
-    Y, misfits = search.apart(*search.refined(Y, gate, LAST[1], fine=True), len(Y))
-    best = Start(Y[0], misfits[0])
-    found = [best]
-    for pose, rows in zip(Y[1:], misfits[1:], strict=True):
-        worse = rows - best.misfits
-        if worse.mean() > CLEARLY * worse.std() / np.sqrt(len(worse)):
-            continue
-        # Two ends of one flat valley are no two answers.
-        middle = best.T_sensorcarrier_sensor @ se3.expmap(
-            0.5 * se3.logmap((se3.inverse(best.T_sensorcarrier_sensor) @ pose)[None])
-        )
-        over = search.look(middle, gate, fine=True)[0][0] - rows
-        if over.mean() > CLEARLY * over.std() / np.sqrt(len(over)):
-            found.append(Start(pose, rows))
-    return found
+    Y, _ = search.apart(*search.refined(Y, gate, LAST[1], fine=True), len(Y))
+    misfits, near, _, _ = search.look(Y, gate, fine=True)
+    best, *others = (Start(*each) for each in zip(Y, misfits, near, strict=True))
+    return [best, *(each for each in others if _is_another(search, best, each, gate))]
+
+
+def _is_another(search: _Search, best: Start, other: Start, gate: float) -> bool:
+    """Whether another start explains the clouds as well, and is no other end of the same flat valley."""
+    worse = other.misfits - best.misfits
+    if worse.mean() > CLEARLY * worse.std() / np.sqrt(len(worse)):
+        return False
+    first = best.T_sensorcarrier_sensor
+    halfway = se3.expmap(0.5 * se3.logmap((se3.inverse(first) @ other.T_sensorcarrier_sensor)[None]))
+    over = search.look(first @ halfway, gate, fine=True)[0][0] - other.misfits
+    return bool(over.mean() > CLEARLY * over.std() / np.sqrt(len(over)))

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.clouds.point_to_plane import Matches, joined, known, matches, sigmas, units
+from gtsam_rwhec.clouds.point_to_plane import joined, known, matches, sigmas, units
 from gtsam_rwhec.clouds.registration import Registrations
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
@@ -49,9 +49,9 @@ def _solved(
         values.insert(k, gtsam.Pose3(pose))
         graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(pose), noise.Gaussian.Covariance(covariance)))
     for a, b, T, root in zip(i, j, T_i_j, roots, strict=True):
-        model = noise.Gaussian.SqrtInformation(root)
-        if robust:
-            model = noise.Robust.Create(noise.mEstimator.Huber.Create(HUBER), model)
+        gaussian = noise.Gaussian.SqrtInformation(root)
+        loss = noise.mEstimator.Huber.Create(HUBER)
+        model = noise.Robust.Create(loss, gaussian) if robust else gaussian
         graph.add(gtsam.BetweenFactorPose3(int(a), int(b), gtsam.Pose3(T), model))
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return np.array([solved.atPose3(k).matrix() for k in range(len(start))])
@@ -88,14 +88,13 @@ def _covariances(
     surfaces: Sequence[Surface], poses: Array, i: np.ndarray, j: np.ndarray, gate_m: float, sigma_m: Array
 ) -> Array:
     """Of each view among the others: each of its points counts once, however many views it is seen in."""
-    seen: list[list[Matches]] = [[] for _ in surfaces]
-    for a, b in zip(np.r_[i, j], np.r_[j, i], strict=True):
-        seen[b].append(matches(surfaces[b], surfaces[a], se3.inverse(poses[a]) @ poses[b], gate_m))
     result = []
-    for several in seen:
-        all_matches = joined(several)
-        counts = np.bincount(all_matches.at)[all_matches.at]
+    for view, surface in enumerate(surfaces):
+        others = np.r_[i[j == view], j[i == view]]
+        T = se3.inverse(poses[others]) @ poses[view]
+        found = joined([matches(surface, surfaces[k], each, gate_m) for k, each in zip(others, T, strict=True)])
+        counts = np.bincount(found.at)[found.at]
         # A residual has the noise of two points, the view's own and the other's; of the others there are many.
-        share = (1.0 + 1.0 / len(several)) / 2.0
-        result.append(known(all_matches, sigma_m, counts * share).covariance)
+        share = (1.0 + 1.0 / len(others)) / 2.0
+        result.append(known(found, sigma_m, counts * share).covariance)
     return np.array(result)

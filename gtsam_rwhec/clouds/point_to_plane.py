@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from rwhec_factors import se3
@@ -30,9 +31,9 @@ LEAST_SHARE = 1e-3
 class Matches:
     """Points (m, 3) of a surface that lie on another, and how far off.
 
-    ``residuals`` (m,) are distances across the mean of both normals, in metres: where a surface is curved, neighbours that
-    lie beside each other are off the tangent plane of either, but not of this mean (Rusinkiewicz 2019, "A symmetric
-    objective function for ICP"). ``rows`` (m, 6) are derivatives by a right perturbation of T_other_surface (rotation
+    ``residuals`` (m,) are distances across the mean of both normals, in metres: where a surface is curved, neighbours
+    that lie beside each other are off the tangent plane of either, but not of this mean (Rusinkiewicz 2019, "A
+    symmetric objective function for ICP"). ``rows`` (m, 6) are derivatives by a right perturbation of T_other_surface (rotation
     first) across the other's normals, ``own_rows`` across the surface's own. ``kind`` is 0 for faces and 1 for edges;
     ``at`` are places among the surface's faces, then edges.
     """
@@ -50,7 +51,7 @@ class Matches:
 def matches(surface: Surface, other: Surface, T_other_surface: Array, gate_m: float) -> Matches:
     """The points of a surface that have a neighbour on another within a gate, with a normal like its own."""
     R, t = T_other_surface[:3, :3], T_other_surface[:3, 3]
-    found, counts = [], []
+    found: list[_Arrays] = []
     first = 0
     for kind, (own, its) in enumerate(((surface.faces, other.faces), (surface.edges, other.edges))):
         distances, nearest = its.tree.query(own.points @ R.T + t, distance_upper_bound=gate_m)
@@ -65,12 +66,11 @@ def matches(surface: Surface, other: Surface, T_other_surface: Array, gate_m: fl
         residuals = np.einsum("ij,ij->i", both, apart)
         # Farther aside than any neighbour within a surface: the point is beyond the end of the other.
         within = (apart**2).sum(axis=1) - residuals**2 < (ASIDE * gate_m) ** 2
-        at, normals, sign, points, residuals = at[within], normals[within], sign[within], points[within], residuals[within]
-        rows = [np.hstack([np.cross(points, n), n]) for n in (normals, sign * own.normals[at])]
-        found.append((points, residuals, *rows, np.full(len(at), kind), first + at))
-        counts.append(len(at))
+        at, normals, sign, points, residuals = (each[within] for each in (at, normals, sign, points, residuals))
+        rows, own_rows = (np.hstack([np.cross(points, n), n]) for n in (normals, sign * own.normals[at]))
+        found.append((points, residuals, rows, own_rows, np.full(len(at), kind), first + at))
         first += len(own.points)
-    return Matches(*(np.concatenate(part) for part in zip(*found, strict=True)), counts[0] / len(surface.faces.points))
+    return _of_arrays(found, len(found[0][0]) / len(surface.faces.points))
 
 
 def sigmas(several: Sequence[Matches], spacing_m: float) -> Array:
@@ -84,16 +84,25 @@ def sigmas(several: Sequence[Matches], spacing_m: float) -> Array:
 
 def joined(several: Sequence[Matches]) -> Matches:
     """Matches of one surface with several others."""
-    names = ("points", "residuals", "rows", "own_rows", "kind", "at")
-    return Matches(*(np.concatenate([getattr(each, name) for each in several]) for name in names), several[0].overlap)
+    arrays = [(each.points, each.residuals, each.rows, each.own_rows, each.kind, each.at) for each in several]
+    return _of_arrays(arrays, max(each.overlap for each in several))
+
+
+#: The arrays of `Matches`, in its order.
+_Arrays: TypeAlias = tuple[Array, Array, Array, Array, np.ndarray, np.ndarray]
+
+
+def _of_arrays(several: Sequence[_Arrays], overlap: float) -> Matches:
+    points, residuals, rows, own_rows, kind, at = (np.concatenate(part) for part in zip(*several, strict=True))
+    return Matches(points, residuals, rows, own_rows, kind, at, overlap)
 
 
 @dataclass(frozen=True)
 class Known:
     """What matches tell of T_other_surface by a right perturbation, rotation first; it adds a guess where they slide.
 
-    ``information`` (6, 6) has nothing along what slides, ``covariance`` there the size of the thing. ``step`` (6,) is the
-    perturbation that matches give, and ``of_guess`` (6, 6) the part of a guess that stays.
+    ``information`` (6, 6) has nothing along what slides, ``covariance`` there the size of the thing. ``step`` (6,) is
+    the perturbation that matches give, and ``of_guess`` (6, 6) the part of a guess that stays.
     """
 
     information: Array
@@ -142,9 +151,8 @@ def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
     certain = np.maximum(values, 0.0)
     total = certain + 1.0 / size**2  # a guess is off by the size of the thing
     step = -vectors @ (vectors.T @ gradient / total)
-    information, covariance, of_guess = (
-        (vectors * d) @ vectors.T for d in (certain, 1.0 / total, 1.0 - certain / total)
-    )
+    parts = (certain, 1.0 / total, 1.0 - certain / total)
+    information, covariance, of_guess = ((vectors * each) @ vectors.T for each in parts)
     return Known(
         _symmetric(to_unit.T @ information @ to_unit),
         _symmetric(from_unit @ covariance @ from_unit.T),

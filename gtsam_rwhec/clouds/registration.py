@@ -74,7 +74,7 @@ class Registrations:
 
 
 def overlapping_pairs(surfaces: Sequence[Surface], poses: Array, gate_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs i < j of views that overlap at predicted poses T_common_sensor (N, 4, 4): all of few views, some of many."""
+    """Pairs i < j of views that overlap at predicted poses T_common_sensor (N, 4, 4): all, or some of many views."""
     i, j = np.triu_indices(len(surfaces), 1)
     draw = np.random.default_rng(0)
     if len(i) > MOST_PROBED:
@@ -143,9 +143,8 @@ def registered(
         steps = np.array([t.step + t.of_guess @ guess for t, guess in zip(tell, guesses, strict=True)])
         T = T @ se3.expmap(steps)
         reach = np.array([np.linalg.norm(surfaces[b].faces.points.mean(axis=0)) for b in j])
-        if (
-            np.linalg.norm(steps[:, :3], axis=1) * reach + np.linalg.norm(steps[:, 3:], axis=1)
-        ).max() < SETTLED * gate_m:
+        moved = np.linalg.norm(steps[:, :3], axis=1) * reach + np.linalg.norm(steps[:, 3:], axis=1)
+        if moved.max() < SETTLED * gate_m:
             break
     return Registrations(
         i,

@@ -16,21 +16,27 @@ from gtsam_rwhec.geometry.poses import Array
 with extra_named():
     import small_gicp
 
-#: A view is thinned to about this many points: registrations gain little beyond, and cost as they are many.
-POINTS = 3000
+#: A view is thinned to about this many points, or less if views are many: all views have about this many points.
+#: Registrations gain little beyond, and cost as they are many.
+POINTS, FEW_POINTS, ALL_POINTS = 3000, 1000, 60_000
+#: Of denser clouds every so-manieth point is taken, so that about this many are left to thin.
+DENSE = 60_000
 #: The spacing is found on about this many points of a view.
 SAMPLED = 20_000
 #: Thinning to less than so many times the spacing of the points themselves makes holes.
 THINNED = 1.5
 #: Edges are looked for among points that are closer to each other by this factor.
-FINER = 2.5
+FINER = 2.0
 #: Points from which a normal is made, and those around a point that may be on an edge.
 NEIGHBOURS, AROUND = 15, 12
 #: A view with fewer points after thinning tells no pose.
 FEWEST_POINTS = 50
 #: A point is on an edge if its neighbours leave such an angle free, rad, around its normal.
 FREE_ANGLE = np.radians(110.0)
-#: Where the normal and the ray differ by more than 60 degrees, a surface ends for the eye alone: that edge wanders with the sensor.
+#: And the mean of their offsets is at least this share of the farthest.
+LOPSIDED = 0.15
+#: Where the normal and the ray differ by more than 60 degrees, a surface ends for the eye alone: that edge wanders
+#: with the sensor.
 FACING = 0.5
 
 
@@ -70,17 +76,23 @@ class Spacing:
     edges_m: float
 
 
-def spacing_of(clouds: Iterable[Array]) -> Spacing:
-    """The spacing at which clouds (n, 3) keep about ``POINTS`` points each, or their own if it is larger."""
+def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
+    """The spacing at which clouds (n, 3) keep as many points as they need, or their own if it is larger.
+
+    ``clouds`` are some of the ``views``.
+    """
     own, faces = [], []
+    wanted = min(POINTS, max(FEW_POINTS, ALL_POINTS // views))
     for points in clouds:
         few = points[:: max(1, len(points) // SAMPLED)]
+        points = points[:: max(1, len(points) // DENSE)]
         own.append(float(np.median(cKDTree(points).query(few, 2)[0][:, 1])))
         spacing = THINNED * own[-1]
-        # Points on a surface are as many as its area has squares.
-        for _ in range(3):
+        for _ in range(10):
             count = len(small_gicp.voxelgrid_sampling(few, spacing).points())
-            spacing *= max(1.0, np.sqrt(count / POINTS))
+            if count < 1.05 * wanted:
+                break
+            spacing *= np.sqrt(count / wanted)  # points on a surface are as many as its area has squares
         faces.append(spacing)
     wide = float(np.median(faces))
     return Spacing(wide, wide / FINER if wide / FINER > THINNED * np.median(own) else 0.0)
@@ -88,10 +100,11 @@ def spacing_of(clouds: Iterable[Array]) -> Spacing:
 
 def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
     """A view thinned to a spacing."""
-    native, tree = small_gicp.preprocess_points(cloud.points, spacing.faces_m, NEIGHBOURS)
+    given = cloud.points[:: max(1, len(cloud) // DENSE)]
+    native, tree = small_gicp.preprocess_points(given, spacing.faces_m, NEIGHBOURS)
     points = native.points()[:, :3]
     faces = Features(points, native.normals()[:, :3], cKDTree(points))
-    return Surface(name, faces, _edges(cloud.points, spacing.edges_m, faces), native, tree)
+    return Surface(name, faces, _edges(given, spacing.edges_m, faces), native, tree)
 
 
 def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
@@ -99,10 +112,13 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     fine = small_gicp.PointCloud(points)
     if spacing_m > 0.0:
         fine = small_gicp.voxelgrid_sampling(fine, spacing_m)
-    points = fine.points()[:, :3]
-    normals = faces.normals[faces.tree.query(points)[1]]
+    points = np.asarray(fine.points()[:, :3])
     neighbours = np.asarray(small_gicp.KdTree(fine).batch_knn_search(points, AROUND + 1)[0], dtype=np.int64)[:, 1:]
-    to = points[neighbours] - points[:, None]
+    # Around a point within a surface its neighbours' offsets sum to little.
+    lop = np.linalg.norm(points[neighbours].mean(axis=1) - points, axis=1)
+    at = np.flatnonzero(lop > LOPSIDED * np.linalg.norm(points[neighbours[:, -1]] - points, axis=1))
+    points, to = points[at], points[neighbours[at]] - points[at, None]
+    normals = faces.normals[faces.tree.query(points)[1]]
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     second = np.cross(normals, first)
@@ -110,7 +126,7 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     angles = np.sort(np.arctan2(y, x), axis=1)
     gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2.0 * np.pi)
     facing = np.abs(np.einsum("ni,ni->n", normals, points)) > FACING * np.linalg.norm(points, axis=1)
-    at = np.flatnonzero((gaps.max(axis=1) > FREE_ANGLE) & facing)
-    inwards = x.mean(axis=1)[at, None] * first[at] + y.mean(axis=1)[at, None] * second[at]
+    on = (gaps.max(axis=1) > FREE_ANGLE) & facing
+    inwards = x.mean(axis=1)[on, None] * first[on] + y.mean(axis=1)[on, None] * second[on]
     outwards = -inwards / np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-12)
-    return Features(points[at], outwards, cKDTree(points[at]))
+    return Features(points[on], outwards, cKDTree(points[on]))

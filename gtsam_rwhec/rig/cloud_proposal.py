@@ -16,7 +16,8 @@ from gtsam_rwhec.calibration.trial_fits import Spread, fitted
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.cloud_files import read_cloud
 from gtsam_rwhec.clouds.first_registration import first_poses
-from gtsam_rwhec.clouds.object_views import ObjectOptions, seen_object
+from gtsam_rwhec.clouds.object_views import seen_object
+from gtsam_rwhec.clouds.registered_views import ObjectOptions
 from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, FileFormatError, RigError
 from gtsam_rwhec.files.progress import Progress
@@ -227,7 +228,7 @@ def _best(folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progre
     at = posed[np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).round().astype(int))]
     seen = {int(i): cloud for i in at if (cloud := _read(clouds.files[i], clouds.unit_m)) is not None}
     at = np.array(list(seen))
-    spacing = spacing_of([cloud.points for cloud in seen.values()])
+    spacing = spacing_of([cloud.points for cloud in seen.values()], len(seen))
     surfaces = [surface_of(cloud, clouds.files[i].name, spacing) for i, cloud in seen.items()]
     misfits = []
     for number, reading in enumerate(readings, start=1):

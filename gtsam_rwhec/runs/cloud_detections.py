@@ -199,5 +199,5 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
                 pairs.i.tolist(), pairs.j.tolist(), pairs.overlap, off, slides.tolist(), strict=True
             )
         ),
-        remarks=tuple(f"{finding}." for finding in (*seen.left_out.values(), *seen.findings)),
+        remarks=tuple(f"{finding}." for finding in seen.left_out.values()),
     )

@@ -64,7 +64,7 @@ def thing(shape: Shape, seed: Seed) -> Distance:
         def relief(p: Array) -> Array:
             squares = ((p[:, None, :2] - places) ** 2).sum(axis=2)
             height = np.exp(-squares / (2.0 * 0.012**2)) @ heights
-            return 0.8 * np.maximum(_box(p, np.array([0.08, 0.06, 0.01])), p[:, 2] - 0.005 - height)
+            return np.asarray(0.8 * np.maximum(_box(p, np.array([0.08, 0.06, 0.01])), p[:, 2] - 0.005 - height))
 
         return relief
     if shape == "bust":
@@ -72,7 +72,8 @@ def thing(shape: Shape, seed: Seed) -> Distance:
         return lambda p: _balls(p, centres, radii, 0.004)
     centres, radii = draw.uniform(-0.05, 0.05, (7, 3)), draw.uniform(0.012, 0.022, 7)
     centres[:, 2] = 0.4 * radii
-    return lambda p: np.asarray(np.minimum(_balls(p, centres, radii, 5e-4), _box(p + [0, 0, 0.005], np.array([0.08, 0.08, 0.005]))))
+    table, below = np.array([0.08, 0.08, 0.005]), np.array([0.0, 0.0, 0.005])
+    return lambda p: np.asarray(np.minimum(_balls(p, centres, radii, 5e-4), _box(p + below, table)))
 
 
 def seen_points(distance: Distance, T_object_camera: Array, noise_m: float, seed: Seed) -> Array:
@@ -147,7 +148,6 @@ def clouds_of_thing(
     away = AWAY_M * looks.uniform(0.9, 1.1, views)
     T_object_sensor = se3.pose(R, looks.normal(0.0, ASIDE_M, (views, 3)) - away[:, None] * R[:, :, 2])
     A = Y @ se3.inverse(T_object_sensor) @ se3.inverse(X)
-    clouds = [
-        Cloud.of(seen_points(distance, T, noise_m, points), source=f"{shape} {k}") for k, T in enumerate(T_object_sensor)
-    ]
+    seen = (seen_points(distance, T, noise_m, points) for T in T_object_sensor)
+    clouds = [Cloud.of(each, source=f"{shape} {k}") for k, each in enumerate(seen)]
     return SimulatedClouds(clouds, perturb(A, noise_in_A, arm), Y, X, se3.inverse(T_object_sensor))

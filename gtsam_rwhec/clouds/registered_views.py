@@ -1,0 +1,230 @@
+"""Registrations of pairs of views and the certified pose of the sensor on its carrier, in turn until both are still."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import chain, islice
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.first_registration import Start, first_poses
+from gtsam_rwhec.clouds.registration import Registrations, aligned, overlapping_pairs, registered
+from gtsam_rwhec.clouds.surfaces import FEWEST_POINTS, FINER, Spacing, Surface, spacing_of, surface_of
+from gtsam_rwhec.errors import CloudError, RwhecWarning
+from gtsam_rwhec.geometry.poses import Array, PoseLike, PosesLike, as_transforms, one_transform
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.certificate import Status
+from gtsam_rwhec.solver.solution import solve
+
+#: Fewer views leave the sensor's pose on its carrier free.
+FEWEST_VIEWS = 3
+#: Rounds of registrations and certified solutions.
+ROUNDS = 4
+#: Gates of GICP, and of points to planes after it, in spacings.
+WIDE, GATE = 4.0, 2.0
+#: A round is the last if predicted poses move by less than this share of the spacing.
+STILL = 0.05
+#: Added to variances (rad^2, m^2): arms and registrations are no better.
+TINY = 1e-12
+#: Registrations that differ from the poses by more than this share of the thing's size are none of this thing.
+CONTRADICTION = 0.15
+#: The spacing is taken from this many views.
+SPACED = 9
+#: The name of the sensor in problems of motions.
+SENSOR = "sensor"
+
+
+@dataclass(frozen=True)
+class ObjectOptions:
+    """Options of `seen_object` and `motions`; the defaults leave every choice to the clouds."""
+
+    #: T_sensorcarrier_sensor, roughly, where the clouds alone leave a choice. None: it is searched for.
+    start: PoseLike | None = None
+    #: Distance (m) of neighbouring points after thinning. None: about 3000 points a view.
+    spacing_m: float | None = None
+
+
+class ViewFault(StrEnum):
+    """What is wrong with a view."""
+
+    #: It overlaps no other view where the carrier's pose puts it.
+    APART = "apart"
+    #: It shows the thing elsewhere than the carrier's pose and all other views do.
+    MOVED = "moved"
+    #: Too few of its points are left to tell a pose.
+    FEW_POINTS = "few_points"
+
+
+@dataclass(frozen=True)
+class ViewFinding:
+    """A view that is left out, and why (the thing was ``off_m`` elsewhere); ``str()`` is a sentence."""
+
+    view: int
+    name: str
+    fault: ViewFault
+    off_m: float = 0.0
+    neighbours: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if self.fault is ViewFault.MOVED:
+            return (
+                f"{self.name} shows the thing {1e3 * self.off_m:.1f} mm from where its pose puts it: it was elsewhere in "
+                "this view alone, or the pose is of another"
+            )
+        if self.fault is ViewFault.FEW_POINTS:
+            return f"{self.name} has too few points to tell a pose"
+        return (
+            f"{self.name} overlaps no view of the others where its pose puts it (nearest by rotation: "
+            f"{', '.join(self.neighbours)}): it sees another side, the thing moved, or the pose is of another view"
+        )
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views that have a surface: their places among all, surfaces, and A of these."""
+
+    at: np.ndarray
+    surfaces: Sequence[Surface]
+    A: Array
+    spacing: Spacing
+
+    def selected(self, mask: np.ndarray) -> Views:
+        """The views where ``mask`` is true."""
+        surfaces = [each for each, yes in zip(self.surfaces, mask, strict=True) if yes]
+        return Views(self.at[mask], surfaces, self.A[mask], self.spacing)
+
+
+def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> tuple[Views, list[ViewFinding]]:
+    """The surfaces of all views, and those that have too few points."""
+    transforms = as_transforms(A, None, "A")
+    given = iter(clouds)
+    first = list(islice(given, SPACED))
+    spacing = spacing_of([each.points for each in first], len(transforms)) if len(transforms) else Spacing(0.0, 0.0)
+    if options.spacing_m is not None:
+        spacing = Spacing(options.spacing_m, spacing.edges_m and options.spacing_m / FINER)
+    surfaces, few = [], []
+    for view, cloud in enumerate(chain(first, given)):
+        surface = surface_of(cloud, f"view {view}" + (f" ({cloud.source})" if cloud.source else ""), spacing)
+        if len(surface.faces.points) < FEWEST_POINTS:
+            few.append(ViewFinding(view, surface.name, ViewFault.FEW_POINTS))
+        surfaces.append(surface)
+    if len(surfaces) != len(transforms):
+        raise CloudError(f"{len(surfaces)} clouds and {len(transforms)} poses in A; give one A for each cloud")
+    at = np.setdiff1d(np.arange(len(surfaces)), [each.view for each in few])
+    if len(at) < FEWEST_VIEWS:
+        raise CloudError(
+            f"{len(at)} views have {FEWEST_POINTS} points and more; at least {FEWEST_VIEWS} are needed, and about ten are "
+            "good" + "".join(f"; {each}" for each in few)
+        )
+    return Views(at, [surfaces[k] for k in at], transforms[at], spacing), few
+
+
+def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrations, Array, bool]:
+    """Registrations of pairs and the certified pose of the sensor on its carrier, in turn until both are still."""
+    spacing = views.spacing.faces_m
+    Y = _first(views, options).T_sensorcarrier_sensor
+    i, j = overlapping_pairs(views.surfaces, se3.inverse(views.A) @ Y, GATE * spacing)
+    starts = np.zeros((0, 4, 4))
+    is_certified = False
+    for _ in range(ROUNDS):
+        poses = se3.inverse(views.A) @ Y
+        predicted = se3.inverse(poses[i]) @ poses[j]
+        if not len(starts):
+            tried = zip(i, j, predicted, strict=True)
+            starts = np.array([aligned(views.surfaces, *pair, WIDE * spacing) for pair in tried])
+        pairs = registered(views.surfaces, views.A, i, j, starts, predicted, GATE * spacing)
+        if len(pairs) < FEWEST_VIEWS - 1:
+            raise CloudError(_no_overlap(views, i, j))
+        i, j, starts = pairs.i, pairs.j, pairs.B
+        before = Y
+        Y, is_certified = certified_pose(pairs, Y)
+        moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
+        if np.ptp(moved, axis=0).max() < STILL * spacing:
+            break
+    off = np.linalg.norm(_at_middle(views, poses[pairs.i] @ pairs.B - poses[pairs.j], pairs.j), axis=1)
+    size = float(np.median([each.size_m for each in views.surfaces]))
+    if np.median(off) > CONTRADICTION * size:
+        raise CloudError(
+            f"registrations of the clouds contradict the poses: they differ by {1e3 * np.median(off):.1f} mm (median "
+            f"of {len(off)} pairs of views) for a thing of {1e3 * size:.0f} mm. Look whether the thing stood still, and "
+            "whether A is T_sensorcarrier_targetcarrier with the right order of angles"
+        )
+    return pairs, Y, is_certified
+
+
+def _at_middle(views: Views, change: Array, at: np.ndarray) -> Array:
+    """How far (M, 3) changes of poses (M, 4, 4) move the middle of each view, m."""
+    middle = np.array([each.faces.points.mean(axis=0) for each in views.surfaces])[at]
+    return np.asarray(np.einsum("nij,nj->ni", change[:, :3, :3], middle) + change[:, :3, 3])
+
+
+def certified_pose(pairs: Registrations, Y: Array) -> tuple[Array, bool]:
+    """The sensor's pose (4, 4) on its carrier by motions, and whether it is certified; ``Y`` is the one before."""
+    off = se3.logmap(se3.inverse(pairs.B) @ se3.inverse(Y) @ pairs.A @ Y)
+    # What A is off counts as well, and is the same in all directions.
+    floor = np.median(off**2, axis=0).reshape(2, 3).mean(axis=1).repeat(3)
+    problem = Problem()
+    covariances = pairs.covariances + np.diag(floor + TINY)
+    problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=covariances, directional=True)
+    with warnings.catch_warnings():
+        # The caller's own problem is judged by `calibrate`, with A's noise.
+        warnings.simplefilter("ignore", RwhecWarning)
+        solution = solve(problem)
+    return solution.Y[SENSOR].matrix(), solution.certificate.status is Status.CERTIFIED
+
+
+def _first(views: Views, options: ObjectOptions) -> Start:
+    """The one start that explains the clouds; a CloudError if there are none or several."""
+    guess = None if options.start is None else one_transform(options.start, "ObjectOptions.start")
+    spacing = views.spacing.faces_m
+    found = first_poses(views.surfaces, views.A, spacing, guess)
+    if not found[0].explains:
+        raise CloudError(_unexplained(views, found[0].misfit))
+    if len(found) > 1:
+        words = "; ".join(
+            f"translation {np.round(1e3 * each.T_sensorcarrier_sensor[:3, 3], 1)} mm, rotation vector "
+            f"{np.round(np.degrees(se3.so3_logmap(each.T_sensorcarrier_sensor[None, :3, :3])[0]), 1)} degrees"
+            for each in found
+        )
+        raise CloudError(
+            f"{len(found)} poses of the sensor on its carrier explain the clouds equally well ({words}): the thing looks "
+            "the same from several sides. State roughly where the sensor is (ObjectOptions.start), or take a thing "
+            "without symmetry"
+        )
+    return found[0]
+
+
+def _unexplained(views: Views, misfit: float) -> str:
+    """Words for poses that explain nothing: the reading of them that would explain the clouds, if there is one."""
+    shorter, longer = views.A.copy(), views.A.copy()
+    shorter[:, :3, 3] *= 1e-3
+    longer[:, :3, 3] *= 1e3
+    rows = "the poses belong to other views: with A shifted by {} row the clouds fit"
+    unit = "{} look like millimetres, and {} like metres: with A's translations times {} the clouds fit"
+    readings = {
+        rows.format("one"): np.roll(views.A, 1, axis=0),
+        rows.format("minus one"): np.roll(views.A, -1, axis=0),
+        unit.format("poses", "clouds", "0.001"): shorter,
+        unit.format("clouds", "poses", "1000"): longer,
+        "A is inverted: give T_sensorcarrier_targetcarrier, with which the clouds fit": se3.inverse(views.A),
+    }
+    for words, A in readings.items():
+        best = first_poses(views.surfaces, A, views.spacing.faces_m)[0]
+        if best.explains and best.misfit < 0.6 * misfit:
+            return words
+    names = f"{views.surfaces[0].name} to {views.surfaces[-1].name}"
+    return (
+        f"{names}: at no pose of the sensor on its carrier do the clouds overlap (misfit {misfit:.2f}; 0 is perfect, 1 "
+        "is apart). Look whether the thing stood still, whether A is T_sensorcarrier_targetcarrier with the right unit "
+        "and order of angles, and whether neighbouring views share a third of what they see"
+    )
+
+
+def _no_overlap(views: Views, i: np.ndarray, j: np.ndarray) -> str:
+    pairs = ", ".join(f"{views.at[a]} and {views.at[b]}" for a, b in zip(i, j, strict=True))
+    return f"views do not overlap where their poses put them (tried: {pairs or 'no pair shares a fifth of its points'})"
