@@ -18,7 +18,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.cloud_detections import detect_in_clouds
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
-from gtsam_rwhec.runs.kept_detections import KeptOfLog
+from gtsam_rwhec.runs.kept_detections import KeptDetections, KeptOfLog
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
@@ -142,8 +142,9 @@ def detected(
     for sensor, source in rig.sensors.items():
         if source.detections is not None:
             found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
+    in_file = kept if isinstance(kept, KeptDetections) else None  # a session in memory has no clouds
     registered = {
-        sensor: detect_in_clouds(log, rig, sensor, cameras.pop(sensor, None), motion, progress=tell, kept=kept)
+        sensor: detect_in_clouds(log, rig, sensor, cameras.pop(sensor, None), motion, progress=tell, kept=in_file)
         for sensor, source in rig.sensors.items()
         if source.clouds is not None
     }
