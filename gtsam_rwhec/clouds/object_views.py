@@ -20,6 +20,7 @@ from gtsam_rwhec.clouds.registered_views import (
     ViewFinding,
     Views,
     certified_pose,
+    check_agreement,
     prepared,
     registered_in_turn,
 )
@@ -121,6 +122,7 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, inside, GATE * views.spacing.faces_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
     stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
+    check_agreement(kept, inside, Y)
     out += [_moved(kept, k, far) for k, far in stays.items()]
     B = se3.inverse(joint.T_common_sensor) @ origin
     turn = se3.adjoint(se3.inverse(B))
@@ -150,7 +152,9 @@ def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None
     Arguments and errors as in `seen_object`, which is better where the sensor sees one thing: it registers all at once.
     """
     views, _ = prepared(clouds, A, options or ObjectOptions())
-    return registered_in_turn(views, options or ObjectOptions())[0].renamed(views.at)
+    registrations, Y = registered_in_turn(views, options or ObjectOptions())
+    check_agreement(views, registrations, Y)
+    return registrations.renamed(views.at)
 
 
 def _where_it_was(

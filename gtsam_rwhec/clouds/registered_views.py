@@ -109,7 +109,9 @@ class Views:
 
 def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> tuple[Views, list[ViewFinding]]:
     """The surfaces of all views, and those that have too few points."""
-    transforms = rows_to_transforms(checked_rows(as_transforms(A, None, "A"), 0, "A").rows)
+    transforms = as_transforms(A, None, "A")
+    if len(transforms):
+        transforms = rows_to_transforms(checked_rows(transforms, 0, "A").rows)
     given = iter(clouds)
     first = list(islice(given, SPACED))
     spacing = spacing_of([each.points for each in first], len(transforms)) if len(transforms) else Spacing(0.0, 0.0)
@@ -154,6 +156,12 @@ def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrati
         moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
         if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
+    return pairs, Y
+
+
+def check_agreement(views: Views, pairs: Registrations, Y: Array) -> None:
+    """Raise a CloudError if registrations are none of a thing that stood still at these poses."""
+    poses = se3.inverse(views.A) @ Y
     off = np.linalg.norm(_at_middle(views, poses[pairs.i] @ pairs.B - poses[pairs.j], pairs.j), axis=1)
     size = float(np.median([each.size_m for each in views.surfaces]))
     if np.median(off) > CONTRADICTION * size:
@@ -162,7 +170,6 @@ def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrati
             f"of {len(off)} pairs of views) for a thing of {1e3 * size:.0f} mm. Look whether the thing stood still, "
             "and whether A is T_sensorcarrier_targetcarrier with the right order of angles"
         )
-    return pairs, Y
 
 
 def _at_middle(views: Views, change: Array, at: np.ndarray) -> Array:

@@ -49,7 +49,7 @@ def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
     for covariance in (of_David, of_Plane):
         assert difference @ np.linalg.solve(covariance, difference) < CHI2_95
     to_David = apart(Sphere, David)
-    assert to_David @ np.linalg.solve(of_Sphere, to_David) < CHI2_95
+    assert to_David @ np.linalg.solve(of_Sphere + of_David, to_David) < CHI2_95
 
 
 @pytest.mark.parametrize("shape", ["bust", "cube"])
