@@ -278,7 +278,7 @@ def free_space_of(
         J_t, J_R = costs_of_pairs(part, poses)
         if fitted is not None:  # the costs that these factors predict, 3 / 2 for each measurement
             factors = np.array([fitted[pair] for pair in part.pairs])
-            J_R, J_t = 1.5 * part.moments.count * factors[:, 0], 1.5 * part.moments.count * factors[:, 1]
+            J_R, J_t = (0.5 * part.equations * factors).T
         known, free = identify_with_basis(part, poses, J_t, J_R)
         directions += known.free_directions
         basis = np.zeros((size, free.shape[1]))

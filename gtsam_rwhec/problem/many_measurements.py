@@ -29,7 +29,7 @@ _OF_FRONT = np.searchsorted(FRONT, FRONT_ENTRIES[0]), np.searchsorted(FRONT, FRO
 class Sorted:
     """Measurements of P pairs, sorted by pair: those of pair p are ``first[p]:first[p + 1]``.
 
-    A, B (N, 4, 4); sigma, kappa () or (N,); stamps_ns (N,), covariances (N, 6, 6) and pixels (N, n, 2), or None.
+    A, B (N, 4, 4); sigma, kappa () or (N,); stamps_ns (N,), covariances (N, 6, 6), pixels (N, n, 2) and kinds (N,), or None.
     ``given`` (N,): their places in the user's arrays, for messages; None where these have the same order.
     """
 
@@ -44,6 +44,7 @@ class Sorted:
     stamps_ns: np.ndarray | None = None
     covariances: Array | None = None
     pixels: Array | None = None
+    kinds: np.ndarray | None = None
 
     @staticmethod
     def of(pair: Pair, raw: Measurements, source: str = "") -> Sorted:
@@ -218,9 +219,10 @@ class Section:
             np.broadcast_to(value, at.stop - at.start) if value.ndim == 0 else value[at]
             for value in (many.sigma, many.kappa)
         )
-        of_all = many.stamps_ns, many.covariances, many.pixels
-        stamps, covariances, pixels = (None if each is None else each[at] for each in of_all)
-        return Measurements(many.A[at], many.B[at], sigma, kappa, stamps, covariances, pixels)
+        of_all = many.stamps_ns, many.covariances, many.pixels, many.kinds
+        return Measurements(
+            many.A[at], many.B[at], sigma, kappa, *(None if each is None else each[at] for each in of_all)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +234,11 @@ class KeptMeasurements:
 
     def __add__(self, other: KeptMeasurements) -> KeptMeasurements:
         return KeptMeasurements(self.stored + other.stored, self.has_covariances or other.has_covariances)
+
+    @property
+    def has_kinds(self) -> bool:
+        """Whether any batch weighs by direction."""
+        return any(each.many.kinds is not None for each in self.stored)
 
     @property
     def batches(self) -> tuple[Measurements, ...]:
@@ -255,7 +262,15 @@ class KeptMeasurements:
             np.concatenate(stamps) if len(stamps) == len(batches) else None,
             np.concatenate([b.covariance_of_B() for b in batches]) if self.has_covariances else None,
             self._pixels(),
+            self._kinds(),
         )
+
+    def _kinds(self) -> np.ndarray | None:
+        """Which parts are measured; None where every batch has whole poses."""
+        batches = self.batches
+        if all(b.kinds is None for b in batches):
+            return None
+        return np.concatenate([np.zeros(len(b.A), dtype=np.int8) if b.kinds is None else b.kinds for b in batches])
 
     def _pixels(self) -> Array | None:
         """Corners of all batches; nan for those that were given as poses."""

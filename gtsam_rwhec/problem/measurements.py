@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -47,6 +48,20 @@ class Pair(NamedTuple):
         return self.label
 
 
+class Kind(IntEnum):
+    """Which parts of a measurement of a pose are measured."""
+
+    #: The whole pose; the certified solution takes the mean variance of its rotation and of its translation.
+    POSE = 0
+    #: The whole pose, whose noise differs by direction: what slides has next to no weight.
+    DIRECTIONAL = 1
+    #: A point of the target: its origin. The rotation means nothing.
+    POINT = 2
+    #: A plane of the target: z is its normal, the origin lies in it. The turn about z and the place in the plane mean
+    #: nothing.
+    PLANE = 3
+
+
 #: Values by pair as users give them: a key may be a plain tuple.
 ByPair: TypeAlias = Mapping[Pair, Value] | Mapping[tuple[str, str], Value]
 
@@ -64,6 +79,7 @@ class Measurements:
     sigma and kappa (N,) are the standard deviation of B's translation in metres and the concentration of B's rotation;
     stamps_ns (N,) integer nanoseconds; covariances (N, 6, 6) those of B, rotation first, right perturbation. pixels (N,
     n, 2) are the target's corners in the images that B is from, nan where one was not seen or B was given as a pose.
+    kinds (N,) say which parts of a measurement are measured (`Kind`); None where all are whole poses.
     """
 
     A: Array
@@ -73,6 +89,7 @@ class Measurements:
     stamps_ns: np.ndarray | None = None
     covariances: Array | None = None
     pixels: Array | None = None
+    kinds: np.ndarray | None = None
 
     def covariance_of_B(self) -> Array:
         """(N, 6, 6), rotation first: as given, or diagonal with 1 / (2 kappa) and sigma^2."""
@@ -87,9 +104,9 @@ class Measurements:
         return replace(self, **{name: array[mask] for name, array in arrays.items() if array is not None})
 
     @property
-    def options(self) -> tuple[np.ndarray | None, Array | None, Array | None]:
-        """Stamps, covariances and pixels."""
-        return self.stamps_ns, self.covariances, self.pixels
+    def options(self) -> tuple[np.ndarray | None, Array | None, Array | None, np.ndarray | None]:
+        """Stamps, covariances, pixels and kinds."""
+        return self.stamps_ns, self.covariances, self.pixels, self.kinds
 
 
 @dataclass(frozen=True)
@@ -105,6 +122,7 @@ class GivenMeasurements:
     covariances: ArrayLike | None
     source: str | None
     pixels: Array | None = None
+    kind: Kind = Kind.POSE
 
     def check_source(self) -> None:
         """Raise an OptionError for a source that is no text."""
@@ -137,10 +155,35 @@ class GivenMeasurements:
                     f"{where}: covariances and {'sigma' if sigma is not None else 'kappa'} are given; give covariances "
                     "alone, or sigma and kappa (the certified solution uses the mean variance of each block)"
                 )
-            variances = np.einsum("nii->ni", covariances)
-            sigma, kappa = np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
+            if self.kind is not Kind.POSE:
+                sigma, kappa = mean_noise(covariances)
+            else:
+                variances = np.einsum("nii->ni", covariances)
+                sigma, kappa = np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
         sigma, kappa = (positive_weights(x, len(A), name, where) for name, x in (("sigma", sigma), ("kappa", kappa)))
-        return Measurements(A, B, sigma, kappa, stamps_ns, covariances, self.pixels)
+        kinds = None if self.kind is Kind.POSE else np.full(len(A), self.kind, dtype=np.int8)
+        return Measurements(A, B, sigma, kappa, stamps_ns, covariances, self.pixels, kinds)
+
+
+def mean_noise(covariances: Array) -> tuple[Array, Array]:
+    """sigma and kappa (N,) of the directions that covariances (N, 6, 6) measure; directions of no weight do not count."""
+    of_rotation, of_translation = (
+        measured_mean(np.linalg.eigvalsh(np.linalg.inv(covariances[:, block, block])))
+        for block in (slice(0, 3), slice(3, 6))
+    )
+    return 1.0 / np.sqrt(of_translation), 0.5 * of_rotation
+
+
+#: A direction is measured where its information is at least this part of the block's largest.
+MEASURED = 1e-6
+
+
+def measured_mean(information: Array) -> Array:
+    """The mean (N,) of the eigenvalues (N, 3) of an information matrix that are no less than rounding."""
+    largest = information.max(axis=1, keepdims=True)
+    has = information >= MEASURED * largest
+    mean: Array = np.where(has, information, 0.0).sum(axis=1) / has.sum(axis=1)
+    return mean
 
 
 def positive_weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:

@@ -7,10 +7,19 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
+from gtsam_rwhec.errors import (
+    CountError,
+    FrameError,
+    MeasurementsNotKeptError,
+    NoiseError,
+    OptionError,
+    RotationsProjectedWarning,
+    ScaleError,
+)
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.accumulation import Accumulator
@@ -22,10 +31,12 @@ from gtsam_rwhec.problem.corners import (
     check_in_image,
     seen_corners,
 )
+from gtsam_rwhec.problem.directions import planes_as_given, points_as_given, unseen_by
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
 from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section, Sorted
 from gtsam_rwhec.problem.measurements import (
     GivenMeasurements,
+    Kind,
     LongTranslations,
     Measurements,
     Pair,
@@ -67,6 +78,13 @@ def check_measurements(measurements: object) -> None:
                 f"measurements has a {type(raw).__name__} for {brief(pair)}; give "
                 "{Pair(target, sensor): Measurements}"
             )
+
+
+def _kind_of(covariances: ArrayLike | None, directional: bool) -> Kind:  # noqa: FBT001
+    """The kind of a batch of poses."""
+    if directional and covariances is None:
+        raise NoiseError("directional=True weighs by direction; give covariances, which have the directions")
+    return Kind.DIRECTIONAL if directional else Kind.POSE
 
 
 class Problem(Knowledge):
@@ -126,6 +144,7 @@ class Problem(Knowledge):
         stamps_ns: ArrayLike | None = None,
         covariances: ArrayLike | None = None,
         source: str | None = None,
+        directional: bool = False,
     ) -> None:
         """Add measurements of a target by a sensor; any number of batches, in any order.
 
@@ -148,14 +167,108 @@ class Problem(Knowledge):
             Refinement uses the whole matrix, the certified solution the mean variance of each block.
         source : str, optional
             Where the measurements come from (a file, a topic); errors name it.
+        directional : bool
+            The certified solution too weighs each measurement by its whole covariance: a direction in which B slides
+            (a very large variance) has next to no weight. Needs ``covariances`` and kept measurements.
 
         Raises
         ------
         PoseError, CountError, NoiseError, FrameError, StampError
             A name, pose, weight, stamp or covariance is not valid; nothing of the batch is added then.
         """
-        given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
+        kind = _kind_of(covariances, directional)
+        given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source, kind=kind)
         self.add_batch(seen_pair(target, sensor), given)
+
+    def add_points(
+        self,
+        target: str,
+        sensor: str,
+        A: PosesLike,
+        points: ArrayLike,
+        sigma: ArrayLike | None = None,
+        *,
+        covariances: ArrayLike | None = None,
+        order: QuaternionOrder | None = None,
+        stamps_ns: ArrayLike | None = None,
+        source: str | None = None,
+    ) -> None:
+        """Add measurements of one fixed point of a target: the centre of a sphere, a reflector, a tool's tip.
+
+        The point is the target's origin. Where nothing else tells the target's rotation it means nothing: its axes are
+        then those of its carrier, by convention.
+
+        Parameters
+        ----------
+        target, sensor : str
+            Names, unique across targets and sensors.
+        A : (N, 4, 4) array, list of gtsam.Pose3, or (N, 7) rows of quaternion and translation
+            T_sensorcarrier_targetcarrier at each measurement; metres.
+        points : (N, 3)
+            The point in the sensor's frame, metres.
+        sigma : float or (N,), optional
+            Standard deviation of a point along each axis, metres.
+        covariances : (3, 3) or (N, 3, 3), optional
+            Covariances of the points in the sensor's axes, m^2, in place of sigma.
+        order, stamps_ns, source
+            As in ``add``.
+
+        Raises
+        ------
+        PoseError, CountError, NoiseError, FrameError, StampError, MeasurementsNotKeptError
+            As in ``add``; or the problem keeps moments only.
+        """
+        pair = seen_pair(target, sensor)
+        where = f"{pair} ({source})" if source else pair.label
+        self.add_batch(pair, points_as_given(A, points, sigma, covariances, order, stamps_ns, source, where))
+
+    def add_planes(
+        self,
+        target: str,
+        sensor: str,
+        A: PosesLike,
+        normals: ArrayLike,
+        points_on_plane: ArrayLike,
+        normal_rad: ArrayLike,
+        offset_m: ArrayLike,
+        *,
+        order: QuaternionOrder | None = None,
+        stamps_ns: ArrayLike | None = None,
+        source: str | None = None,
+    ) -> None:
+        """Add measurements of one fixed plane of a target, as a LiDAR sees a board or a depth camera the floor.
+
+        The plane is the target's plane z = 0, and z is its normal. Where nothing else tells the rest of the target's
+        pose it means nothing: by convention the origin is then the plane's point nearest to the carrier's origin, and
+        x is as near as may be to the carrier's x axis (to y where the normal is near x).
+
+        Parameters
+        ----------
+        target, sensor : str
+            Names, unique across targets and sensors.
+        A : (N, 4, 4) array, list of gtsam.Pose3, or (N, 7) rows of quaternion and translation
+            T_sensorcarrier_targetcarrier at each measurement; metres.
+        normals : (N, 3)
+            Unit normals in the sensor's frame, all towards the same side of the plane.
+        points_on_plane : (N, 3)
+            A point of each plane in the sensor's frame, metres: the middle of the points that the plane was fitted to.
+        normal_rad : float or (N,)
+            Standard deviation of the normal about each axis in the plane, rad.
+        offset_m : float or (N,)
+            Standard deviation of the plane along its normal at the given point, metres.
+        order, stamps_ns, source
+            As in ``add``.
+
+        Raises
+        ------
+        PoseError, CountError, NoiseError, FrameError, StampError, MeasurementsNotKeptError
+            As in ``add``; or a normal is no unit vector, or the problem keeps moments only.
+        """
+        pair = seen_pair(target, sensor)
+        where = f"{pair} ({source})" if source else pair.label
+        noise = normal_rad, offset_m
+        given = planes_as_given(A, normals, points_on_plane, *noise, order, stamps_ns, source, where)
+        self.add_batch(pair, given)
 
     def add_many(
         self,
@@ -283,13 +396,15 @@ class Problem(Knowledge):
         stamps_ns: ArrayLike | None = None,
         covariances: ArrayLike | None = None,
         source: str | None = None,
+        directional: bool = False,
     ) -> None:
         """Add motions of a sensor and its carrier: A Y = Y B (AX = XB). Arguments and errors as in ``add``.
 
         A is the carrier's motion and B the motion that the sensor measured, both T_before_after.
         """
         check_name(sensor, "the sensor's name")
-        given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
+        kind = _kind_of(covariances, directional)
+        given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source, kind=kind)
         self.add_batch(Pair(sensor, sensor), given)
 
     def add_batch(self, pair: Pair, given: GivenMeasurements, long: list[LongTranslations] | None = None) -> None:
@@ -301,6 +416,8 @@ class Problem(Knowledge):
         given.check_source()
         where = f"{pair} ({given.source})" if given.source else pair.label
         self._check_names(pair, where)
+        if given.kind is not Kind.POSE:
+            self._check_can_weigh(where)
         many = Sorted.of(pair, given.checked(where), f" ({given.source})" if given.source else "")
         self._add(many, where, given.has_noise, stacklevel=4, long=long)
 
@@ -330,6 +447,19 @@ class Problem(Knowledge):
             self._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
             kept = KeptMeasurements((Section(many, number),), has_covariances) if self.keep_measurements else nothing
             self._kept[pair] = self._kept[pair] + kept if pair in self._kept else kept
+
+    def _check_can_weigh(self, where: str) -> None:
+        """Refuse measurements that weigh by direction where the certified form cannot hold them."""
+        if not self.keep_measurements:
+            raise MeasurementsNotKeptError(
+                f"{where}: measurements that weigh by direction are kept one by one, and this problem keeps none "
+                "(keep_measurements=False); make it with keep_measurements=True"
+            )
+        if self.scale == "per_target":
+            raise ScaleError(
+                f"{where}: with scale='per_target' the certified form cannot weigh by direction; take scale='known', or "
+                "'shared' for one unknown scale"
+            )
 
     def _check_names(self, pair: Pair, where: str) -> None:
         for name, kind in zip(pair, SIDES, strict=True):
@@ -394,6 +524,22 @@ class Problem(Knowledge):
     def has_covariances(self) -> bool:
         """Whether any measurement has a full covariance (refinement alone uses it)."""
         return any(kept.has_covariances for kept in self._kept.values())
+
+    @property
+    def directed(self) -> frozenset[Pair]:
+        """The pairs with measurements that weigh by direction; all of such a pair's measurements do."""
+        return frozenset(pair for pair, kept in self._kept.items() if kept.has_kinds)
+
+    def unseen(self, name: str) -> np.ndarray:
+        """(6,): which directions [omega, v] of a frame's own axes mean nothing: nothing that was stated sees them."""
+        kept = [kept for pair, kept in self._kept.items() if name in pair]
+        of_target = name not in self.fixed and self._kind.get(name) == "target"
+        if not of_target or not all(each.has_kinds for each in kept):
+            return np.zeros(6, dtype=bool)
+        unseen = np.logical_and.reduce([unseen_by(batch) for each in kept for batch in each.batches])
+        for prior in self.priors.get(name, []):
+            unseen &= ~np.repeat([prior.kappa is not None, prior.sigma is not None], 3)
+        return np.asarray(unseen)
 
     @property
     def has_measurements(self) -> bool:

@@ -172,6 +172,11 @@ def given_poses(part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]
     return np.array(poses).reshape(-1, 4, 4)
 
 
+def poses_of(X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]) -> dict[str, Array]:
+    """The user's poses (4, 4) by name."""
+    return {name: one_transform(T, f"the pose of {name}") for name, T in (*X.items(), *Y.items())}
+
+
 def _scale_of(name: str, scale: float | Mapping[str, float]) -> float:
     """A frame's own scale: its entry, or the one number for all."""
     if isinstance(scale, Mapping) and name not in scale:
@@ -231,6 +236,11 @@ def costs_of_pairs(part: Part, poses: PairPoses) -> tuple[Array, Array]:
         squares = moments.kappa[at] * ((R_X**2).sum(axis=(1, 2)) + (R_Y**2).sum(axis=(1, 2)))
         cross = moments.rotations(at).reshape(k, 3, 3, 3, 3)
         J_R[at] = 0.5 * squares - np.einsum("ekp,ekp->e", np.einsum("eikpq,eip->ekq", cross, R_X), R_Y)
+    for directed in part.directed:
+        e, alpha = directed.e, poses.alpha[directed.e]
+        t = alpha * np.r_[poses.t_X[e], poses.t_Y[e], 1.0]
+        x = np.r_[t, poses.R_X[e].T.ravel(), poses.R_Y[e].T.ravel()]
+        J_t[e], J_R[e] = directed.costs(*part.centres(e), x)
     return np.maximum(J_t, 0.0), np.maximum(J_R, 0.0)  # zero may round to a negative number
 
 

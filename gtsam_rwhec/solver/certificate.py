@@ -11,6 +11,7 @@ from math import fsum
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.directed_pairs import Convention
 from gtsam_rwhec.solver.parts import Kind, Part
 from gtsam_rwhec.solver.region import Region
 
@@ -195,18 +196,21 @@ class Objective:
     origin, as its rotation residual acts on the lever arm t_X: it is about ``origin_m`` in the target carrier's frame,
     metres (A becomes A T(origin_m), X becomes T(-origin_m) X), and for motions about ``motion_origin_m`` in the
     sensor's carrier. Both are None for the direct cost, and where unconnected parts differ: ``Solution.parts`` has each
-    part's own.
+    part's own. ``by_direction``: some measurements weigh by their information matrix; its directions are those of the
+    answer of the last round but one, in which nothing moved any more.
     """
 
     form: Kind
     has_priors: bool
     origin_m: tuple[float, float, float] | None = None
     motion_origin_m: tuple[float, float, float] | None = None
+    by_direction: bool = False
 
     @staticmethod
     def of(part: Part) -> Objective:
         """The cost of a part."""
-        objective = Objective(part.kind, bool(part.priors))
+        has_priors = any(not isinstance(each, Convention) for beliefs in part.priors.values() for each in beliefs)
+        objective = Objective(part.kind, has_priors, by_direction=bool(part.directed))
         if part.kind == "direct":
             return objective
         of_motions = _triple(part.gauge.sensor_carrier) if part.moments.motion.any() else None
@@ -221,12 +225,18 @@ class Objective:
             any(o.has_priors for o in objectives),
             origins.pop() if len(origins) == 1 else None,
             of_motions.pop() if len(of_motions) == 1 else None,
+            any(o.by_direction for o in objectives),
         )
 
     def __str__(self) -> str:
         about = ""
         if self.origin_m is not None:
             about = f", about the point ({', '.join(f'{x:.6g}' for x in self.origin_m)}) m of the target carrier"
+        if self.by_direction:
+            about += (
+                "; where measurements weigh by direction, by their information, with the directions of translations at "
+                "the answer of the round before"
+            )
         return _OBJECTIVES[self.form] + about + (", and the priors" if self.has_priors else "")
 
 

@@ -16,8 +16,10 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma, gammas
+from gtsam_rwhec.problem.knowledge import Prior
 from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B
 from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
+from gtsam_rwhec.solver.directed_pairs import Convention
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.parts import Part
 
@@ -85,6 +87,8 @@ def full_forms(part: Part, slots: Slots) -> tuple[BlockMatrix, BlockMatrix]:
             translation = translation[:, SWAPPED[:, None], SWAPPED]
             rotation = rotation.transpose(0, 2, 1)
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
+        for k, directed in part.directed_at(at):
+            of_translations[k], of_rotations[k], _ = directed.forms(*part.centres(directed.e), 0.0)
         has_both, frames = coupled[at], slots.frames[at].T
         of_both = of_translations + of_rotations
         for form, numbers in zip(forms, slots.forms(at, of_both, of_rotations), strict=True):
@@ -157,31 +161,28 @@ def _add_priors(form: BlockMatrix, part: Part) -> None:
         if name not in place:
             continue
         for prior in priors:
-            quadratic = _prior_form(prior.transform, prior.sigma, prior.kappa, part)
+            quadratic = _prior_form(prior, part)
             form.frames[place[name]] += quadratic[used, used]
+            if isinstance(prior, Convention) and used.start:
+                continue  # what means nothing gives the other rotations no sign
             form.tails[place[name], :, 1] += quadratic[used, 13]
             form.tail[1, 1] += quadratic[13, 13]
 
 
-def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) -> Array:
+def _prior_form(prior: Prior, part: Part) -> Array:
     """The form (14, 14) of one prior over [t, s, vec R, h]."""
-    rows = []
-    if sigma is not None:
-        residual = np.zeros((3, 14))
-        residual[:, :3] = np.eye(3)
-        if part.kind == "direct":
-            residual[:, 13] = -T[:3, 3]  # t - t_0 h
-        else:
-            # X = T'^-1: |t_X - t_0| = |t' + R' t_0|, linear in the inverse's t' and R'.
-            residual[:, 4:13] = np.kron(T[:3, 3], np.eye(3))
-        rows.append(residual / sigma)
-    if kappa is not None:
-        residual = np.zeros((9, 14))
-        residual[:, 4:13] = np.eye(9)
-        residual[:, 13] = -as_variable(T, part)[:3, :3].T.ravel()  # r - r_0 h
-        rows.append(residual * np.sqrt(kappa))
-    stacked = np.concatenate(rows)
-    return 0.5 * stacked.T @ stacked
+    T, (along, turns) = prior.transform, prior.weights
+    residual, turn = np.zeros((3, 14)), np.zeros((9, 14))
+    residual[:, :3] = np.eye(3)
+    if part.kind == "direct":
+        residual[:, 13] = -T[:3, 3]  # t - t_0 h
+    else:
+        # X = T'^-1: |t_X - t_0| = |t' + R' t_0|, linear in the inverse's t' and R'.
+        residual[:, 4:13] = np.kron(T[:3, 3], np.eye(3))
+    turn[:, 4:13] = np.eye(9)
+    turn[:, 13] = -as_variable(T, part)[:3, :3].T.ravel()  # r - r_0 h
+    form: Array = 0.5 * (residual.T @ along @ residual + turn.T @ np.kron(turns, np.eye(3)) @ turn)
+    return form
 
 
 def rounding_of_fixed(part: Part) -> Array:
@@ -231,6 +232,9 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
     v[:, 16:25] = 0.5 * np.repeat(square[:, T_B], 3, axis=1)
     v *= 16.0
     v[:, 7:] += (moments.kappa * (1.5 * unit + off))[:, None]
+    reach = rounding_of_fixed(part).sum(axis=(1, 2)) / gamma(1)
+    for e, directed in part.directed_at(slice(0, len(v))):
+        v[e] = directed.forms(*part.centres(e), float(reach[e]))[2] * (1.0 + 2.0 * meeting[e] / directed.count)
     return v
 
 

@@ -12,15 +12,17 @@ c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carri
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import R_A, T_A
 from gtsam_rwhec.solver.answers import PairPoses
 from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
+from gtsam_rwhec.solver.directed_pairs import Convention
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.rotations import HATS
@@ -61,6 +63,8 @@ class PairInformation:
     used: np.ndarray
     motion: np.ndarray  #: (E,): whether both ends are one frame
     owns: np.ndarray  #: (E,): whether the target (or the sensor of motions) has a scale of its own
+    #: By pair (15, 15): of the rotations and translations of measurements that weigh by direction.
+    directed: Mapping[int, tuple[Array, Array]]
 
     def rotation(self, at: slice | np.ndarray = slice(None)) -> Array:
         """The information of some pairs' rotation residuals, (k, 15, 15)."""
@@ -68,8 +72,16 @@ class PairInformation:
         full = np.zeros((len(K), 15, 15))
         full[:, OMEGA_X, OMEGA_X] = full[:, OMEGA_Y, OMEGA_Y] = 2.0 * K[:, None, None] * _EYE
         full[:, OMEGA_X, OMEGA_Y] = -2.0 * (K / self.weight[at])[:, None, None] * self.turned[at]
+        self._put(full, at, 0)
         self._fold(full, at)
         return full
+
+    def _put(self, full: Array, at: slice | np.ndarray, kind: int) -> None:
+        """Replace the information of pairs that weigh by direction: of rotations (0) or of translations (1)."""
+        if self.directed:
+            places = np.arange(len(self.kappa))[at]
+            for k in np.flatnonzero(np.isin(places, list(self.directed))):
+                full[k] = self.directed[int(places[k])][kind]
 
     def translation(self, at: slice | np.ndarray = slice(None)) -> Array:
         """The information of some pairs' translation residuals, (k, 15, 15)."""
@@ -87,6 +99,7 @@ class PairInformation:
         full[:, V_Y, SHARED] = -np.einsum("eij,ej->ei", R_Yt, c)
         full[:, SHARED, SHARED] = square  # c^ c = 0: nothing with omega_Y
         full *= (self.alpha[at] ** 2)[:, None, None]
+        self._put(full, at, 1)
         self._fold(full, at)
         for owns, place in ((self.owns & ~self.motion, OWN_X), (self.owns & self.motion, 13)):
             rows = np.flatnonzero(owns[at])
@@ -135,10 +148,17 @@ def pair_information(part: Part, poses: PairPoses) -> PairInformation:
     used = np.zeros((E, 15), dtype=bool)
     used[:, :6] = (free[:, 0] & ~motion)[:, None]
     used[:, 7:13] = free[:, 1, None]
+    target = part.ends[:, 0]
+    used[free[:, 0], :6] &= ~part.unseen[target[free[:, 0]]]
+    directed = {}
+    for each in part.directed:
+        e = each.e
+        X, Y = pose(poses.R_X[e], poses.t_X[e]), pose(poses.R_Y[e], poses.t_Y[e])
+        directed[e] = each.information(*part.centres(e), X, Y, float(poses.alpha[e]))
     used[:, SHARED] = part.scale == "shared"
     used[:, OWN_X], used[:, 13] = owns & ~motion, owns & motion
     sums = turned, arm, along, lever, lever_squares
-    return PairInformation(moments.kappa, moments.weight, poses.alpha, poses.R_Y, *sums, used, motion, owns)
+    return PairInformation(moments.kappa, moments.weight, poses.alpha, poses.R_Y, *sums, used, motion, owns, directed)
 
 
 def order_of(part: Part) -> Elimination:
@@ -197,6 +217,8 @@ def prior_information(part: Part) -> tuple[Array, Array]:
     rotation, translation = np.zeros((len(part.free), 7)), np.zeros((len(part.free), 7))
     for i, name in enumerate(part.free):
         for prior in part.priors.get(name, []):
+            if isinstance(prior, Convention):
+                continue  # it holds what means nothing
             if prior.kappa is not None:
                 rotation[i, :3] += 2.0 * prior.kappa
             if prior.sigma is not None:

@@ -115,14 +115,13 @@ class MeasuredPriors:
                 (QV, VQV, of_t, of_r, about),
                 (QV_size, VQV_size, t_size, r_size, np.abs(about)),
             ):
-                if prior.sigma is not None:
-                    by[t_rows] += 0.5 / prior.sigma**2 * t
-                    products += 0.5 / prior.sigma**2 * t.T @ t
-                    if self.part.kind == "inverse":
-                        by[r_rows] += 0.5 / prior.sigma**2 * np.kron(s[:, None], t)
-                if prior.kappa is not None:
-                    by[r_rows] += 0.5 * prior.kappa * r
-                    products += 0.5 * prior.kappa * r.T @ r
+                along, turns = (0.5 * weight if by is QV else 0.5 * np.abs(weight) for weight in prior.weights)
+                weighed, turned_r = along @ t, np.kron(turns, np.eye(3)) @ r
+                by[t_rows] += weighed
+                by[r_rows] += turned_r
+                products += t.T @ weighed + r.T @ turned_r
+                if self.part.kind == "inverse":
+                    by[r_rows] += np.kron(s[:, None], weighed)
         unit = gamma(OPERATIONS + len(self.priors) + sum(map(len, self.priors.values())))
         return QV, unit * QV_size, VQV, unit * VQV_size
 
@@ -328,8 +327,9 @@ class MeasuredForm:
         begin, end = at.start, at.start + E
         first, last = (bisect_left(self.given.batches, e, key=lambda batch: batch[0]) for e in (begin, end))
         batches = [(e - begin, raw) for e, raw in self.given.batches[first:last]]
+        directed = list(self.part.directed_at(slice(begin, end)))
         shared = [own for each in self.given.shared if (own := each.of(begin, end)) is not None]
-        return Measured(batches, a, c, self.part.kind == "inverse", shared), coefficients
+        return Measured(batches, a, c, self.part.kind == "inverse", shared, directed), coefficients
 
     # -- results ------------------------------------------------------------------------------------------------
 

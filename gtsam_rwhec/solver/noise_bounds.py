@@ -68,27 +68,27 @@ def variance_factors(part: Part, told: PartInformation, J_t: Array, J_R: Array) 
     """Variance factors from the costs J_t, J_R (E,) of the pairs at the optimum, in the physical model.
 
     A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2), and J_R
-    is sum kappa |dR|_F^2 / 2 = sum kappa theta^2. Both have expectation 3 N / 2, as rotations have variance 1 / (2
+    is sum kappa |dR|_F^2 / 2 = sum kappa theta^2. Both have as expectation half the equations (3 N of poses), as rotations have variance 1 / (2
     kappa) an axis. The part's factors are corrected for the unknowns that were fitted.
     """
-    counts, N = part.moments.count, part.number_of_measurements
-    if part.number_of_unknowns >= 6 * N:  # the noise cannot be estimated: use the weights
+    counts, N = part.moments.count, part.equations.sum(axis=0)
+    if part.number_of_unknowns >= N.sum():  # the noise cannot be estimated: use the weights
         ones = np.ones(len(counts))
         return PartVarianceFactors(ones, ones, ones, 0.0, 0.0, 0.0)
     spare_on_arm, spare_rotation = equations_to_spare(part, told)
-    spare_translation = float(max(3 * N - part.number_of_unknowns + 3 * len(part.free), 0))
+    spare_translation = float(max(N[1] - part.number_of_unknowns + _turns(part), 0.0))
     lengths = part.moments.squares(T_B)
     floor_t = (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts  # t_B counts as 1 cm at least
     floor_R = 2.0 * part.moments.kappa * FLOOR**2 / counts
 
-    def factors(J: Array, spare: float, floor: Array) -> Array:
+    def factors(J: Array, spare: float, floor: Array, equations: Array) -> Array:
         of_part = 2.0 * float(J.sum()) / max(spare, 1.0)
-        return np.maximum(np.maximum(J / (1.5 * counts), of_part), floor)
+        return np.maximum(np.maximum(J / (0.5 * np.maximum(equations, 1.0)), of_part), floor)
 
     return PartVarianceFactors(
-        factors(J_R, spare_rotation, floor_R),
-        factors(J_t, spare_translation, floor_t),
-        factors(J_t, spare_on_arm, floor_t),
+        factors(J_R, spare_rotation, floor_R, part.equations[:, 0]),
+        factors(J_t, spare_translation, floor_t, part.equations[:, 1]),
+        factors(J_t, spare_on_arm, floor_t, part.equations[:, 1]),
         spare_rotation,
         spare_translation,
         spare_on_arm,
@@ -100,8 +100,8 @@ def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]
 
     In the worst case all unknowns were fitted to the translations, and all rotations to the rotations.
     """
-    N, rotations = part.number_of_measurements, 3 * len(part.free)
-    worst = max(float(3 * N - part.number_of_unknowns), 0.0), max(float(3 * N - rotations), 0.0)
+    of_rotations, of_translations = part.equations.sum(axis=0).tolist()
+    worst = max(of_translations - part.number_of_unknowns, 0.0), max(of_rotations - _turns(part), 0.0)
     used = told.used
     if worst[0] >= PLENTY or used.sum() > DENSE_PARAMETERS:
         return worst
@@ -114,7 +114,12 @@ def equations_to_spare(part: Part, told: PartInformation) -> tuple[float, float]
     known = values > ROUNDING * values.max(initial=0.0)
     root = vectors[:, known] / np.sqrt(values[known])
     by_translations, by_rotations = (float((root * (info @ root)).sum()) for info in (I_t, I_R))
-    return max(3 * N - by_translations, 0.0), max(3 * N - by_rotations, 0.0)
+    return max(of_translations - by_translations, 0.0), max(of_rotations - by_rotations, 0.0)
+
+
+def _turns(part: Part) -> int:
+    """The number of unknowns of rotations."""
+    return 3 * len(part.free) - int(part.unseen[:, :3].sum())
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -16,6 +17,7 @@ from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.directed_pairs import Convention, DirectedPair
 
 #: Pairs with more measurements are evaluated one by one.
 SMALL = 256
@@ -38,7 +40,7 @@ class Shared:
 class Given:
     """Raw measurements by the index of their pair, fixed poses (4, 4) and priors, about the user's own origin."""
 
-    batches: list[tuple[int, Measurements]]  #: in ascending order of the pairs
+    batches: list[tuple[int, Measurements]]  #: of pairs that do not weigh by direction, in ascending order of the pairs
     shared: list[Shared]  #: of pairs that were added many at once
     fixed: dict[str, Array]
     priors: dict[str, list[Prior]]
@@ -48,9 +50,12 @@ class Given:
         """What a problem holds of the pairs and frames; None where its raw measurements were not kept."""
         if not problem.has_measurements:
             return None
+        by_direction = problem.directed
         batches: list[tuple[int, Measurements]] = []
         shared: dict[int, Shared] = {}
         for e, pair in enumerate(pairs):
+            if pair in by_direction:
+                continue
             for batch in problem.stored(pair):
                 if batch.count > SMALL or len(batch.many.pairs) == 1:
                     batches.append((e, batch.measurements))
@@ -92,11 +97,39 @@ class Part:
     scale: ScaleMode
     is_relative: bool  #: whether all weights are 1, so that costs have no statistical meaning
     given: Given | None  #: the raw measurements, fixed frames and priors; None where measurements were not kept
+    directed: tuple[DirectedPair, ...] = ()  #: the pairs that weigh by direction, in ascending order
+    is_about: bool = False  #: whether the directions are those of an answer
 
     @property
     def names(self) -> tuple[str, ...]:
         """All frames of the part."""
         return self.targets + self.sensors
+
+    def directed_at(self, at: slice) -> Iterator[tuple[int, DirectedPair]]:
+        """Those of some pairs that weigh by direction, with their places among these."""
+        return ((each.e - at.start, each) for each in self.directed if at.start <= each.e < at.stop)
+
+    def centres(self, e: int) -> tuple[Array, Array]:
+        """The gauge's points (a, c) of a pair: a motion has both ends in the sensor's carrier."""
+        a = self.gauge.sensor_carrier
+        return a, a if self.pairs[e].is_motion else self.gauge.target_carrier
+
+    @cached_property
+    def equations(self) -> Array:
+        """(E, 2): how many equations of rotation and of translation a pair gives."""
+        result = np.repeat(3.0 * self.moments.count[:, None], 2, axis=1)
+        for each in self.directed:
+            result[each.e] = each.weighing.equations
+        return result
+
+    @cached_property
+    def unseen(self) -> np.ndarray:
+        """(n, 6): which directions of the free frames mean nothing."""
+        result = np.zeros((len(self.free), 6), dtype=bool)
+        for each in self.directed:
+            if each.unseen.any():
+                result[self.ends[each.e, 0]] = each.unseen
+        return result
 
     @cached_property
     def ends(self) -> np.ndarray:
@@ -140,17 +173,18 @@ class Part:
     @property
     def number_of_unknowns(self) -> int:
         """Six for each free frame, and one for each unknown scale."""
-        return 6 * len(self.free) + (self.scale == "shared") + len(self.scale_owners)
+        return 6 * len(self.free) - int(self.unseen.sum()) + (self.scale == "shared") + len(self.scale_owners)
 
     def frame_shift(self, name: str) -> Array:
         """The translation that the gauge has subtracted from a frame's, in metres."""
         return self.gauge.target_carrier if name in self._of_target_carrier else self.gauge.sensor_carrier
 
 
-def parts_of(problem: Problem) -> list[Part]:
+def parts_of(problem: Problem, about: Mapping[str, Array] | None = None) -> list[Part]:
     """Split a problem into connected parts, and check the problem as a whole.
 
-    A scale that all targets share joins all frames to one part.
+    ``about`` has poses (4, 4) of the frames, at which measurements that weigh by direction have their directions; left
+    out, their translations have mean weights, except on frames that are fixed. A scale that all targets share joins all frames to one part.
     Raises `CountError` without measurements; `FrameError` for a fixed frame, prior or scale of a frame that no
     measurement mentions; `UnderdeterminedError` for fewer equations than unknowns in a part.
     """
@@ -169,7 +203,7 @@ def parts_of(problem: Problem) -> list[Part]:
     for pair in problem.pairs:
         pairs[where[pair.sensor]].append(pair)
     return [
-        _part(problem, sorted(component, key=order.__getitem__), tuple(of_component))
+        _part(problem, sorted(component, key=order.__getitem__), tuple(of_component), about or {})
         for component, of_component in zip(components, pairs, strict=True)
     ]
 
@@ -188,16 +222,34 @@ def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
     return list(components.values())
 
 
-def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...]) -> Part:
+def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...], about: Mapping[str, Array]) -> Part:
     """A part of these frames, targets before sensors, as the problem orders them."""
     members, seen = frozenset(names), {pair.target for pair in pairs if not pair.is_motion}
     targets = tuple(name for name in names if name in seen)
     sensors = tuple(name for name in names if name not in seen)
     gauge, moments = _centred(problem, pairs)
     priors = {name: problem.priors[name] for name in problem.priors if name in members}
+    by_direction = problem.directed
+    directed = tuple(DirectedPair.of(e, pair, problem, about) for e, pair in enumerate(pairs) if pair in by_direction)
+    conventions = {pairs[each.e].target: each.convention(about, pairs[each.e].target) for each in directed}
+    held: dict[str, list[Prior]] = {name: [prior] for name, prior in conventions.items() if prior is not None}
     is_inverse = problem.scale == "per_target" or (
         problem.scale == "shared" and any(p.sigma is not None for beliefs in priors.values() for p in beliefs)
     )
+    if directed and is_inverse:
+        raise ScaleError(
+            f"{', '.join(names)}: measurements that weigh by direction ({pairs[directed[0].e]}) take no prior of a "
+            "translation beside an unknown scale; give the scale, or fix the frame"
+        )
+    if problem.scale == "shared" and any(p.sigma is not None for beliefs in held.values() for p in beliefs):
+        raise ScaleError(
+            f"{', '.join(held)}: planes of unknown pose are not certified beside an unknown scale; give the scale (scale='known'), or "
+            "fix the target (fix)"
+        )
+    given = Given.of(problem, pairs, members)
+    beliefs_of = {name: [*priors.get(name, []), *held.get(name, [])] for name in (*priors, *held)}
+    if given is not None:
+        given = replace(given, priors=beliefs_of)
     shift = {name: gauge.target_carrier for name in targets} | {name: gauge.sensor_carrier for name in sensors}
     part = Part(
         free=tuple(name for name in targets + sensors if name not in problem.fixed),
@@ -207,15 +259,17 @@ def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...]) -> Part:
         moments=moments,
         fixed={name: _moved(T, shift[name]) for name, T in problem.fixed.items() if name in members},
         priors={
-            name: [Prior(_moved(p.transform, shift[name]), p.sigma, p.kappa) for p in beliefs]
-            for name, beliefs in priors.items()
+            name: [replace(p, transform=_moved(p.transform, shift[name])) for p in beliefs]
+            for name, beliefs in beliefs_of.items()
         },
         fixed_scales={name: s for name, s in problem.fixed_scales.items() if name in members},
         gauge=gauge,
         kind="inverse" if is_inverse else "direct",
         scale=problem.scale,
         is_relative=problem.is_relative,
-        given=Given.of(problem, pairs, members),
+        given=given,
+        directed=directed,
+        is_about=bool(about),
     )
     _check(part)
     return part
@@ -244,8 +298,8 @@ def _moved(T: Array, origin: Array) -> Array:
 
 
 def _check(part: Part) -> None:
-    equations = 6 * part.number_of_measurements
-    beliefs = [p for priors in part.priors.values() for p in priors]
+    equations = int(part.equations.sum())
+    beliefs = [p for priors in part.priors.values() for p in priors if not isinstance(p, Convention)]
     equations += sum(3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs)
     if equations < part.number_of_unknowns:
         raise UnderdeterminedError(

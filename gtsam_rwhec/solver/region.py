@@ -95,6 +95,8 @@ def extent_of(part: Part, point: Point) -> float:
             centred = raw.A[:, :3, 3] + raw.A[:, :3, :3] @ c - a
             largest.append(float(np.linalg.norm(centred, axis=1).max()))
             largest.append(float(np.linalg.norm(raw.B[:, :3, 3], axis=1).max() / scale[e]))
+        for directed in part.directed:
+            largest.append(directed.extent(*part.centres(directed.e), float(scale[directed.e])))
         for shared in part.given.shared:
             many, pair = shared.many, np.repeat(shared.pair, shared.many.counts)
             A, B = many.A[pair >= 0, :3], many.B[pair >= 0, :3, 3]

@@ -18,6 +18,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import Doubled, gamma
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.solver.block_matrix import sum_into
+from gtsam_rwhec.solver.directed_pairs import DirectedPair
 from gtsam_rwhec.solver.parts import SMALL, Shared
 
 #: This many measurements are evaluated exactly at once: the slices of a block stay in the processor's cache.
@@ -33,6 +34,8 @@ FEATURE_BITS = 24
 COEFFICIENT_BITS = 28
 #: The low slices' products round by less than this part of the largest sum of terms.
 LOW_PART = 2.0**-70
+#: Sums of three products of doubled numbers round by less than this part of the largest.
+DOUBLED = 2.0**-95
 #: Operations of a residual's last sum, its weight, and its square.
 _FEW = 12
 #: The kind of weight of each residual, kappa or 1 / sigma^2.
@@ -70,6 +73,7 @@ class Stack:
     B: Array
     weight: Array
     kappa: Array
+    directed: tuple[DirectedPair, slice] | None = None  #: whose weights they have, where these differ by direction
 
 
 @dataclass(frozen=True)
@@ -84,12 +88,14 @@ class Measured:
     c: Array
     is_swapped: bool
     shared: Sequence[Shared] = ()  #: measurements of many pairs
+    directed: Sequence[tuple[int, DirectedPair]] = ()  #: those that weigh by direction
 
     @property
     def count(self) -> int:
         """The number of measurements."""
         of_shared = (int(each.many.counts[each.pair >= 0].sum()) for each in self.shared)
-        return sum(len(raw.A) for _, raw in self.batches) + sum(of_shared)
+        of_batches = [len(raw.A) for _, raw in self.batches] + [each.count for _, each in self.directed]
+        return sum(of_batches) + sum(of_shared)
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,12 @@ class Sums:
 def stacks_of(measured: Measured, block: int = BLOCK) -> Iterator[Stack]:
     """The measurements in stacks, those of long batches in blocks."""
     yield from small_stacks(measured)
+    for pair, directed in measured.directed:
+        for first in range(0, directed.count, block):
+            part = slice(first, min(first + block, directed.count))
+            A, B = (_rows(poses[part])[None] for poses in (directed.raw.A, directed.raw.B))
+            one = np.ones(A.shape[:2])
+            yield Stack(np.array([pair]), A, B, one, one, (directed, part))
     for pair, raw in measured.batches:
         if len(raw.A) <= SMALL:
             continue
@@ -182,10 +194,18 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         number += 1
         of_A_and_B = slice(None, None, -1 if measured.is_swapped else 1)
         front, back = (stack.A, stack.B)[of_A_and_B]
-        r, low = _residuals(stack.pairs, front, back, coefficients, exact=exact)
+        (r, rest), low = _residuals(stack.pairs, front, back, coefficients, exact=exact)
         A, off = _centred(stack, measured)
         k, m = stack.weight.shape
-        residuals, weights = r.reshape(k, m, D, 12), np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
+        if stack.directed is None:
+            r = r if rest is None else r + rest
+            weights = np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
+        else:
+            directed, part = stack.directed
+            turn = directed.reach(part)
+            low = (low + DOUBLED * _reach(r)).reshape(k, D, 12) @ turn.T * (1.0 + 1e-9)
+            r, weights = directed.turned(part, r, rest), directed.weights(part)[None]
+        residuals = r.reshape(k, m, D, 12)
         weighted = residuals * weights[:, :, None, :]
         flat = weighted.reshape(k, m, outputs)
         unit = gamma(m + _FEW)
@@ -200,12 +220,17 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         else:
             square, error = _together(weighted, residuals, root, slack)
             places = np.zeros(1, dtype=int)
-        one_error = (of_ones * (unit * root + slack)).reshape(k, 1, outputs)
+        one_size, one_error = of_ones * root, of_ones * (unit * root + slack)
+        if stack.directed is not None:
+            flat = directed.turned_back(part, flat)
+            one_error = (one_error + gamma(_FEW + 12) * one_size) @ turn * (1.0 + 1e-9)
+            one_size = one_size @ turn
+        one_size, one_error = one_size.reshape(k, 1, outputs), one_error.reshape(k, 1, outputs)
         of_poses, of_errors = [], []
         for poses, rounding in ((A, off), (stack.B, np.zeros((k, 12))))[of_A_and_B]:
             of_poses.append(np.matmul(poses.transpose(0, 2, 1), flat))
             reach = _reach(poses)[:, :, None] * one_error
-            of_errors.append(reach + rounding[:, :, None] * (of_ones * root).reshape(k, 1, outputs))
+            of_errors.append(reach + rounding[:, :, None] * one_size)
         values, bounds = (square, *of_poses, np.ones(m) @ flat), (error, *of_errors, one_error[:, 0])
         rows = places, *[stack.pairs] * 3
         for at, table, bound, size, value, of_value in zip(rows, tables, errors, sizes, values, bounds, strict=True):
@@ -247,8 +272,8 @@ def _centred(stack: Stack, measured: Measured) -> tuple[Array, Array]:
 
 def _residuals(
     pairs: np.ndarray, front_rows: Array, back_rows: Array, coefficients: Coefficients, *, exact: bool
-) -> tuple[Array, Array]:
-    """Residuals (k, m, 12 D), to their last digit and an absolute error of at most the second array (k, 12 D)."""
+) -> tuple[tuple[Array, Array | None], Array]:
+    """Residuals (k, m, 12 D) as sums of two doubles, right to an absolute error of at most the last array (k, 12 D)."""
     front, back, one = (
         Doubled(c.hi[pairs], c.lo[pairs]) for c in (coefficients.front, coefficients.back, coefficients.one)
     )
@@ -258,7 +283,7 @@ def _residuals(
     total *= 1.0 + 1e-9
     if not exact:
         plain = np.matmul(front_rows, front.hi) + np.matmul(back_rows, back.hi) + one.hi[:, None, :]
-        return plain, gamma(OPERATIONS) * total
+        return (plain, None), gamma(OPERATIONS) * total
     top: Array = _power_above(total)
     result: Array = np.zeros((*front_rows.shape[:2], total.shape[1]))
     low = np.zeros_like(result)
@@ -275,8 +300,7 @@ def _residuals(
     one_high = np.rint(one.hi / of_one) * of_one
     result += one_high[:, None, :]
     low += ((one.hi - one_high) + one.lo)[:, None, :]
-    result += low
-    return result, top * LOW_PART
+    return (result, low), top * LOW_PART
 
 
 def _feature_units(x: Array) -> Array:

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from rwhec_factors.se3 import pose
 from scipy.special import chdtr, chdtrc
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError, WeightsWarning
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.poses import to_pose3
+from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -24,6 +25,7 @@ from gtsam_rwhec.solver.answers import (
     costs_of_pairs,
     given_answer,
     given_poses,
+    poses_of,
     residuals_of_pairs,
     rotations_as_variables,
     scales_of,
@@ -127,6 +129,12 @@ class PartSolution:
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
     residual_cost: float
+
+    @property
+    def poses(self) -> dict[str, Array]:
+        """The free frames' poses (4, 4) about the user's origin."""
+        answer, shift = self.answer, self.part.frame_shift
+        return {n: pose(R, t + shift(n)) for n, R, t in zip(self.part.free, answer.R, answer.t, strict=True)}
 
     @staticmethod
     def of(searched: Searched) -> PartSolution:
@@ -236,8 +244,26 @@ def solve(
             )
         check_against_knowledge(problem, *initial)
     with one_blas_thread(), np.errstate(all="ignore"):
-        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem)]
+        about = None if initial is None else poses_of(*initial[:2])
+        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about)]
+        # Directions of translations are those of an answer: they are taken there again until the answer stays.
+        for _ in range(MOST_ROUNDS if problem.directed else 0):
+            before, about = about, {name: T for result in results for name, T in result.poses.items()}
+            if before is not None and max(_turned(before[name], T) for name, T in about.items()) < STILL_RAD:
+                break
+            results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about)]
     return _merge(problem, results)
+
+
+#: Rounds about the answer of the round before; three are usual.
+MOST_ROUNDS = 12
+#: Directions stay where no rotation turns by more than this: far below what any sensor tells.
+STILL_RAD = 1e-9
+
+
+def _turned(before: Array, after: Array) -> float:
+    """The angle between the rotations of two poses, rad, nearly."""
+    return float(np.linalg.norm(before[:3, :3] - after[:3, :3])) / np.sqrt(2.0)
 
 
 def _solved(
@@ -297,8 +323,8 @@ def certify(
     """
     check_types(problem, options, progress)
     options = options or SolveOptions()
-    parts = parts_of(problem)
     check_against_knowledge(problem, X, Y, scale)
+    parts = parts_of(problem, poses_of(X, Y) if problem.directed else None)
     certificates = []
     for part in parts:
         given = given_answer(part, X, Y, scale)
@@ -336,8 +362,7 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
     residuals: dict[Pair, Residual] = {}
     for result in results:
         part, answer = result.part, result.answer
-        for name, R, t in zip(part.free, answer.R, answer.t, strict=True):
-            poses[name] = to_pose3(R, t + part.frame_shift(name))
+        poses |= {name: to_pose3(T[:3, :3], T[:3, 3]) for name, T in result.poses.items()}
         scales |= scales_of(part, answer)
         residuals |= result.residuals
     certificate = Certificate.merged([result.certificate for result in results])
@@ -378,7 +403,7 @@ def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
     if problem.is_relative or any(result.part.kind == "inverse" for result in results):
         return
     cost = sum(result.residual_cost for result in results)
-    degrees_of_freedom = sum(6 * r.part.number_of_measurements - r.part.number_of_unknowns for r in results)
+    degrees_of_freedom = int(sum(r.part.equations.sum() - r.part.number_of_unknowns for r in results))
     ratio = contradicted_by(cost, degrees_of_freedom)
     if ratio is None:
         return

@@ -87,7 +87,7 @@ def test_add_then_remove_gives_what_was(seed: int, which: int, size: float) -> N
 
 
 def test_covariances_are_those_of_a_refinement_of_the_same_measurements() -> None:
-    stream = streamed(ones(3, 40))
+    stream = streamed(ones_of(general(1, 1, seed=3, number_of_measurements=60, noise=NOISE).problem))
     refined = stream.last.refined
     problem = stream.problem
     batch = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))

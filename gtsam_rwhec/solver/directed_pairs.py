@@ -1,0 +1,204 @@
+"""Pairs whose measurements weigh by direction: their forms, costs and information, in the place of moments.
+
+In the direct kind, A X = Y B, with E = R_A R_X - R_Y R_B and e = R_A t_X + alpha t_A - t_Y - R_Y t_B, a measurement's
+six to twelve rows are E V and L' (e + E c), linear in the pair's 25 variables (design fact 26). The directions L are in
+the sensor carrier's axes. They depend on the answer, so they are those of the answer of the round before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rwhec_factors.se3 import hat
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import Doubled, gamma, two_sum
+from gtsam_rwhec.problem.directions import Weighing, frames_of
+from gtsam_rwhec.problem.knowledge import Prior
+from gtsam_rwhec.problem.measurements import Kind, Measurements, Pair
+from gtsam_rwhec.problem.problem import Problem
+
+#: Rows of this many measurements are computed at once: some megabytes.
+BLOCK = 2048
+#: Rounded operations of an entry of a row: the product of three matrices, and A about the gauge.
+OPERATIONS = 20
+
+
+@dataclass(frozen=True)
+class Convention(Prior):
+    """What holds the directions of a target that mean nothing, at no cost.
+
+    ``of_plane``: of R only x and y count, of t only what lies in the plane of the pose's x and y.
+    """
+
+    of_plane: bool = False
+
+    @property
+    def weights(self) -> tuple[Array, Array]:
+        """As those of other priors."""
+        if not self.of_plane:
+            return super().weights
+        x_y = self.transform[:3, :2]
+        return x_y @ x_y.T * (0.0 if self.sigma is None else 1.0 / self.sigma**2), np.diag([1.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class DirectedPair:
+    """The measurements of one pair, with L in the sensor carrier's axes."""
+
+    e: int  #: the pair's place in its part
+    raw: Measurements
+    weighing: Weighing
+    unseen: np.ndarray  #: (6,): which directions of the target mean nothing
+
+    @staticmethod
+    def of(e: int, pair: Pair, problem: Problem, about: Mapping[str, Array]) -> DirectedPair:
+        """A pair of a problem, with the directions at poses (4, 4) of its frames; where they lack, one mean weight."""
+        raw = problem.measurements(*pair)
+        weighing = Weighing.of(raw)
+        kinds = np.zeros(len(raw.A), dtype=np.int8) if raw.kinds is None else raw.kinds
+        known = problem.fixed | dict(about)
+        axes, of_axes = np.tile(np.eye(3), (len(raw.A), 1, 1)), np.repeat(weighing.mean[:, None], 3, axis=1)
+        for name, has in ((pair.target, kinds != Kind.POINT), (pair.sensor, kinds == Kind.POINT)):
+            if name in known:
+                R = known[name][:3, :3]
+                to_carrier = raw.A[has, :3, :3] @ R if name == pair.target else R @ raw.B[has, :3, :3]
+                axes[has], of_axes[has] = to_carrier @ weighing.axes[has], weighing.of_axes[has]
+        return DirectedPair(e, raw, replace(weighing, axes=axes, of_axes=of_axes), problem.unseen(pair.target))
+
+    @property
+    def count(self) -> int:
+        """The number of measurements."""
+        return len(self.raw.A)
+
+    def extent(self, a: Array, c: Array, scale: float) -> float:
+        """The longest translation of A about a gauge (a, c), and of B in true length."""
+        centred = self.raw.A[:, :3, 3] + self.raw.A[:, :3, :3] @ c - a
+        both = np.concatenate([centred, self.raw.B[:, :3, 3] / scale])
+        return float(np.linalg.norm(both, axis=1).max())
+
+    def rows(self, a: Array, c: Array) -> Iterator[tuple[Array, Array, Array]]:
+        """Some measurements' rows (k, 12, 25), magnitudes of their terms, and weights (k, 12); A about a gauge (a, c).
+
+        Nine rows are of the rotation, three of the translation.
+        """
+        for begin in range(0, self.count, BLOCK):
+            at = slice(begin, begin + BLOCK)
+            A, B, w = self.raw.A[at], self.raw.B[at], self.weighing
+            R_A, R_B, k = A[:, :3, :3], B[:, :3, :3], len(A)
+            plain, size = np.zeros((2, k, 12, 25))
+            for p in range(3):
+                for q in range(3):
+                    plain[:, 3 * p + q, 7 + 3 * q : 10 + 3 * q] = R_A[:, p]
+                    plain[:, 3 * p + q, 16 + p :: 3] = -R_B[:, :, q]
+                plain[:, 9 + p, 16 + p :: 3] = -B[:, :3, 3]
+                plain[:, 9 + p, 3 + p] = -1.0
+            plain[:, 9:, :3] = R_A
+            plain[:, 9:, 6] = A[:, :3, 3] + R_A @ c - a
+            size[...] = np.abs(plain)
+            size[:, 9:, 6] = np.abs(A[:, :3, 3]) + np.abs(R_A) @ np.abs(c) + np.abs(a)
+            turned = _turning(w.turns[at], w.centre[at], w.axes[at])
+            yield turned @ plain, np.abs(turned) @ size, self.weights(at)
+
+    def weights(self, at: slice) -> Array:
+        """(k, 12) weights of the rows of some measurements."""
+        return np.concatenate([np.tile(self.weighing.of_turns[at], 3), self.weighing.of_axes[at]], axis=1)
+
+    def forms(self, a: Array, c: Array, reach: float) -> tuple[Array, Array, Array]:
+        """The forms (25, 25) of translations and of rotations, and a diagonal (25,) that dominates their rounding.
+
+        ``reach``: the size of what a fixed frame's translation adds to those of A.
+        """
+        of_both, rounding = np.zeros((2, 25, 25)), np.zeros(25)
+        for rows, sizes, weights in self.rows(a, c):
+            for form, part in zip(of_both, (slice(9, 12), slice(0, 9)), strict=True):
+                one = rows[:, part].reshape(-1, 25)
+                form += 0.5 * (one * weights[:, part].reshape(-1, 1)).T @ one
+            # x'Dx with |D| <= u s s' is at most 25 u sum s_p^2 x_p^2.
+            sizes[:, 9:, 6] += reach
+            rounding += 0.5 * 25.0 * np.einsum("kr,krp->p", weights, sizes**2)
+        return of_both[0], of_both[1], gamma(self.count + 2 * OPERATIONS) * rounding * (1.0 + 1e-9)
+
+    def costs(self, a: Array, c: Array, x: Array) -> tuple[float, float]:
+        """J_t and J_R at values of the pair's variables (25,)."""
+        squares = np.zeros(12)
+        for rows, _, weights in self.rows(a, c):
+            squares += 0.5 * (weights * (rows @ x) ** 2).sum(axis=0)
+        return float(squares[9:].sum()), float(squares[:9].sum())
+
+    def information(self, a: Array, c: Array, X: Array, Y: Array, alpha: float) -> tuple[Array, Array]:
+        """The expected information (15, 15) of rotations and of translations at poses (4, 4) about the gauge.
+
+        The parameters are those of `PairInformation`: at B's prediction E is R [omega_X - R' R_Y omega_Y] with
+        R = R_A R_X, and e + E c is as there, with [R c] (R_Y omega_Y - R omega_X) beside it.
+        """
+        w, A, R_Y = self.weighing, self.raw.A, Y[:3, :3]
+        R = A[:, :3, :3] @ X[:3, :3]
+        lever = A[:, :3, :3] @ (X[:3, 3] + c) + A[:, :3, 3] - a - Y[:3, 3]
+        turn, move = np.zeros((2, self.count, 3, 15))
+        turn[:, :, 0:3], turn[:, :, 7:10] = np.eye(3), -R.transpose(0, 2, 1) @ R_Y
+        arm = hat(np.einsum("nij,nj->ni", R, w.centre))
+        move[:, :, 0:3], move[:, :, 7:10] = -arm @ R, (alpha * hat(lever) + arm) @ R_Y
+        move[:, :, 3:6], move[:, :, 10:13] = alpha * R, -alpha * R_Y
+        move[:, :, 14] = alpha * lever
+        told = w.of_turns.sum(axis=1, keepdims=True) - w.of_turns
+        found = []
+        for axes, weights, J in ((w.turns, told, turn), (w.axes, w.of_axes, move)):
+            one = (axes.transpose(0, 2, 1) @ J).reshape(-1, 15)
+            found.append((one * weights.reshape(-1, 1)).T @ one)
+        return found[0], found[1]
+
+    def turned(self, at: slice, hi: Array, lo: Array | None) -> Array:
+        """Residuals hi + lo (1, m, 12 D), E row by row and then e, as E V and L' (e + E c), without cancellation."""
+        w, m = self.weighing, hi.shape[1]
+        both = Doubled(*(each.reshape(m, -1, 12) for each in two_sum(hi, np.zeros_like(hi) if lo is None else lo)))
+        E = Doubled(*(each[:, :, :9].reshape(m, -1, 3, 3) for each in both))
+        e = Doubled(*(each[:, :, 9:] for each in both))
+        turns = _products(E, w.turns[at][:, None, None])
+        moved = e.plus(Doubled(*(each[..., 0] for each in _products(E, w.centre[at][:, None, None, :, None]))))
+        along = _products(Doubled(moved.hi[:, :, None], moved.lo[:, :, None]), w.axes[at][:, None, None])
+        values = turns.value.reshape(m, -1, 9), along.value.reshape(m, -1, 3)
+        return np.concatenate(values, axis=2).reshape(hi.shape)
+
+    def turned_back(self, at: slice, rows: Array) -> Array:
+        """Numbers of the rows E V and L' (e + E c), (1, m, 12 D), as numbers of E and e: the transpose."""
+        w, m = self.weighing, rows.shape[1]
+        matrix = _turning(w.turns[at], w.centre[at], w.axes[at])
+        result: Array = (rows.reshape(m, -1, 12) @ matrix).reshape(rows.shape)
+        return result
+
+    def reach(self, at: slice) -> Array:
+        """(12, 12): the largest size of each entry of the rows' matrix, of some measurements."""
+        w = self.weighing
+        reach: Array = np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
+        return reach
+
+    def convention(self, at: Mapping[str, Array], target: str) -> Convention | None:
+        """What holds the directions of the target that mean nothing, about an answer, which costs nothing there."""
+        if not self.unseen.any():
+            return None
+        if target not in at or self.unseen[0]:
+            return Convention(np.eye(4), None, 1.0)
+        transform = np.eye(4)
+        transform[:3, :3] = frames_of(at[target][None, :3, 2])[0]
+        return Convention(transform, 1.0 if self.unseen[3] else None, 1.0, of_plane=True)
+
+
+def _turning(turns: Array, centre: Array, axes: Array) -> Array:
+    """The matrices (k, 12, 12) from [E row by row, e] to [E V row by row, L' (e + E c)]."""
+    k = len(turns)
+    result = np.zeros((k, 12, 12))
+    transposed = axes.transpose(0, 2, 1)
+    for p in range(3):
+        block = slice(3 * p, 3 * p + 3)
+        result[:, block, block] = turns.transpose(0, 2, 1)
+        result[:, 9:, block] = transposed[:, :, p, None] * centre[:, None, :]
+    result[:, 9:, 9:] = transposed
+    return result
+
+
+def _products(rows: Doubled, matrices: Array) -> Doubled:
+    """Rows (m, D, i, k) times matrices (m, 1, 1, k, j) of doubles."""
+    return Doubled(*(each[..., None] for each in rows)).times(matrices).summed(axis=-2)
