@@ -27,7 +27,7 @@ GATE = 4.0
 FEWEST_POINTS = 30
 FEWEST_BEAMS = 3
 #: A beam that hits or misses against the rectangle, by chance: dust, hands, a pole on the board's plane.
-STRAY = 0.01
+STRAY = 0.001
 #: At least this share of the beams near the edges of a board agrees with its rectangle.
 AGREEING = 0.93
 #: Softness of the rectangle's edges, metres, in the rounds before the last: from a guess to the edges themselves.
@@ -288,8 +288,12 @@ def _fitted(
     return _board(beams, plane, axes, rays, rectangle)
 
 
+#: What a ray hit: the board, what is behind it, both, or something that stands before the board.
+HIT, MISS, MIXED, UNKNOWN = 1, 0, 2, -1
+
+
 class _Rays(NamedTuple):
-    """Rays about a board: where they meet its plane (N, 3), whether they hit it (1, 0; -1: not known)."""
+    """Rays about a board: where they meet its plane (N, 3), what each hit (HIT, MISS, MIXED, UNKNOWN)."""
 
     at: Array
     hit: np.ndarray
@@ -303,15 +307,15 @@ def _rays(beams: Beams, flat: _Flat, middle: Array, radius_m: float, options: Li
     gate = max(GATE * options.noise_m, 0.03)
     with np.errstate(invalid="ignore"):
         behind = np.where(lattice.index < 0, np.inf, lattice.ranges - expected)
-    hit = np.where(np.abs(behind) <= gate, 1, np.where(behind > gate, 0, -1))
+    hit = np.where(np.abs(behind) <= gate, HIT, np.where(behind > gate, MISS, UNKNOWN))
     # A point behind the plane, next to one on it, and apart from its other neighbour in depth: a mixed pixel.
     mixed = np.zeros(len(hit), dtype=bool)
     same = lattice.rings[1:] == lattice.rings[:-1]
     for inner, outer in ((slice(None, -2), slice(2, None)), (slice(2, None), slice(None, -2))):
         with np.errstate(invalid="ignore"):
             apart = np.abs(lattice.ranges[1:-1] - lattice.ranges[outer]) > gate
-        mixed[1:-1] |= same[1:] & same[:-1] & (hit[inner] == 1) & (hit[1:-1] == 0) & apart & (lattice.index[1:-1] >= 0)
-    hit[mixed] = -1
+        mixed[1:-1] |= same[1:] & same[:-1] & (hit[inner] == HIT) & (hit[1:-1] == MISS) & apart & (lattice.index[1:-1] >= 0)
+    hit[mixed] = MIXED
     at = expected[:, None] * lattice.directions
     kept = np.isfinite(expected)
     kept[kept] = np.linalg.norm(at[kept] - middle, axis=1) < radius_m
@@ -339,12 +343,13 @@ def _rectangle(
 ) -> _Rectangle | str:
     """The rectangle by which rays hit and which miss, by importance sampling; or why it is none.
 
-    A ray at depth d inside of an edge hits with probability Phi(d / s), s to be found. The inset is by how much all edges seem further
+    A ray at depth d inside of an edge hits with probability Phi(d / s), s to be found; one that is mixed is within half a
+    footprint of an edge. The inset is by how much all edges seem further
     in, since a pulse that hits partly comes back from somewhere else: it has a prior of half a footprint.
     """
-    known = rays.hit >= 0
-    at, hit = rays.at[known] @ axes, rays.hit[known] == 1
-    sign = np.where(hit, 1.0, -1.0)
+    known = rays.hit != UNKNOWN
+    at, hit, is_mixed = rays.at[known] @ axes, rays.hit[known] == HIT, rays.hit[known] == MIXED
+    sign = np.where(hit | is_mixed, 1.0, -1.0)
     footprint = 0.5 * options.divergence_rad * range_m
     sharp = 0.3 * footprint + 0.0005
     prior, spread_of_prior = np.array([0.0, np.log(sharp)]), np.array([0.5 * footprint, SOFT_SPREAD])
@@ -353,7 +358,8 @@ def _rectangle(
     table = np.logaddexp(np.log(STRAY), np.log1p(-2.0 * STRAY) + log_ndtr(np.linspace(-8.0, 8.0, 1601)))
 
     def log_posterior(rectangles: Array, soft: float, who: np.ndarray) -> Array:
-        z = inside_m(at[who], rectangles, size_m)
+        z, mixed = inside_m(at[who], rectangles, size_m), is_mixed[who]
+        z[:, mixed] = footprint - np.abs(z[:, mixed])
         z *= sign[who] * (100.0 / np.maximum(np.exp(rectangles[:, 4:]), soft))
         votes: Array = table[(np.clip(z, -800.0, 800.0) + 800.5).astype(np.int32)].sum(axis=1)
         return votes - 0.5 * (((rectangles[:, 3:] - prior) / spread_of_prior) ** 2).sum(axis=1)
@@ -392,7 +398,7 @@ def _rectangle(
         if not is_tempered:
             break
     depth = inside_m(at, mean[None], size_m)[0]
-    close = np.abs(depth) < 0.25 * min(size_m)
+    close = (np.abs(depth) < 0.25 * min(size_m)) & ~is_mixed
     agreeing = ((depth > 0.0) == hit)[close]
     if not len(agreeing) or agreeing.mean() < AGREEING:
         return "a flat piece of another size or shape"
@@ -437,7 +443,7 @@ def _plane_of(
 ) -> _PlaneOf | None:
     """The plane by generalised least squares: ranges with white noise, and a bias of each beam."""
     margin = options.divergence_rad * np.linalg.norm(rays.at, axis=1) + 0.005
-    inner = (rays.hit == 1) & (inside_m(rays.at @ axes, rectangle.mean[None], size_m)[0] > margin)
+    inner = (rays.hit == HIT) & (inside_m(rays.at @ axes, rectangle.mean[None], size_m)[0] > margin)
     index, at = rays.index[inner], rays.at[inner]
     if len(index) < FEWEST_POINTS:
         return None

@@ -229,7 +229,7 @@ def lidar_and_camera(
     for k, like in enumerate(expected):
         B[k], C[k] = turned_like(B[k], C[k], like[:3, :3], size_m)
     problem = Problem(sensor_carrier="camera", target_carrier="board_in_camera")
-    problem.add(target, sensor, A, B, covariances=C)
+    problem.add(target, sensor, A, B, covariances=C, directional=True)
     problem.fix(target, np.eye(4))
     return problem
 
