@@ -36,7 +36,7 @@ SOFT_M = (0.08, 0.04, 0.02, 0.01)
 SOFT_SPREAD = 0.7
 #: Random rectangles tried in each round, and how many of them must count in the last.
 SAMPLES = 800
-EFFECTIVE = 200.0
+EFFECTIVE = 100.0
 #: Rays that count in the rounds before the last.
 ROUGH_RAYS = 200
 #: Rounds with the edges as sharp as they are, at most.
@@ -331,10 +331,15 @@ class _Rectangle(NamedTuple):
 
 def inside_m(at: Array, rectangles: Array, size_m: tuple[float, float]) -> Array:
     """How far points (N, 2) are inside of rectangles (M, 4 or more) [u, v, angle, inset]: (M, N), negative outside; metres."""
-    offset = at[None] - rectangles[:, None, :2]
-    c, s = np.cos(rectangles[:, 2])[:, None], np.sin(rectangles[:, 2])[:, None]
-    x, y = c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]
-    depth: Array = np.minimum(0.5 * size_m[0] - np.abs(x), 0.5 * size_m[1] - np.abs(y)) - rectangles[:, 3, None]
+    c, s = np.cos(rectangles[:, 2]), np.sin(rectangles[:, 2])
+    depth, other = (
+        np.abs(axis @ at.T - (axis * rectangles[:, :2]).sum(axis=1, keepdims=True))
+        for axis in (np.stack([c, s], axis=1), np.stack([-s, c], axis=1))
+    )
+    np.subtract(0.5 * size_m[0], depth, out=depth)
+    np.subtract(0.5 * size_m[1], other, out=other)
+    np.minimum(depth, other, out=depth)
+    depth -= rectangles[:, 3, None]
     return depth
 
 
