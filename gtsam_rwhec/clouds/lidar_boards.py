@@ -26,8 +26,14 @@ GATE = 4.0
 #: Fewer points or beams on a board do not tell its plane.
 FEWEST_POINTS = 30
 FEWEST_BEAMS = 3
-#: A beam that hits or misses against the rectangle, by chance: dust, hands, a pole on the board's plane.
+#: A beam that hits or misses against the rectangle, by chance: first, when the pole or the hand that holds the board may
+#: count as board, and then, without those that were far off.
+STRAY_AT_FIRST = 0.02
 STRAY = 0.001
+#: A ray that looks mixed and is not, by chance: a pole behind the board has edges too.
+STRAY_MIXED = 0.1
+#: Far off is this many standard deviations of the first rectangle, and as much of its edges' softness.
+FAR_OFF = 4.0
 #: At least this share of the beams near the edges of a board agrees with its rectangle.
 AGREEING = 0.93
 #: Softness of the rectangle's edges, metres, in the rounds before the last: from a guess to the edges themselves.
@@ -328,6 +334,11 @@ class _Rectangle(NamedTuple):
     mean: Array
     covariance: Array
 
+    def spread_m(self, size_m: Array) -> float:
+        """Standard deviation of where a corner is, at most."""
+        C = self.covariance
+        return float(np.sqrt(np.linalg.eigvalsh(C[:2, :2])[1] + C[2, 2] * (size_m @ size_m) / 4.0))
+
 
 def inside_m(at: Array, rectangles: Array, size_m: tuple[float, float]) -> Array:
     """How far points (N, 2) are inside of rectangles (M, 4 or more) [u, v, angle, inset]: (M, N), negative outside; metres."""
@@ -353,20 +364,28 @@ def _rectangle(
     in, since a pulse that hits partly comes back from somewhere else: it has a prior of half a footprint.
     """
     known = rays.hit != UNKNOWN
+    stray = STRAY_AT_FIRST
+    if before is not None:
+        stray = STRAY
+        depth = inside_m(rays.at @ axes, before.mean[None], size_m)[0]
+        off = np.where(rays.hit == HIT, -depth, np.where(rays.hit == MISS, depth, np.abs(depth)))
+        known &= off < FAR_OFF * (np.exp(before.mean[4]) + before.spread_m(size_m))
     at, hit, is_mixed = rays.at[known] @ axes, rays.hit[known] == HIT, rays.hit[known] == MIXED
     sign = np.where(hit | is_mixed, 1.0, -1.0)
     footprint = 0.5 * options.divergence_rad * range_m
     sharp = 0.3 * footprint + 0.0005
     prior, spread_of_prior = np.array([0.0, np.log(sharp)]), np.array([0.5 * footprint, SOFT_SPREAD])
 
-    # log(P(agree)) over z in steps of 0.01
-    table = np.logaddexp(np.log(STRAY), np.log1p(-2.0 * STRAY) + log_ndtr(np.linspace(-8.0, 8.0, 1601)))
+    # log(P(agree)) over z in steps of 0.01, of clear rays and of mixed ones
+    z_of_table = log_ndtr(np.linspace(-8.0, 8.0, 1601))
+    tables = np.array([np.logaddexp(np.log(p), np.log1p(-2.0 * p) + z_of_table) for p in (stray, STRAY_MIXED)])
+    kind = is_mixed.astype(int)
 
     def log_posterior(rectangles: Array, soft: float, who: np.ndarray) -> Array:
         z, mixed = inside_m(at[who], rectangles, size_m), is_mixed[who]
         z[:, mixed] = footprint - np.abs(z[:, mixed])
         z *= sign[who] * (100.0 / np.maximum(np.exp(rectangles[:, 4:]), soft))
-        votes: Array = table[(np.clip(z, -800.0, 800.0) + 800.5).astype(np.int32)].sum(axis=1)
+        votes: Array = tables[kind[who], (np.clip(z, -800.0, 800.0) + 800.5).astype(np.int32)].sum(axis=1)
         return votes - 0.5 * (((rectangles[:, 3:] - prior) / spread_of_prior) ** 2).sum(axis=1)
 
     rng = np.random.default_rng(0)
@@ -376,8 +395,8 @@ def _rectangle(
         root = np.linalg.cholesky(1.5 * covariance + np.diag([1e-8, 1e-8, 1e-8, 1e-10, 1e-4]))
         drawn = rng.normal(size=(SAMPLES, 5))
         drawn /= np.sqrt(rng.chisquare(6.0, (SAMPLES, 1)) / 6.0)  # heavier tails than the posterior's
-        spread = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1] + covariance[2, 2] * (size_m @ size_m) / 4.0)
-        who = np.flatnonzero(np.abs(inside_m(at, mean[None], size_m)[0]) < 4.0 * np.exp(mean[4]) + 4.0 * spread)
+        reach = FAR_OFF * (np.exp(mean[4]) + _Rectangle(mean, covariance).spread_m(size_m))
+        who = np.flatnonzero(np.abs(inside_m(at, mean[None], size_m)[0]) < reach)
         return mean + drawn @ root.T, -5.5 * np.log1p((drawn**2).sum(axis=1) / 6.0), who
 
     if before is not None:

@@ -34,6 +34,8 @@ ROUGH_MOST = 9.0
 BIAS_ROUNDS = 50
 #: A beam's bias is named where it is larger than this many of its standard deviations.
 SURE = 4.0
+#: The standard deviation, rad or m, of the one of a prior's two parts that is exact.
+NEXT_TO_NOTHING = 1e-6
 #: Points of one board that were measured over a longer time than this, seconds, blur where the board was moved by hand.
 LONG_S = 0.02
 
@@ -174,6 +176,8 @@ def lidar_and_camera(
     *,
     camera_covariances: ArrayLike | None = None,
     T_board_target: PoseLike | None = None,
+    placed_m: float = 0.0,
+    placed_rad: float = 0.0,
     target: str = "board",
     sensor: str = "lidar",
 ) -> Problem:
@@ -197,6 +201,9 @@ def lidar_and_camera(
         Of T_camera_board, such as those of detections. Left out: ``calibrate`` finds what they add.
     T_board_target : pose, optional
         The camera's target on the board. Left out: the target is in the board's middle, x along the width.
+    placed_m, placed_rad : float
+        Standard deviations of the target's place on the board, and of what the LiDAR measures too far everywhere, which
+        looks the same: 0.01 m and 0.01 rad are usual. 0: both are exact. Otherwise the result has the board's pose too.
     target, sensor : str
         Names in the problem.
 
@@ -204,8 +211,8 @@ def lidar_and_camera(
     ------
     CountError
         The numbers of poses and covariances differ, or fewer than two places have both poses.
-    PoseError, NoiseError
-        A pose or a covariance is not valid.
+    PoseError, NoiseError, PriorError
+        A pose, a covariance or a standard deviation is not valid.
     """
     A, B = as_transforms(T_camera_board, None, "T_camera_board"), as_transforms(T_lidar_board, None, "T_lidar_board")
     C = real_array(covariances)
@@ -230,7 +237,11 @@ def lidar_and_camera(
         B[k], C[k] = turned_like(B[k], C[k], like[:3, :3], size_m)
     problem = Problem(sensor_carrier="camera", target_carrier="board_in_camera")
     problem.add(target, sensor, A, B, covariances=C, directional=True)
-    problem.fix(target, np.eye(4))
+    if placed_m == 0.0 and placed_rad == 0.0:
+        problem.fix(target, np.eye(4))
+    else:
+        placed_rad, placed_m = max(placed_rad, NEXT_TO_NOTHING), max(placed_m, NEXT_TO_NOTHING)
+        problem.add_prior(target, np.eye(4), placed_m, 0.5 / placed_rad**2)
     return problem
 
 
