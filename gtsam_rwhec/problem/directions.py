@@ -11,11 +11,11 @@ of each other, so a sphere's centre counts whole, whatever the frame's origin is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rwhec_factors.se3 import hat
+from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, NoiseError, PoseError
 from gtsam_rwhec.files.terminal_text import brief
@@ -24,8 +24,10 @@ from gtsam_rwhec.geometry.real_numbers import is_between, real_array
 from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, GivenMeasurements, Kind, Measurements
 
 #: Standard deviations of directions that mean nothing, rad and m: their information is lost beside any other.
-MEANINGLESS_RAD = 100.0
-MEANINGLESS_M = 100.0
+MEANINGLESS_RAD = 30.0
+MEANINGLESS_M = 30.0
+#: Variances, rad^2 or m^2, from which on a direction slides: nothing that is measured is so rough.
+SLIDES = 25.0
 #: Which directions [omega, v] of a target's own axes a kind of measurement does not see.
 UNSEEN = {
     Kind.POSE: np.zeros(6, dtype=bool),
@@ -55,7 +57,7 @@ def points_as_given(
             f"{where}: give sigma (m, along each axis) or covariances (3 x 3, m^2) of the points, one of both"
         )
     if covariances is None:
-        spread = _deviations(sigma, N, "sigma", where)[:, None, None] ** 2 * np.eye(3)
+        spread: Array = _deviations(sigma, N, "sigma", where)[:, None, None] ** 2 * np.eye(3)
     else:
         spread = _checked_spread(covariances, N, where)
     B, noise = np.tile(np.eye(4), (N, 1, 1)), np.zeros((N, 6, 6))
@@ -97,12 +99,13 @@ def planes_as_given(
     return GivenMeasurements(A, B, None, None, order, stamps_ns, noise, source, kind=Kind.PLANE)
 
 
-def frames_of(normals: Array) -> Array:
-    """Rotations (N, 3, 3) whose z is a unit normal (N, 3), and whose x is as near as may be to the first axis.
+def frames_of(normals: Array, along: Array | None = None) -> Array:
+    """Rotations (N, 3, 3) whose z is a unit normal (N, 3), and whose x is as near as may be to ``along`` (N, 3).
 
-    Where the normal is near that axis, x is as near as may be to the second one.
+    Left out, that is the first axis; the second one where the normal is near the first.
     """
-    along = np.where(np.abs(normals[:, :1]) < 0.9, np.eye(3)[0], np.eye(3)[1])
+    if along is None:
+        along = np.where(np.abs(normals[:, :1]) < 0.9, np.eye(3)[0], np.eye(3)[1])
     x = along - np.einsum("ni,ni->n", along, normals)[:, None] * normals
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     frames: Array = np.stack([x, np.cross(normals, x), normals], axis=2)
@@ -175,16 +178,19 @@ class Weighing:
         moment = np.stack([crossed[:, j, k] - crossed[:, k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
         arm = np.einsum("nii->n", of_rotation)[:, None, None] * np.eye(3) - of_rotation
         centre = -np.linalg.solve(arm, moment[:, :, None])[:, :, 0]
-        moved = np.concatenate([-hat(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
+        is_point, is_plane, z = raw.is_of(Kind.POINT), raw.is_of(Kind.PLANE), np.array([0.0, 0.0, 1.0])
+        centre[is_point] = 0.0
+        # Of a plane only (omega x c)_z counts: where it tells least of its tilt.
+        tilt = np.linalg.solve(of_rotation[is_plane, :2, :2], crossed[is_plane, 2, :2, None])[:, :, 0]
+        centre[is_plane] = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
+        moved = np.concatenate([-se3.hat(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
         there = moved @ noise @ moved.transpose(0, 2, 1)
         information, turns = np.linalg.eigh(np.linalg.inv(of_rotation))
         information[:, 2] = np.minimum(information[:, 2], information[:, 0] + information[:, 1])
         of_turns = np.maximum(0.5 * information.sum(axis=1, keepdims=True) - information, 0.0)
         variances, axes = np.linalg.eigh(0.5 * (there + there.transpose(0, 2, 1)))
         of_axes, mean = 1.0 / variances, 3.0 / variances.sum(axis=1)
-        kinds = raw.kinds if raw.kinds is not None else np.zeros(len(centre), dtype=np.int8)
-        is_point, is_plane, z = kinds == Kind.POINT, kinds == Kind.PLANE, np.array([0.0, 0.0, 1.0])
-        of_turns[is_point] = centre[is_point] = 0.0
+        of_turns[is_point] = 0.0
         turns[is_plane] = axes[is_plane] = np.eye(3)
         of_turns[is_plane] = 2.0 / np.einsum("nii->n", of_rotation[is_plane, :2, :2])[:, None] * z
         of_axes[is_plane] = 1.0 / there[is_plane, 2, 2, None] * z
@@ -198,8 +204,79 @@ class Weighing:
         return int(seen[0].sum()), int(seen[1].sum())
 
 
+def aligned(raw: Measurements, X: Array, Y: Array, scale: float = 1.0) -> Measurements:
+    """The measurements, each slid to where poses (4, 4) X and Y predict it, along what it does not measure.
+
+    So a residual is small in every direction, and its directions turn with the target. A point's rotation is the
+    predicted one; a plane's frame turns about its normal and moves in the plane; others slide along the eigenvectors
+    of their covariance with a variance of at least ``SLIDES``. Covariances move along. ``scale``: measured over true
+    length.
+    """
+    if raw.covariances is None or raw.kinds is None:
+        return raw
+    predicted = se3.inverse(Y)[None] @ raw.A @ X
+    predicted[:, :3, 3] *= scale
+    B, slid = raw.B, raw.B.copy()
+    point, plane, other = (raw.is_of(kind) for kind in (Kind.POINT, Kind.PLANE, Kind.DIRECTIONAL))
+    slid[point, :3, :3] = predicted[point, :3, :3]
+    normal = B[plane, :3, 2]
+    slid[plane, :3, :3] = frames_of(normal, predicted[plane, :3, 0])
+    off = predicted[plane, :3, 3] - B[plane, :3, 3]
+    slid[plane, :3, 3] += off - np.einsum("ni,ni->n", off, normal)[:, None] * normal
+    covariances = raw.covariances
+    if other.any():
+        variances, along = np.linalg.eigh(covariances[other])
+        free = along * (variances >= SLIDES)[:, None, :]
+        step = free @ (free.transpose(0, 2, 1) @ se3.logmap(se3.inverse(B[other]) @ predicted[other])[:, :, None])
+        slid[other] = B[other] @ se3.expmap(step[:, :, 0])
+    moved = se3.adjoint(se3.inverse(slid) @ B)
+    moved[raw.is_of(Kind.POSE)] = np.eye(6)
+    covariances = moved @ covariances @ moved.transpose(0, 2, 1)
+    for kind in (Kind.POINT, Kind.PLANE):  # what means nothing tells nothing of the rest
+        mine, seen = raw.is_of(kind), ~UNSEEN[kind]
+        stated = np.where(seen, 0.0, np.einsum("nii->ni", raw.covariances[mine]))
+        covariances[mine] = covariances[mine] * (seen[:, None] & seen) + stated[:, :, None] * np.eye(6)
+    return replace(raw, B=slid, covariances=0.5 * (covariances + covariances.transpose(0, 2, 1)))
+
+
+def slides_of(raw: Measurements) -> Array | None:
+    """The part of the covariances (N, 6, 6) that is of directions in which nothing is measured; None without any."""
+    if raw.kinds is None or raw.covariances is None:
+        return None
+    slides = np.zeros_like(raw.covariances)
+    for kind in (Kind.POINT, Kind.PLANE):
+        mine = raw.is_of(kind)
+        slides[mine] = np.where(UNSEEN[kind], np.einsum("nii->ni", raw.covariances[mine]), 0.0)[:, :, None] * np.eye(6)
+    other = raw.is_of(Kind.DIRECTIONAL)
+    variances, along = np.linalg.eigh(raw.covariances[other])
+    slides[other] = (along * np.where(variances >= SLIDES, variances, 0.0)[:, None, :]) @ along.transpose(0, 2, 1)
+    return slides
+
+
+def axes_seen(raw: Measurements) -> np.ndarray:
+    """(N, 6): which entries of a residual Log(B^-1 Y^-1 A X) are measured: all but those of points and planes."""
+    seen = np.ones((len(raw.A), 6), dtype=bool)
+    for kind in (Kind.POINT, Kind.PLANE):
+        seen[raw.is_of(kind)] = ~UNSEEN[kind]
+    return seen
+
+
+def axes_told(raw: Measurements) -> Array:
+    """(N, 2): how many directions of rotation and of translation each measurement tells."""
+    told = np.full((len(raw.A), 2), 3.0)
+    told[raw.is_of(Kind.POINT)], told[raw.is_of(Kind.PLANE)] = (0.0, 3.0), (2.0, 1.0)
+    other = raw.is_of(Kind.DIRECTIONAL)
+    if raw.covariances is not None and other.any():
+        noise = raw.covariances[other]
+        whole = (np.linalg.eigvalsh(noise) < SLIDES).sum(axis=1)
+        told[other, 0] = (np.linalg.eigvalsh(noise[:, :3, :3]) < SLIDES).sum(axis=1)
+        told[other, 1] = whole - told[other, 0]  # a turn about an arm moves the origin
+    return told
+
+
 def unseen_by(raw: Measurements) -> np.ndarray:
     """(6,): which directions of the target's frame none of the measurements sees."""
     if raw.kinds is None:
         return UNSEEN[Kind.POSE]
-    return np.logical_and.reduce([UNSEEN[Kind(kind)] for kind in np.unique(raw.kinds)])
+    unseen: np.ndarray = np.all([UNSEEN[Kind(kind)] for kind in np.unique(raw.kinds)], axis=0)
+    return unseen

@@ -37,11 +37,6 @@ class Prior:
     sigma: float | None
     kappa: float | None
 
-    @property
-    def weights(self) -> tuple[Array, Array]:
-        """(3, 3) each: those of t - t_0, in the carrier's axes, and of R - R_0, in the frame's own."""
-        return np.eye(3) * (0.0 if self.sigma is None else 1.0 / self.sigma**2), np.eye(3) * (self.kappa or 0.0)
-
 
 def difference(T: Array, S: Array) -> str:
     """The distance of two poses, in words."""

@@ -29,7 +29,8 @@ _OF_FRONT = np.searchsorted(FRONT, FRONT_ENTRIES[0]), np.searchsorted(FRONT, FRO
 class Sorted:
     """Measurements of P pairs, sorted by pair: those of pair p are ``first[p]:first[p + 1]``.
 
-    A, B (N, 4, 4); sigma, kappa () or (N,); stamps_ns (N,), covariances (N, 6, 6), pixels (N, n, 2) and kinds (N,), or None.
+    A, B (N, 4, 4); sigma, kappa () or (N,); stamps_ns (N,), covariances (N, 6, 6), pixels (N, n, 2), kinds (N,), or
+    None.
     ``given`` (N,): their places in the user's arrays, for messages; None where these have the same order.
     """
 

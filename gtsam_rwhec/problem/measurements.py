@@ -98,6 +98,10 @@ class Measurements:
         variances = np.repeat(np.column_stack([0.5 / self.kappa, self.sigma**2]), 3, axis=1)
         return variances[:, :, None] * np.eye(6)
 
+    def is_of(self, kind: Kind) -> np.ndarray:
+        """(N,): which measurements are of a kind."""
+        return np.full(len(self.A), kind is Kind.POSE) if self.kinds is None else self.kinds == kind
+
     def selected(self, mask: np.ndarray) -> Measurements:
         """The measurements where ``mask`` (N,) is true."""
         arrays = {part.name: getattr(self, part.name) for part in fields(self)}
@@ -166,7 +170,7 @@ class GivenMeasurements:
 
 
 def mean_noise(covariances: Array) -> tuple[Array, Array]:
-    """sigma and kappa (N,) of the directions that covariances (N, 6, 6) measure; directions of no weight do not count."""
+    """sigma and kappa (N,) of what covariances (N, 6, 6) measure; directions of no weight do not count."""
     of_rotation, of_translation = (
         measured_mean(np.linalg.eigvalsh(np.linalg.inv(covariances[:, block, block])))
         for block in (slice(0, 3), slice(3, 6))

@@ -21,7 +21,7 @@ from gtsam_rwhec.errors import (
     ScaleError,
 )
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
+from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, Array, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.corners import (
     EachImage,
@@ -31,7 +31,7 @@ from gtsam_rwhec.problem.corners import (
     check_in_image,
     seen_corners,
 )
-from gtsam_rwhec.problem.directions import planes_as_given, points_as_given, unseen_by
+from gtsam_rwhec.problem.directions import axes_told, planes_as_given, points_as_given, unseen_by
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
 from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section, Sorted
 from gtsam_rwhec.problem.measurements import (
@@ -80,7 +80,7 @@ def check_measurements(measurements: object) -> None:
             )
 
 
-def _kind_of(covariances: ArrayLike | None, directional: bool) -> Kind:  # noqa: FBT001
+def _kind_of(covariances: ArrayLike | None, directional: bool) -> Kind:
     """The kind of a batch of poses."""
     if directional and covariances is None:
         raise NoiseError("directional=True weighs by direction; give covariances, which have the directions")
@@ -126,6 +126,8 @@ class Problem(Knowledge):
         self.is_relative = False  # whether the noise of some measurements is not stated
         self._kind: dict[str, Literal["target", "sensor"]] = {}
         self._kept: dict[Pair, KeptMeasurements] = {}
+        #: Poses (4, 4) of targets to which measurements that weigh by direction were slid (`aligned_at`).
+        self.held: dict[str, Array] = {}
         self._accumulator = Accumulator()
         self._long: frozenset[str] = frozenset()  # which of "A" and "B" had the millimetre warning
 
@@ -457,8 +459,8 @@ class Problem(Knowledge):
             )
         if self.scale == "per_target":
             raise ScaleError(
-                f"{where}: with scale='per_target' the certified form cannot weigh by direction; take scale='known', or "
-                "'shared' for one unknown scale"
+                f"{where}: with scale='per_target' the certified form cannot weigh by direction; take scale='known', "
+                "or 'shared' for one unknown scale"
             )
 
     def _check_names(self, pair: Pair, where: str) -> None:
@@ -530,16 +532,23 @@ class Problem(Knowledge):
         """The pairs with measurements that weigh by direction; all of such a pair's measurements do."""
         return frozenset(pair for pair, kept in self._kept.items() if kept.has_kinds)
 
+    @property
+    def number_of_equations(self) -> int:
+        """Six for each measurement, and for those that weigh by direction as many as they tell."""
+        of_directed = sum(int(axes_told(batch).sum()) for pair in self.directed for batch in self._kept[pair].batches)
+        others = self.number_of_measurements - sum(self._kept[pair].count for pair in self.directed)
+        return 6 * others + of_directed
+
     def unseen(self, name: str) -> np.ndarray:
         """(6,): which directions [omega, v] of a frame's own axes mean nothing: nothing that was stated sees them."""
         kept = [kept for pair, kept in self._kept.items() if name in pair]
         of_target = name not in self.fixed and self._kind.get(name) == "target"
         if not of_target or not all(each.has_kinds for each in kept):
             return np.zeros(6, dtype=bool)
-        unseen = np.logical_and.reduce([unseen_by(batch) for each in kept for batch in each.batches])
+        unseen: np.ndarray = np.all([unseen_by(batch) for each in kept for batch in each.batches], axis=0)
         for prior in self.priors.get(name, []):
             unseen &= ~np.repeat([prior.kappa is not None, prior.sigma is not None], 3)
-        return np.asarray(unseen)
+        return unseen
 
     @property
     def has_measurements(self) -> bool:

@@ -11,7 +11,6 @@ from math import fsum
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver.directed_pairs import Convention
 from gtsam_rwhec.solver.parts import Kind, Part
 from gtsam_rwhec.solver.region import Region
 
@@ -209,8 +208,7 @@ class Objective:
     @staticmethod
     def of(part: Part) -> Objective:
         """The cost of a part."""
-        has_priors = any(not isinstance(each, Convention) for beliefs in part.priors.values() for each in beliefs)
-        objective = Objective(part.kind, has_priors, by_direction=bool(part.directed))
+        objective = Objective(part.kind, bool(part.priors), by_direction=bool(part.directed))
         if part.kind == "direct":
             return objective
         of_motions = _triple(part.gauge.sensor_carrier) if part.moments.motion.any() else None

@@ -8,40 +8,44 @@ the sensor carrier's axes. They depend on the answer, so they are those of the a
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from rwhec_factors.se3 import hat
+from rwhec_factors.se3 import hat, inverse
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import Doubled, gamma, two_sum
-from gtsam_rwhec.problem.directions import Weighing, frames_of
-from gtsam_rwhec.problem.knowledge import Prior
-from gtsam_rwhec.problem.measurements import Kind, Measurements, Pair
+from gtsam_rwhec.problem.directions import Weighing, aligned, frames_of
+from gtsam_rwhec.problem.measurements import Kind, Pair
 from gtsam_rwhec.problem.problem import Problem
 
 #: Rows of this many measurements are computed at once: some megabytes.
 BLOCK = 2048
+#: The weight of what holds a direction that means nothing, 1 / rad^2 and 1 / m^2: next to nothing, and never paid.
+HELD = 1.0
 #: Rounded operations of an entry of a row: the product of three matrices, and A about the gauge.
 OPERATIONS = 20
 
 
-@dataclass(frozen=True)
-class Convention(Prior):
-    """What holds the directions of a target that mean nothing, at no cost.
+def directed_pairs(
+    problem: Problem, pairs: tuple[Pair, ...], about: Mapping[str, Array], scale: float
+) -> tuple[DirectedPair, ...]:
+    """Those of some pairs that weigh by direction.
 
-    ``of_plane``: of R only x and y count, of t only what lies in the plane of the pose's x and y.
+    ``about`` has poses (4, 4) of frames, at which the directions are taken, and ``scale`` measured over true length;
+    where poses lack, translations have one mean weight. What means nothing of a target is held in its first pair.
     """
-
-    of_plane: bool = False
-
-    @property
-    def weights(self) -> tuple[Array, Array]:
-        """As those of other priors."""
-        if not self.of_plane:
-            return super().weights
-        x_y = self.transform[:3, :2]
-        return x_y @ x_y.T * (0.0 if self.sigma is None else 1.0 / self.sigma**2), np.diag([1.0, 1.0, 0.0])
+    by_direction, known = problem.directed, problem.fixed | dict(about)
+    found: list[DirectedPair] = []
+    held: set[str] = set()
+    for e, pair in enumerate(pairs):
+        if pair in by_direction:
+            one = DirectedPair.of(e, pair, problem, known, scale)
+            if one.unseen.any() and pair.target not in held:
+                one = one.holding(known.get(pair.target), known.get(pair.sensor, np.eye(4)), scale)
+                held.add(pair.target)
+            found.append(one)
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -49,34 +53,61 @@ class DirectedPair:
     """The measurements of one pair, with L in the sensor carrier's axes."""
 
     e: int  #: the pair's place in its part
-    raw: Measurements
+    A: Array  #: (N, 4, 4)
+    B: Array  #: (N, 4, 4)
     weighing: Weighing
+    equations: tuple[int, int]  #: how many they are, of rotation and of translation
     unseen: np.ndarray  #: (6,): which directions of the target mean nothing
 
     @staticmethod
-    def of(e: int, pair: Pair, problem: Problem, about: Mapping[str, Array]) -> DirectedPair:
-        """A pair of a problem, with the directions at poses (4, 4) of its frames; where they lack, one mean weight."""
+    def of(e: int, pair: Pair, problem: Problem, known: Mapping[str, Array], scale: float) -> DirectedPair:
+        """A pair of a problem, with the directions at the poses (4, 4) of its frames that are known."""
         raw = problem.measurements(*pair)
-        weighing = Weighing.of(raw)
-        kinds = np.zeros(len(raw.A), dtype=np.int8) if raw.kinds is None else raw.kinds
-        known = problem.fixed | dict(about)
-        axes, of_axes = np.tile(np.eye(3), (len(raw.A), 1, 1)), np.repeat(weighing.mean[:, None], 3, axis=1)
-        for name, has in ((pair.target, kinds != Kind.POINT), (pair.sensor, kinds == Kind.POINT)):
-            if name in known:
-                R = known[name][:3, :3]
-                to_carrier = raw.A[has, :3, :3] @ R if name == pair.target else R @ raw.B[has, :3, :3]
-                axes[has], of_axes[has] = to_carrier @ weighing.axes[has], weighing.of_axes[has]
-        return DirectedPair(e, raw, replace(weighing, axes=axes, of_axes=of_axes), problem.unseen(pair.target))
+        X, Y = known.get(pair.target), known.get(pair.sensor)
+        if X is not None and Y is not None:
+            raw = aligned(raw, X, Y, scale)
+        w, is_point, N = Weighing.of(raw), raw.is_of(Kind.POINT), len(raw.A)
+        axes, of_axes = np.tile(np.eye(3), (N, 1, 1)), np.repeat(w.mean[:, None], 3, axis=1)
+        for T, has in ((X, ~is_point), (Y, is_point)):
+            if T is not None:
+                of_frame = T[:3, :3] @ raw.B[has, :3, :3] if T is Y else raw.A[has, :3, :3] @ T[:3, :3]
+                axes[has], of_axes[has] = of_frame @ w.axes[has], w.of_axes[has]
+        weighing = replace(w, axes=axes, of_axes=of_axes)
+        return DirectedPair(e, raw.A, raw.B, weighing, w.equations, problem.unseen(pair.target))
+
+    def holding(self, X: Array | None, Y: Array, scale: float) -> DirectedPair:
+        """The pair with one more row of measurements, which holds what means nothing where convention has it.
+
+        What means nothing follows whatever the other frames do, so this costs nothing.
+        """
+        A, T = self.A[:1], np.eye(4)
+        if X is not None and not self.unseen[0]:
+            normal = X[:3, 2]
+            T[:3, :3] = frames_of(normal[None])[0]
+            T[:3, 3] = normal * (normal @ X[:3, 3])
+        B, w = inverse(Y)[None] @ A @ T, self.weighing
+        B[:, :3, 3] *= scale
+        more = Weighing(
+            turns=np.eye(3)[None],
+            of_turns=HELD * np.array([[1.0, 1.0, float(self.unseen[0])]]),
+            centre=np.zeros((1, 3)),
+            axes=A[:, :3, :3] @ T[:3, :3],
+            of_axes=HELD * self.unseen[None, 3:] * (X is not None),
+            mean=np.zeros(1),
+        )
+        whole = {part.name: np.concatenate([getattr(w, part.name), getattr(more, part.name)]) for part in fields(w)}
+        A, B = np.concatenate([self.A, A]), np.concatenate([self.B, B])
+        return replace(self, A=A, B=B, weighing=Weighing(**whole))
 
     @property
     def count(self) -> int:
-        """The number of measurements."""
-        return len(self.raw.A)
+        """The number of measurements, and of what holds."""
+        return len(self.A)
 
     def extent(self, a: Array, c: Array, scale: float) -> float:
         """The longest translation of A about a gauge (a, c), and of B in true length."""
-        centred = self.raw.A[:, :3, 3] + self.raw.A[:, :3, :3] @ c - a
-        both = np.concatenate([centred, self.raw.B[:, :3, 3] / scale])
+        centred = self.A[:, :3, 3] + self.A[:, :3, :3] @ c - a
+        both = np.concatenate([centred, self.B[:, :3, 3] / scale])
         return float(np.linalg.norm(both, axis=1).max())
 
     def rows(self, a: Array, c: Array) -> Iterator[tuple[Array, Array, Array]]:
@@ -86,7 +117,7 @@ class DirectedPair:
         """
         for begin in range(0, self.count, BLOCK):
             at = slice(begin, begin + BLOCK)
-            A, B, w = self.raw.A[at], self.raw.B[at], self.weighing
+            A, B, w = self.A[at], self.B[at], self.weighing
             R_A, R_B, k = A[:, :3, :3], B[:, :3, :3], len(A)
             plain, size = np.zeros((2, k, 12, 25))
             for p in range(3):
@@ -134,7 +165,7 @@ class DirectedPair:
         The parameters are those of `PairInformation`: at B's prediction E is R [omega_X - R' R_Y omega_Y] with
         R = R_A R_X, and e + E c is as there, with [R c] (R_Y omega_Y - R omega_X) beside it.
         """
-        w, A, R_Y = self.weighing, self.raw.A, Y[:3, :3]
+        w, A, R_Y = self.weighing, self.A, Y[:3, :3]
         R = A[:, :3, :3] @ X[:3, :3]
         lever = A[:, :3, :3] @ (X[:3, 3] + c) + A[:, :3, 3] - a - Y[:3, 3]
         turn, move = np.zeros((2, self.count, 3, 15))
@@ -169,21 +200,17 @@ class DirectedPair:
         result: Array = (rows.reshape(m, -1, 12) @ matrix).reshape(rows.shape)
         return result
 
-    def reach(self, at: slice) -> Array:
-        """(12, 12): the largest size of each entry of the rows' matrix, of some measurements."""
+    def reach(self, at: slice, sizes: Array) -> Array:
+        """Bounds on the rows' sizes from those of E row by row and e, (..., 12), of some measurements."""
         w = self.weighing
-        reach: Array = np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
-        return reach
+        result: Array = sizes @ np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0).T
+        return result
 
-    def convention(self, at: Mapping[str, Array], target: str) -> Convention | None:
-        """What holds the directions of the target that mean nothing, about an answer, which costs nothing there."""
-        if not self.unseen.any():
-            return None
-        if target not in at or self.unseen[0]:
-            return Convention(np.eye(4), None, 1.0)
-        transform = np.eye(4)
-        transform[:3, :3] = frames_of(at[target][None, :3, 2])[0]
-        return Convention(transform, 1.0 if self.unseen[3] else None, 1.0, of_plane=True)
+    def reach_back(self, at: slice, sizes: Array) -> Array:
+        """Bounds on the sizes of what ``turned_back`` gives, from those of the rows (..., 12)."""
+        w = self.weighing
+        result: Array = sizes @ np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
+        return result
 
 
 def _turning(turns: Array, centre: Array, axes: Array) -> Array:

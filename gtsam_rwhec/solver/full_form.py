@@ -16,10 +16,8 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma, gammas
-from gtsam_rwhec.problem.knowledge import Prior
 from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B
 from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
-from gtsam_rwhec.solver.directed_pairs import Convention
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.parts import Part
 
@@ -161,28 +159,31 @@ def _add_priors(form: BlockMatrix, part: Part) -> None:
         if name not in place:
             continue
         for prior in priors:
-            quadratic = _prior_form(prior, part)
+            quadratic = _prior_form(prior.transform, prior.sigma, prior.kappa, part)
             form.frames[place[name]] += quadratic[used, used]
-            if isinstance(prior, Convention) and used.start:
-                continue  # what means nothing gives the other rotations no sign
             form.tails[place[name], :, 1] += quadratic[used, 13]
             form.tail[1, 1] += quadratic[13, 13]
 
 
-def _prior_form(prior: Prior, part: Part) -> Array:
+def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) -> Array:
     """The form (14, 14) of one prior over [t, s, vec R, h]."""
-    T, (along, turns) = prior.transform, prior.weights
-    residual, turn = np.zeros((3, 14)), np.zeros((9, 14))
-    residual[:, :3] = np.eye(3)
-    if part.kind == "direct":
-        residual[:, 13] = -T[:3, 3]  # t - t_0 h
-    else:
-        # X = T'^-1: |t_X - t_0| = |t' + R' t_0|, linear in the inverse's t' and R'.
-        residual[:, 4:13] = np.kron(T[:3, 3], np.eye(3))
-    turn[:, 4:13] = np.eye(9)
-    turn[:, 13] = -as_variable(T, part)[:3, :3].T.ravel()  # r - r_0 h
-    form: Array = 0.5 * (residual.T @ along @ residual + turn.T @ np.kron(turns, np.eye(3)) @ turn)
-    return form
+    rows = []
+    if sigma is not None:
+        residual = np.zeros((3, 14))
+        residual[:, :3] = np.eye(3)
+        if part.kind == "direct":
+            residual[:, 13] = -T[:3, 3]  # t - t_0 h
+        else:
+            # X = T'^-1: |t_X - t_0| = |t' + R' t_0|, linear in the inverse's t' and R'.
+            residual[:, 4:13] = np.kron(T[:3, 3], np.eye(3))
+        rows.append(residual / sigma)
+    if kappa is not None:
+        residual = np.zeros((9, 14))
+        residual[:, 4:13] = np.eye(9)
+        residual[:, 13] = -as_variable(T, part)[:3, :3].T.ravel()  # r - r_0 h
+        rows.append(residual * np.sqrt(kappa))
+    stacked = np.concatenate(rows)
+    return 0.5 * stacked.T @ stacked
 
 
 def rounding_of_fixed(part: Part) -> Array:

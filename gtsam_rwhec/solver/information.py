@@ -22,7 +22,6 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import R_A, T_A
 from gtsam_rwhec.solver.answers import PairPoses
 from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
-from gtsam_rwhec.solver.directed_pairs import Convention
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.rotations import HATS
@@ -217,8 +216,6 @@ def prior_information(part: Part) -> tuple[Array, Array]:
     rotation, translation = np.zeros((len(part.free), 7)), np.zeros((len(part.free), 7))
     for i, name in enumerate(part.free):
         for prior in part.priors.get(name, []):
-            if isinstance(prior, Convention):
-                continue  # it holds what means nothing
             if prior.kappa is not None:
                 rotation[i, :3] += 2.0 * prior.kappa
             if prior.sigma is not None:

@@ -115,13 +115,14 @@ class MeasuredPriors:
                 (QV, VQV, of_t, of_r, about),
                 (QV_size, VQV_size, t_size, r_size, np.abs(about)),
             ):
-                along, turns = (0.5 * weight if by is QV else 0.5 * np.abs(weight) for weight in prior.weights)
-                weighed, turned_r = along @ t, np.kron(turns, np.eye(3)) @ r
-                by[t_rows] += weighed
-                by[r_rows] += turned_r
-                products += t.T @ weighed + r.T @ turned_r
-                if self.part.kind == "inverse":
-                    by[r_rows] += np.kron(s[:, None], weighed)
+                if prior.sigma is not None:
+                    by[t_rows] += 0.5 / prior.sigma**2 * t
+                    products += 0.5 / prior.sigma**2 * t.T @ t
+                    if self.part.kind == "inverse":
+                        by[r_rows] += 0.5 / prior.sigma**2 * np.kron(s[:, None], t)
+                if prior.kappa is not None:
+                    by[r_rows] += 0.5 * prior.kappa * r
+                    products += 0.5 * prior.kappa * r.T @ r
         unit = gamma(OPERATIONS + len(self.priors) + sum(map(len, self.priors.values())))
         return QV, unit * QV_size, VQV, unit * VQV_size
 

@@ -68,8 +68,8 @@ def variance_factors(part: Part, told: PartInformation, J_t: Array, J_R: Array) 
     """Variance factors from the costs J_t, J_R (E,) of the pairs at the optimum, in the physical model.
 
     A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2), and J_R
-    is sum kappa |dR|_F^2 / 2 = sum kappa theta^2. Both have as expectation half the equations (3 N of poses), as rotations have variance 1 / (2
-    kappa) an axis. The part's factors are corrected for the unknowns that were fitted.
+    is sum kappa |dR|_F^2 / 2 = sum kappa theta^2. Both have as expectation half the equations (3 N of poses), as
+    rotations have variance 1 / (2 kappa) an axis. The part's factors are corrected for the unknowns that were fitted.
     """
     counts, N = part.moments.count, part.equations.sum(axis=0)
     if part.number_of_unknowns >= N.sum():  # the noise cannot be estimated: use the weights

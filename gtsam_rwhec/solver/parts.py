@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -17,7 +17,7 @@ from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.directed_pairs import Convention, DirectedPair
+from gtsam_rwhec.solver.directed_pairs import DirectedPair, directed_pairs
 
 #: Pairs with more measurements are evaluated one by one.
 SMALL = 256
@@ -98,7 +98,6 @@ class Part:
     is_relative: bool  #: whether all weights are 1, so that costs have no statistical meaning
     given: Given | None  #: the raw measurements, fixed frames and priors; None where measurements were not kept
     directed: tuple[DirectedPair, ...] = ()  #: the pairs that weigh by direction, in ascending order
-    is_about: bool = False  #: whether the directions are those of an answer
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,7 +118,7 @@ class Part:
         """(E, 2): how many equations of rotation and of translation a pair gives."""
         result = np.repeat(3.0 * self.moments.count[:, None], 2, axis=1)
         for each in self.directed:
-            result[each.e] = each.weighing.equations
+            result[each.e] = each.equations
         return result
 
     @cached_property
@@ -180,11 +179,12 @@ class Part:
         return self.gauge.target_carrier if name in self._of_target_carrier else self.gauge.sensor_carrier
 
 
-def parts_of(problem: Problem, about: Mapping[str, Array] | None = None) -> list[Part]:
+def parts_of(problem: Problem, about: Mapping[str, Array] | None = None, scale: float = 1.0) -> list[Part]:
     """Split a problem into connected parts, and check the problem as a whole.
 
-    ``about`` has poses (4, 4) of the frames, at which measurements that weigh by direction have their directions; left
-    out, their translations have mean weights, except on frames that are fixed. A scale that all targets share joins all frames to one part.
+    ``about`` has poses (4, 4) of the frames, and ``scale`` the shared scale there, at which measurements that weigh by
+    direction have their directions; left out, their translations have mean weights, except on frames that are fixed.
+    A scale that all targets share joins all frames to one part.
     Raises `CountError` without measurements; `FrameError` for a fixed frame, prior or scale of a frame that no
     measurement mentions; `UnderdeterminedError` for fewer equations than unknowns in a part.
     """
@@ -203,7 +203,7 @@ def parts_of(problem: Problem, about: Mapping[str, Array] | None = None) -> list
     for pair in problem.pairs:
         pairs[where[pair.sensor]].append(pair)
     return [
-        _part(problem, sorted(component, key=order.__getitem__), tuple(of_component), about or {})
+        _part(problem, sorted(component, key=order.__getitem__), tuple(of_component), about or {}, scale)
         for component, of_component in zip(components, pairs, strict=True)
     ]
 
@@ -222,17 +222,16 @@ def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
     return list(components.values())
 
 
-def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...], about: Mapping[str, Array]) -> Part:
+def _part(
+    problem: Problem, names: list[str], pairs: tuple[Pair, ...], about: Mapping[str, Array], scale: float
+) -> Part:
     """A part of these frames, targets before sensors, as the problem orders them."""
     members, seen = frozenset(names), {pair.target for pair in pairs if not pair.is_motion}
     targets = tuple(name for name in names if name in seen)
     sensors = tuple(name for name in names if name not in seen)
     gauge, moments = _centred(problem, pairs)
     priors = {name: problem.priors[name] for name in problem.priors if name in members}
-    by_direction = problem.directed
-    directed = tuple(DirectedPair.of(e, pair, problem, about) for e, pair in enumerate(pairs) if pair in by_direction)
-    conventions = {pairs[each.e].target: each.convention(about, pairs[each.e].target) for each in directed}
-    held: dict[str, list[Prior]] = {name: [prior] for name, prior in conventions.items() if prior is not None}
+    directed = directed_pairs(problem, pairs, about, scale)
     is_inverse = problem.scale == "per_target" or (
         problem.scale == "shared" and any(p.sigma is not None for beliefs in priors.values() for p in beliefs)
     )
@@ -241,15 +240,6 @@ def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...], about: Ma
             f"{', '.join(names)}: measurements that weigh by direction ({pairs[directed[0].e]}) take no prior of a "
             "translation beside an unknown scale; give the scale, or fix the frame"
         )
-    if problem.scale == "shared" and any(p.sigma is not None for beliefs in held.values() for p in beliefs):
-        raise ScaleError(
-            f"{', '.join(held)}: planes of unknown pose are not certified beside an unknown scale; give the scale (scale='known'), or "
-            "fix the target (fix)"
-        )
-    given = Given.of(problem, pairs, members)
-    beliefs_of = {name: [*priors.get(name, []), *held.get(name, [])] for name in (*priors, *held)}
-    if given is not None:
-        given = replace(given, priors=beliefs_of)
     shift = {name: gauge.target_carrier for name in targets} | {name: gauge.sensor_carrier for name in sensors}
     part = Part(
         free=tuple(name for name in targets + sensors if name not in problem.fixed),
@@ -259,17 +249,16 @@ def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...], about: Ma
         moments=moments,
         fixed={name: _moved(T, shift[name]) for name, T in problem.fixed.items() if name in members},
         priors={
-            name: [replace(p, transform=_moved(p.transform, shift[name])) for p in beliefs]
-            for name, beliefs in beliefs_of.items()
+            name: [Prior(_moved(p.transform, shift[name]), p.sigma, p.kappa) for p in beliefs]
+            for name, beliefs in priors.items()
         },
         fixed_scales={name: s for name, s in problem.fixed_scales.items() if name in members},
         gauge=gauge,
         kind="inverse" if is_inverse else "direct",
         scale=problem.scale,
         is_relative=problem.is_relative,
-        given=given,
+        given=Given.of(problem, pairs, members),
         directed=directed,
-        is_about=bool(about),
     )
     _check(part)
     return part
@@ -299,7 +288,7 @@ def _moved(T: Array, origin: Array) -> Array:
 
 def _check(part: Part) -> None:
     equations = int(part.equations.sum())
-    beliefs = [p for priors in part.priors.values() for p in priors if not isinstance(p, Convention)]
+    beliefs = [p for priors in part.priors.values() for p in priors]
     equations += sum(3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs)
     if equations < part.number_of_unknowns:
         raise UnderdeterminedError(

@@ -120,7 +120,7 @@ def stacks_of(measured: Measured, block: int = BLOCK) -> Iterator[Stack]:
     for pair, directed in measured.directed:
         for first in range(0, directed.count, block):
             part = slice(first, min(first + block, directed.count))
-            A, B = (_rows(poses[part])[None] for poses in (directed.raw.A, directed.raw.B))
+            A, B = (_rows(poses[part])[None] for poses in (directed.A, directed.B))
             one = np.ones(A.shape[:2])
             yield Stack(np.array([pair]), A, B, one, one, (directed, part))
     for pair, raw in measured.batches:
@@ -199,15 +199,15 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         k, m = stack.weight.shape
         if stack.directed is None:
             r = r if rest is None else r + rest
-            weights = np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
+            weights: Array = np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
         else:
             directed, part = stack.directed
-            turn = directed.reach(part)
-            low = (low + DOUBLED * _reach(r)).reshape(k, D, 12) @ turn.T * (1.0 + 1e-9)
+            rounded: Array = (low + DOUBLED * _reach(r)) * (1.0 + 1e-9)
+            low = np.reshape(directed.reach(part, rounded.reshape(k, D, 12)), (k, outputs))
             r, weights = directed.turned(part, r, rest), directed.weights(part)[None]
         residuals = r.reshape(k, m, D, 12)
         weighted = residuals * weights[:, :, None, :]
-        flat = weighted.reshape(k, m, outputs)
+        flat: Array = weighted.reshape(k, m, outputs)
         unit = gamma(m + _FEW)
         of_ones = np.sqrt(np.ones(m) @ weights)[:, None, :]
         # |r| has an error of low: by Cauchy and Schwarz each root of a sum of squares is off by sqrt(total) low.
@@ -220,12 +220,12 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         else:
             square, error = _together(weighted, residuals, root, slack)
             places = np.zeros(1, dtype=int)
-        one_size, one_error = of_ones * root, of_ones * (unit * root + slack)
+        in_rows, rows_error = of_ones * root, of_ones * (unit * root + slack)
         if stack.directed is not None:
             flat = directed.turned_back(part, flat)
-            one_error = (one_error + gamma(_FEW + 12) * one_size) @ turn * (1.0 + 1e-9)
-            one_size = one_size @ turn
-        one_size, one_error = one_size.reshape(k, 1, outputs), one_error.reshape(k, 1, outputs)
+            grown: Array = (rows_error + gamma(_FEW + 12) * in_rows) * (1.0 + 1e-9)
+            rows_error, in_rows = directed.reach_back(part, grown), directed.reach_back(part, in_rows)
+        one_size, one_error = in_rows.reshape(k, 1, outputs), rows_error.reshape(k, 1, outputs)
         of_poses, of_errors = [], []
         for poses, rounding in ((A, off), (stack.B, np.zeros((k, 12))))[of_A_and_B]:
             of_poses.append(np.matmul(poses.transpose(0, 2, 1), flat))

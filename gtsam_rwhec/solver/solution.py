@@ -14,7 +14,7 @@ from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionErro
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, to_pose3
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.answers import (
@@ -245,13 +245,15 @@ def solve(
         check_against_knowledge(problem, *initial)
     with one_blas_thread(), np.errstate(all="ignore"):
         about = None if initial is None else poses_of(*initial[:2])
-        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about)]
+        scale = 1.0 if initial is None or problem.scale != "shared" else checked_scale(initial[2], "the start's scale")
+        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
         # Directions of translations are those of an answer: they are taken there again until the answer stays.
         for _ in range(MOST_ROUNDS if problem.directed else 0):
             before, about = about, {name: T for result in results for name, T in result.poses.items()}
             if before is not None and max(_turned(before[name], T) for name, T in about.items()) < STILL_RAD:
                 break
-            results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about)]
+            scale = results[0].answer.scale
+            results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
     return _merge(problem, results)
 
 
@@ -263,7 +265,7 @@ STILL_RAD = 1e-9
 
 def _turned(before: Array, after: Array) -> float:
     """The angle between the rotations of two poses, rad, nearly."""
-    return float(np.linalg.norm(before[:3, :3] - after[:3, :3])) / np.sqrt(2.0)
+    return float(np.linalg.norm(before[:3, :3] - after[:3, :3]) / np.sqrt(2.0))
 
 
 def _solved(
@@ -324,7 +326,8 @@ def certify(
     check_types(problem, options, progress)
     options = options or SolveOptions()
     check_against_knowledge(problem, X, Y, scale)
-    parts = parts_of(problem, poses_of(X, Y) if problem.directed else None)
+    shared = checked_scale(scale, "the answer's scale of all targets") if problem.scale == "shared" else 1.0
+    parts = parts_of(problem, poses_of(X, Y) if problem.directed else None, shared)
     certificates = []
     for part in parts:
         given = given_answer(part, X, Y, scale)
