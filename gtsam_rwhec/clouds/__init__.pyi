@@ -6,3 +6,7 @@ from .lidar_boards import find_board as find_board
 from .lidar_camera import SeenBoards as SeenBoards
 from .lidar_camera import lidar_and_camera as lidar_and_camera
 from .lidar_camera import seen_boards as seen_boards
+from .shapes import SeenPlane as SeenPlane
+from .shapes import SeenSphere as SeenSphere
+from .shapes import find_plane as find_plane
+from .shapes import find_sphere as find_sphere

@@ -14,3 +14,7 @@ from .simulation import FrameDistance as FrameDistance
 from .simulation import PosesAndScale as PosesAndScale
 from .simulation import Simulation as Simulation
 from .simulation import frame_distance as frame_distance
+from .lidar_scenes import LidarPlaces as LidarPlaces
+from .lidar_scenes import SimulatedLidar as SimulatedLidar
+from .lidar_scenes import lidar_cloud as lidar_cloud
+from .lidar_scenes import lidar_places as lidar_places
