@@ -10,3 +10,5 @@ from .shapes import SeenPlane as SeenPlane
 from .shapes import SeenSphere as SeenSphere
 from .shapes import find_plane as find_plane
 from .shapes import find_sphere as find_sphere
+from .depth_boards import DepthBoard as DepthBoard
+from .depth_boards import board_in_depth as board_in_depth
