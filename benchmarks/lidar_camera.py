@@ -2,13 +2,13 @@
 
     python benchmarks/lidar_camera.py [--runs 300] [--biased 60] [--splits 20] [--workers 2]
 
-Simulated (`gtsam_rwhec/simulate/lidar_scenes.py`): 16 beams, ranges to 15 mm, a divergence of 3 mrad with mixed pixels, a
-room, a board of 0.6 x 0.85 m on a stand in 10 or 3 places 1.5 to 3 m away, found without a start; the camera's poses by
-corners to 0.2 px. Each run has its own poses. The LiDAR's and the camera's covariances are taken as they are stated. "Biased":
-each beam measures 5 mm (standard deviation) too far or too near, always.
+Simulated (`gtsam_rwhec/simulate/lidar_scenes.py`): 16 beams, ranges to 15 mm, a divergence of 3 mrad with mixed pixels,
+a room, a board of 0.6 x 0.85 m on a stand in 10 or 3 places 1.5 to 3 m away, found without a start; the camera's poses
+by corners to 0.2 px. Each run has its own poses. The LiDAR's and the camera's covariances are taken as they are stated.
+"Biased": each beam measures 5 mm (standard deviation) too far or too near, always.
 
-Real (`lidar_board/poses.csv` beside the checkout, or in the folder that GTSAM_RWHEC_DATA names): halves of 20 places drawn at random, of
-which each must hold the other's answer in its own 95 % ellipsoid. Exits with 1 if a bar is missed.
+Real (`lidar_board/poses.csv` beside the checkout, or in the folder that GTSAM_RWHEC_DATA names): halves of 20 places
+drawn at random, of which each must hold the other's answer in its own 95 % ellipsoid. Exits with 1 if a bar is missed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ def one(kind: str, seed: int) -> tuple[float, float, bool, bool, float, float]:
     found = rw.calibrate(problem, rw.CalibrateOptions(noise="given"))
     away = frame_distance(found.Y["lidar"].matrix(), places.T_camera_lidar)
     deviations = np.sqrt(np.diagonal(found.covariance("lidar")))
-    bounds = found.squared_radius(3, LEVEL) ** 0.5 * np.array([np.degrees(deviations[:3].max()), 1e3 * deviations[3:].max()])
+    bounds = found.squared_radius(3, LEVEL) ** 0.5 * np.array(
+        [np.degrees(deviations[:3].max()), 1e3 * deviations[3:].max()]
+    )
     return (
         away.translation_mm, away.rotation_deg, bool(found.contains("lidar", places.T_camera_lidar, LEVEL)),
         found.solution.certificate.status is rw.Status.CERTIFIED, float(bounds[1]), float(bounds[0]),
@@ -64,7 +66,11 @@ def simulated(kind: str, runs: int, workers: int) -> list[bars.Row]:
     rows.append(bars.at_most(f"{kind}: rotation, median", float(np.median(degrees)), most[1], " deg"))
     share = bars.Share.of(held.tolist())
     met = share.meets(LEAST, MOST) if kind == "10 places" else None
-    rows.append(bars.Row(f"{kind}: 95 % ellipsoids that hold the truth", str(share), "95 +- 2 %" if met is not None else "", met))
+    rows.append(
+        bars.Row(
+            f"{kind}: 95 % ellipsoids that hold the truth", str(share), "95 +- 2 %" if met is not None else "", met
+        )
+    )
     return rows
 
 
@@ -82,10 +88,13 @@ def real(splits: int) -> list[bars.Row]:
         Y = [half.Y["lidar"].matrix() for half in halves]
         apart.append(frame_distance(*Y))
         both.append(all(half.contains("lidar", other, LEVEL) for half, other in zip(halves, Y[::-1], strict=True)))
-    distance = f"{np.median([d.translation_mm for d in apart]):.1f} mm, {np.median([d.rotation_deg for d in apart]):.2f} deg"
+    distance = (
+        f"{np.median([d.translation_mm for d in apart]):.1f} mm, {np.median([d.rotation_deg for d in apart]):.2f} deg"
+    )
+    verdict = whole.verdict.name
     good = all(each is rw.Status.CERTIFIED for each in status)
     return [
-        bars.Row("40 real places: T_lidar_camera, mm", f"{np.round(t, 1)} +- {np.round(sigma, 1)} (of Y); {whole.verdict.name}"),
+        bars.Row("40 real places: t of T_lidar_camera", f"{np.round(t, 1)} +- {np.round(sigma, 1)} mm, {verdict}"),
         bars.Row("    certified, with all halves", str(good), "all", good),
         bars.Row(
             "    halves each in the other's 95 % ellipsoid", f"{sum(both)} of {splits}; median apart {distance}",

@@ -18,6 +18,8 @@ from gtsam_rwhec.geometry.poses import Array
 APART_RAD = float(np.radians(0.25))
 #: More beams than this are not a LiDAR's of few beams: the elevations of the cloud are no lines.
 MOST_BEAMS = 256
+#: A beam has at least so many points, usually.
+FEWEST_OF_BEAM = 20
 #: A beam whose points are further than this from one elevation is none; radians.
 STRAIGHT_RAD = float(np.radians(0.5))
 #: Pulses that are further apart than this many steps have a gap between them.
@@ -30,7 +32,7 @@ class Lattice(NamedTuple):
     directions: Array  #: (N, 3)
     ranges: Array  #: (N,), metres; infinite where nothing came back
     rings: np.ndarray  #: (N,)
-    index: np.ndarray  #: (N,) the point in the cloud; -1 where nothing came back
+    point: np.ndarray  #: (N,) which of the cloud; -1 where nothing came back
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,10 @@ def beams_of(cloud: Cloud, where: str) -> Beams:
         order = np.argsort(elevations)
         rings = np.empty(len(order), dtype=int)
         rings[order] = np.concatenate([[0], np.cumsum(np.diff(elevations[order]) > APART_RAD)])
-        spreads = [np.ptp(elevations[rings == ring]) for ring in range(min(rings.max() + 1, MOST_BEAMS))]
-        if rings.max() < 2 or rings.max() >= MOST_BEAMS or np.median(spreads) > STRAIGHT_RAD:
+        count = int(rings.max()) + 1
+        spreads = [np.ptp(elevations[rings == ring]) for ring in range(min(count, MOST_BEAMS))]
+        is_scattered = np.median(spreads) > STRAIGHT_RAD or np.median(np.bincount(rings)) < FEWEST_OF_BEAM
+        if not 3 <= count <= MOST_BEAMS or is_scattered:
             raise CloudError(
                 f"{where}: the points have no beam numbers (ring), and their elevations do not fall into lines; give "
                 "rings, and the cloud in the LiDAR's own frame, whose z is the axis about which it spins"

@@ -22,7 +22,7 @@ FEWEST_POINTS = 12
 FEWEST_CORNERS = 4
 #: A corner that is off by this many of the usual errors is left out.
 GATE = 4.0
-#: Points that are further than this, metres for each metre of depth, from the others about a corner are of something else.
+#: Points that differ from the others about a corner by this share of their depth are of something else.
 JUMP = 0.02
 
 
@@ -57,8 +57,8 @@ def board_in_depth(
     """The pose of a board from the places of its corners in an organised cloud.
 
     Corners come from the image that belongs to the cloud, pixel for pixel: of a ``rw.detect.Detector``,
-    ``detection.corners_px`` and ``target.corners()[detection.indices]``. Each is looked up in the points about it, which
-    are a smooth function of the pixel on a flat board, so no intrinsics are used.
+    ``detection.corners_px`` and ``target.corners()[detection.indices]``. Each is looked up in the points about it,
+    which are a smooth function of the pixel on a flat board, so no intrinsics are used.
 
     Parameters
     ----------
@@ -89,9 +89,8 @@ def board_in_depth(
     if cloud.shape is None:
         raise CloudError(f"{where} is no image of points (rows, columns, 3); a corner in pixels has no point in it")
     rows, columns = cloud.shape
-    place = np.full(rows * columns, -1)
-    place[cloud.at] = np.arange(len(cloud))
-    place = place.reshape(rows, columns)
+    place = np.full((rows, columns), -1)
+    place.flat[cloud.at] = np.arange(len(cloud))
     corners, spreads = np.full((len(pixels), 3), np.nan), np.full((len(pixels), 3, 3), np.nan)
     for k, pixel in enumerate(pixels):
         found = _corner(cloud.points, place, pixel, corner_px)
@@ -101,7 +100,7 @@ def board_in_depth(
     for _ in range(5):
         if used.sum() < FEWEST_CORNERS:
             raise CloudError(
-                f"{where}: of {len(pixels)} corners only {used.sum()} have points about them that agree with the board; "
+                f"{where}: of {len(pixels)} corners only {used.sum()} have points that agree with the board; "
                 "look whether image and cloud belong together, and whether the cloud is in metres"
             )
         T = _aligned(corners[used], board[used])
@@ -131,7 +130,9 @@ def _corner(points: Array, place: np.ndarray, pixel: Array, corner_px: float) ->
         return None
     reach = int(np.ceil(WINDOW_PX))
     x, y = np.round(pixel).astype(int)
-    rows, columns = (np.arange(max(c - reach, 0), min(c + reach + 1, n)) for c, n in zip((y, x), place.shape, strict=True))
+    rows, columns = (
+        np.arange(max(c - reach, 0), min(c + reach + 1, n)) for c, n in zip((y, x), place.shape, strict=True)
+    )
     v, u = np.meshgrid(rows, columns, indexing="ij")
     index = place[v, u]
     near = (index >= 0) & (np.hypot(u - pixel[0], v - pixel[1]) <= WINDOW_PX)
@@ -157,4 +158,3 @@ def _aligned(a: Array, b: Array) -> Array:
     """T_a_b (4, 4) that takes points b (n, 3) to points a by least squares (Umeyama 1991)."""
     R = so3_nearest(((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))[None])[0]
     return pose(R, a.mean(axis=0) - R @ b.mean(axis=0))
-

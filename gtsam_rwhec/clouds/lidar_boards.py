@@ -1,12 +1,12 @@
 """A plain rectangular board in the cloud of a LiDAR of few beams: where it is, its pose, and how well that is known.
 
-The plane is told by the points on the board; in it, the rectangle by which beams hit the board and which pass beside it.
-So a horizontal edge between two beams is known to the gap between these, and the covariance says so.
+The plane is told by the points on the board; in it, the rectangle by which beams hit the board and which pass beside
+it. So a horizontal edge between two beams is known to the gap between these, and the covariance says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,8 +26,8 @@ GATE = 4.0
 #: Fewer points or beams on a board do not tell its plane.
 FEWEST_POINTS = 30
 FEWEST_BEAMS = 3
-#: A beam that hits or misses against the rectangle, by chance: first, when the pole or the hand that holds the board may
-#: count as board, and then, without those that were far off.
+#: A beam that hits or misses against the rectangle, by chance: first, when the pole or the hand that holds the board
+#: may count as board, and then, without those that were far off.
 STRAY_AT_FIRST = 0.02
 STRAY = 0.001
 #: A ray that looks mixed and is not, by chance: a pole behind the board has edges too.
@@ -181,7 +181,7 @@ def find_board(
     return found[0] if start is None else _turned_to(found[0], start, size_m)
 
 
-def board_turns(size_m: tuple[float, float]) -> list[Array]:
+def board_turns(size_m: Sequence[float] | Array) -> list[Array]:
     """The rotations (3, 3) about z after which a board looks the same."""
     steps = 4 if abs(size_m[0] - size_m[1]) < 0.05 * max(size_m) else 2
     turns = []
@@ -192,7 +192,7 @@ def board_turns(size_m: tuple[float, float]) -> list[Array]:
 
 
 def turned_like(T: Array, covariance: Array, like: Array, size_m: tuple[float, float]) -> tuple[Array, Array]:
-    """A board's pose (4, 4) and covariance (6, 6), turned so that it is as near to another rotation (3, 3) as it can be."""
+    """A board's pose (4, 4) and covariance (6, 6), turned to be as near to another rotation (3, 3) as it can be."""
     turn = max(board_turns(size_m), key=lambda R: float(np.trace(like.T @ T[:3, :3] @ R)))
     both = np.kron(np.eye(2), turn)
     return T @ pose(turn, np.zeros(3)), both.T @ covariance @ both
@@ -263,7 +263,11 @@ def _plane_through(points: Array, noise_m: float) -> tuple[_Flat, np.ndarray] | 
 
 
 def _fitted(
-    beams: Beams, candidate: np.ndarray, size_m: tuple[float, float], options: LidarBoardOptions, biases: BeamBiases | None
+    beams: Beams,
+    candidate: np.ndarray,
+    size_m: tuple[float, float],
+    options: LidarBoardOptions,
+    biases: BeamBiases | None,
 ) -> LidarBoard | str:
     """The board whose points are among the candidates, or why there is none."""
     few = f"a piece with fewer than {FEWEST_POINTS} points on a plane, by {FEWEST_BEAMS} beams"
@@ -278,7 +282,7 @@ def _fitted(
     if len(np.unique(beams.rings[rough])) < FEWEST_BEAMS:
         return few
     rectangle: _Rectangle | None = None
-    for _ in range(2):  # the plane of all points, then of those inside of the edges
+    while True:  # the plane of all points, then of those inside of the edges
         x = np.cross([0.0, 0.0, 1.0], flat.normal)
         x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-3 else np.array([0.0, 1.0, 0.0])
         axes = np.stack([x, np.cross(flat.normal, x)], axis=1)  # (3, 2), in the plane
@@ -286,12 +290,13 @@ def _fitted(
         told = _rectangle(rays, axes, np.array(size_m), options, float(np.linalg.norm(middle)), rectangle)
         if isinstance(told, str):
             return told
-        rectangle = told
-        plane = _plane_of(beams, flat, axes, rays, rectangle, size_m, options, biases)
+        plane = _plane_of(beams, flat, axes, rays, told, size_m, options, biases)
         if plane is None:
             return few
+        if rectangle is not None:
+            return _board(beams, plane, axes, rays, told)
+        rectangle = told
         flat, middle = plane.flat, plane.flat.offset * flat.normal + axes @ rectangle.mean[:2]
-    return _board(beams, plane, axes, rays, rectangle)
 
 
 #: What a ray hit: the board, what is behind it, both, or something that stands before the board.
@@ -303,7 +308,7 @@ class _Rays(NamedTuple):
 
     at: Array
     hit: np.ndarray
-    index: np.ndarray  #: (N,) the point of each in the cloud; -1 for pulses that came back from nowhere
+    point: np.ndarray  #: (N,) which of the cloud; -1 for pulses that came back from nowhere
     mixed: int
 
 
@@ -312,7 +317,7 @@ def _rays(beams: Beams, flat: _Flat, middle: Array, radius_m: float, options: Li
     expected = flat.ranges(lattice.directions)
     gate = max(GATE * options.noise_m, 0.03)
     with np.errstate(invalid="ignore"):
-        behind = np.where(lattice.index < 0, np.inf, lattice.ranges - expected)
+        behind = np.where(lattice.point < 0, np.inf, lattice.ranges - expected)
     hit = np.where(np.abs(behind) <= gate, HIT, np.where(behind > gate, MISS, UNKNOWN))
     # A point behind the plane, next to one on it, and apart from its other neighbour in depth: a mixed pixel.
     mixed = np.zeros(len(hit), dtype=bool)
@@ -320,16 +325,18 @@ def _rays(beams: Beams, flat: _Flat, middle: Array, radius_m: float, options: Li
     for inner, outer in ((slice(None, -2), slice(2, None)), (slice(2, None), slice(None, -2))):
         with np.errstate(invalid="ignore"):
             apart = np.abs(lattice.ranges[1:-1] - lattice.ranges[outer]) > gate
-        mixed[1:-1] |= same[1:] & same[:-1] & (hit[inner] == HIT) & (hit[1:-1] == MISS) & apart & (lattice.index[1:-1] >= 0)
+        mixed[1:-1] |= (
+            same[1:] & same[:-1] & (hit[inner] == HIT) & (hit[1:-1] == MISS) & apart & (lattice.point[1:-1] >= 0)
+        )
     hit[mixed] = MIXED
     at = expected[:, None] * lattice.directions
     kept = np.isfinite(expected)
     kept[kept] = np.linalg.norm(at[kept] - middle, axis=1) < radius_m
-    return _Rays(at[kept], hit[kept], lattice.index[kept], int(mixed[kept].sum()))
+    return _Rays(at[kept], hit[kept], lattice.point[kept], int(mixed[kept].sum()))
 
 
 class _Rectangle(NamedTuple):
-    """The rectangle's posterior: mean (5,) of [u, v, angle, inset, log of softness] and covariance (5, 5); metres, rad."""
+    """The rectangle's posterior: mean (5,) of [u, v, angle, inset, log of softness], covariance (5, 5); metres, rad."""
 
     mean: Array
     covariance: Array
@@ -340,8 +347,8 @@ class _Rectangle(NamedTuple):
         return float(np.sqrt(np.linalg.eigvalsh(C[:2, :2])[1] + C[2, 2] * (size_m @ size_m) / 4.0))
 
 
-def inside_m(at: Array, rectangles: Array, size_m: tuple[float, float]) -> Array:
-    """How far points (N, 2) are inside of rectangles (M, 4 or more) [u, v, angle, inset]: (M, N), negative outside; metres."""
+def inside_m(at: Array, rectangles: Array, size_m: Sequence[float] | Array) -> Array:
+    """How far points (N, 2) are inside of rectangles (M, 4 or more) [u, v, angle, inset], metres: (M, N)."""
     c, s = np.cos(rectangles[:, 2]), np.sin(rectangles[:, 2])
     depth, other = (
         np.abs(axis @ at.T - (axis * rectangles[:, :2]).sum(axis=1, keepdims=True))
@@ -351,7 +358,8 @@ def inside_m(at: Array, rectangles: Array, size_m: tuple[float, float]) -> Array
     np.subtract(0.5 * size_m[1], other, out=other)
     np.minimum(depth, other, out=depth)
     depth -= rectangles[:, 3, None]
-    return depth
+    result: Array = depth
+    return result
 
 
 def _rectangle(
@@ -359,9 +367,9 @@ def _rectangle(
 ) -> _Rectangle | str:
     """The rectangle by which rays hit and which miss, by importance sampling; or why it is none.
 
-    A ray at depth d inside of an edge hits with probability Phi(d / s), s to be found; one that is mixed is within half a
-    footprint of an edge. The inset is by how much all edges seem further
-    in, since a pulse that hits partly comes back from somewhere else: it has a prior of half a footprint.
+    A ray at depth d inside of an edge hits with probability Phi(d / s), s to be found; one that is mixed is within half
+    a footprint of an edge. The inset is by how much all edges seem further in, since a pulse that hits partly comes
+    back from somewhere else: it has a prior of half a footprint.
     """
     known = rays.hit != UNKNOWN
     stray = STRAY_AT_FIRST
@@ -385,8 +393,9 @@ def _rectangle(
         z, mixed = inside_m(at[who], rectangles, size_m), is_mixed[who]
         z[:, mixed] = footprint - np.abs(z[:, mixed])
         z *= sign[who] * (100.0 / np.maximum(np.exp(rectangles[:, 4:]), soft))
-        votes: Array = tables[kind[who], (np.clip(z, -800.0, 800.0) + 800.5).astype(np.int32)].sum(axis=1)
-        return votes - 0.5 * (((rectangles[:, 3:] - prior) / spread_of_prior) ** 2).sum(axis=1)
+        votes = tables[kind[who], (np.clip(z, -800.0, 800.0) + 800.5).astype(np.int32)].sum(axis=1)
+        result: Array = votes - 0.5 * (((rectangles[:, 3:] - prior) / spread_of_prior) ** 2).sum(axis=1)
+        return result
 
     rng = np.random.default_rng(0)
 
@@ -404,10 +413,10 @@ def _rectangle(
     else:
         period = 2.0 * np.pi / len(board_turns(size_m))
         about = 0.25 * min(size_m)
-        tried = rng.normal(size=(3 * SAMPLES, 5)) * [about, about, 0.0, *spread_of_prior]
+        tried: Array = rng.normal(size=(3 * SAMPLES, 5)) * [about, about, 0.0, *spread_of_prior]
         tried += np.r_[np.median(at[hit], axis=0), 0.0, prior]
         tried[:, 2] = rng.uniform(0.0, period, len(tried))
-        log_proposed = np.zeros(len(tried))
+        log_proposed: Array = np.zeros(len(tried))
         for soft in SOFT_M:
             some = np.arange(0, len(at), 1 + len(at) // ROUGH_RAYS)
             log_weight = log_posterior(tried, soft, some) - log_proposed
@@ -436,7 +445,7 @@ def _moments(weight: Array, samples: Array) -> tuple[Array, Array]:
 
 
 def _weights(log_weight: Array) -> tuple[Array, bool]:
-    """Weights of samples, of which enough count: tempered where few have nearly all the weight; and whether they are."""
+    """Weights of samples, tempered where few have nearly all the weight, and whether they are tempered."""
     power = 1.0
     while True:
         weight = np.exp(power * log_weight - logsumexp(power * log_weight))
@@ -468,7 +477,7 @@ def _plane_of(
     """The plane by generalised least squares: ranges with white noise, and a bias of each beam."""
     margin = options.divergence_rad * np.linalg.norm(rays.at, axis=1) + 0.005
     inner = (rays.hit == HIT) & (inside_m(rays.at @ axes, rectangle.mean[None], size_m)[0] > margin)
-    index, at = rays.index[inner], rays.at[inner]
+    index, at = rays.point[inner], rays.at[inner]
     if len(index) < FEWEST_POINTS:
         return None
     c, s = np.cos(rectangle.mean[2]), np.sin(rectangle.mean[2])
@@ -536,6 +545,4 @@ def _board(beams: Beams, plane: _PlaneOf, axes: Array, rays: _Rays, rectangle: _
     covariance += by_plane @ plane.covariance @ by_plane.T
     times = beams.times_s
     span = None if times is None else float(np.ptp(times[plane.inner]))
-    return LidarBoard(
-        pose(R, middle), covariance, len(plane.inner), rays.mixed, plane.noise_m, span, plane.moments
-    )
+    return LidarBoard(pose(R, middle), covariance, len(plane.inner), rays.mixed, plane.noise_m, span, plane.moments)

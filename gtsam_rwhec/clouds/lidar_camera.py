@@ -133,7 +133,9 @@ def seen_boards(
         except CloudError as error:
             left_out[place] = str(error)
     if not found:
-        raise CloudError(f"no cloud of {len(clouds)} has the board; the first says: {next(iter(left_out.values()), '')}")
+        raise CloudError(
+            f"no cloud of {len(clouds)} has the board; the first says: {next(iter(left_out.values()), '')}"
+        )
     biases = _biases([board.moments for board in found.values()], options.beam_bias_m)
     for place in list(found):
         near_it = found[place].T_sensor_board
@@ -229,7 +231,9 @@ def lidar_and_camera(
     to_board = se3.adjoint(X[None])[0]
     used = np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2))
     if used.sum() < 2:
-        raise CountError(f"{used.sum()} of {len(A)} places have both poses of the board; at least 2 are needed, 10 are good")
+        raise CountError(
+            f"{used.sum()} of {len(A)} places have both poses of the board; at least 2 are needed, 10 are good"
+        )
     A, B, C = A[used], B[used].copy(), C[used] + to_board @ camera[used] @ to_board.T
     Y = rough_alignment(A, B)
     expected = se3.inverse(Y[None]) @ A

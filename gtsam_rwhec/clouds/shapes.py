@@ -23,8 +23,8 @@ from gtsam_rwhec.geometry.real_numbers import is_between
 #: Fewer points than this on a shape do not tell it.
 FEWEST_POINTS = 30
 #: Shapes that are tried, and points among which they are compared.
-TRIES = 600
-COMPARED = 4000
+TRIES = 400
+COMPARED = 2000
 #: A point that is off by this many standard deviations is not of the shape.
 GATE = 4.0
 #: A point that is off by less than this many is of something else near its edge: a mixed pixel.
@@ -142,7 +142,10 @@ def find_sphere(cloud: Cloud, radius_m: float | None = None, *, noise_m: float |
         near = (np.abs(off) < GATE * _spread(off[cosine > GRAZING], noise)) & (cosine > 0.0)
         used = near & (cosine > GRAZING)
         if used.sum() < FEWEST_POINTS:
-            raise CloudError(f"{where}: a sphere has only {used.sum()} points that are not at its edge; come nearer")
+            raise CloudError(
+                f"{where}: no such sphere in {len(points)} points: the nearest to one has {used.sum()} points on its "
+                "side towards the sensor, away from its edge; look whether it is seen, and from near enough"
+            )
         J = -normal[used] if radius_m is not None else np.column_stack([-normal[used], -np.ones(used.sum())])
         step = -np.linalg.lstsq(J, off[used], rcond=None)[0]
         centre, radius = centre + step[:3], radius + (float(step[3]) if radius_m is None else 0.0)
@@ -180,7 +183,7 @@ def find_plane(cloud: Cloud, *, noise_m: float | None = None) -> SeenPlane:
         raise OptionError(f"find_plane: noise_m={brief(noise_m)}; give a positive number of metres")
     points = cloud.points
     noise = noise_m or surface_noise(points)
-    best, off = _by_ransac(points, 3, _plane_through, _off_plane, noise, where, "plane")
+    _, off = _by_ransac(points, 3, _plane_through, _off_plane, noise, where, "plane")
     for _ in range(10):
         used = np.abs(off) < GATE * _spread(off, noise)
         middle = points[used].mean(axis=0)
@@ -238,7 +241,8 @@ def _by_ransac(
     tree = cKDTree(compared)
     seeds = rng.integers(len(compared), size=TRIES)
     sizes = np.geomspace(max(FEWEST_POINTS, len(compared) // 50), len(compared), 6).astype(int)
-    best, most = np.zeros(4), 0
+    best: Array = np.zeros(4)
+    most = 0
     for number, seed in enumerate(seeds):
         about = tree.query(compared[seed], k=min(int(sizes[number % len(sizes)]), len(compared)))[1]
         shape = through(compared[rng.choice(about, few, replace=False)])
@@ -259,7 +263,7 @@ def _sphere_through(points: Array) -> Array:
         return np.full(4, np.nan)
     c = np.linalg.solve(M, (points**2).sum(axis=1))
     square = c[3] + c[:3] @ c[:3]
-    return np.r_[c[:3], np.sqrt(square) if square > 0.0 else np.nan]
+    return np.array([*c[:3], np.sqrt(square) if square > 0.0 else np.nan])
 
 
 def _off_sphere(points: Array, sphere: Array) -> Array:
@@ -271,7 +275,7 @@ def _plane_through(points: Array) -> Array:
     """[normal, offset] (4,) of three points; nan where they are on one line."""
     normal = np.cross(points[1] - points[0], points[2] - points[0])
     length = np.linalg.norm(normal)
-    return np.r_[normal, normal @ points[0]] / length if length > 1e-12 else np.full(4, np.nan)
+    return np.array([*normal, normal @ points[0]]) / length if length > 1e-12 else np.full(4, np.nan)
 
 
 def _off_plane(points: Array, plane: Array) -> Array:

@@ -96,9 +96,7 @@ def lidar_cloud(
         np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     )
     stand[:3, 3] -= 0.12 * stand[:3, 2] + (0.0, 0.0, 0.75)
-    ranges = np.minimum(
-        _rectangle(origins, seen, T_lidar_board, size_m), _rectangle(origins, seen, stand, (0.04, 1.5))
-    )
+    ranges = np.minimum(_rectangle(origins, seen, T_lidar_board, size_m), _rectangle(origins, seen, stand, (0.04, 1.5)))
     ranges = np.minimum(ranges, _room(origins, seen, T_lidar_room))
     near = ranges.min(axis=1, keepdims=True)
     is_near = ranges < near + ONE_SURFACE_M
@@ -148,9 +146,10 @@ def lidar_places(
     """
     rng = np.random.default_rng(seed)
     lidar = lidar or SimulatedLidar()
-    T_lidar_camera = pose(LOOKING, np.array([0.07, 0.0, -0.15])) @ expmap(
-        np.r_[rng.normal(0.0, 0.05, 3), rng.normal(0.0, 0.05, 3)][None]
-    )[0]
+    T_lidar_camera = (
+        pose(LOOKING, np.array([0.07, 0.0, -0.15]))
+        @ expmap(np.r_[rng.normal(0.0, 0.05, 3), rng.normal(0.0, 0.05, 3)][None])[0]
+    )
     biases = rng.normal(0.0, lidar.bias_m, len(lidar.elevations_rad)) if lidar.bias_m else None
     grid = np.stack(np.meshgrid(np.linspace(-0.42, 0.42, 7), np.linspace(-0.42, 0.42, 10)), axis=-1).reshape(-1, 2)
     corners = np.concatenate([grid * size_m, np.zeros((len(grid), 1))], axis=1)
@@ -168,13 +167,17 @@ def lidar_places(
         clouds.append(lidar_cloud(lidar, T, size_m, rng, biases_m=biases))
         truth = inverse(T_lidar_camera[None])[0] @ T
         at = corners @ truth[:3, :3].T + truth[:3, 3]
-        by_point = focal_px * np.stack(
-            [
-                np.stack([1.0 / at[:, 2], 0.0 * at[:, 2], -at[:, 0] / at[:, 2] ** 2], axis=1),
-                np.stack([0.0 * at[:, 2], 1.0 / at[:, 2], -at[:, 1] / at[:, 2] ** 2], axis=1),
-            ],
-            axis=1,
-        ) @ truth[:3, :3]
+        by_point = (
+            focal_px
+            * np.stack(
+                [
+                    np.stack([1.0 / at[:, 2], 0.0 * at[:, 2], -at[:, 0] / at[:, 2] ** 2], axis=1),
+                    np.stack([0.0 * at[:, 2], 1.0 / at[:, 2], -at[:, 1] / at[:, 2] ** 2], axis=1),
+                ],
+                axis=1,
+            )
+            @ truth[:3, :3]
+        )
         J = np.concatenate([np.cross(corners[:, None], by_point), by_point], axis=2).reshape(-1, 6)
         covariance = corner_px**2 * np.linalg.inv(J.T @ J)
         seen.append(truth @ expmap(rng.multivariate_normal(np.zeros(6), covariance)[None])[0])

@@ -1,8 +1,8 @@
 """Real places of a board before a camera and a LiDAR, as other people measured them; tests and benchmarks use them.
 
-The file (`data/vlp` of acfr/cam_lidar_calibration) has 19 rows a place: the board's middle in the camera (mm), its normal and
-its four corners; the same in the LiDAR; angles, sizes and other figures. The corners of the two go round in opposite
-directions, and either normal may point either way.
+The file (`data/vlp` of acfr/cam_lidar_calibration) has 19 rows a place: the board's middle in the camera (mm), its
+normal and its four corners; the same in the LiDAR; angles, sizes and other figures. The corners of the two go round in
+opposite directions, and either normal may point either way.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def places_of(path: Path) -> tuple[Array, Array]:
 
 
 def _board(given: Array) -> Array:
-    """A board's pose from its middle (mm), its normal and four corners (mm): x along the shorter side, z to the sensor."""
+    """A board's pose from its middle (mm), normal and four corners (mm): x along the shorter side."""
     middle, normal, corners = 1e-3 * given[0], given[1] / np.linalg.norm(given[1]), 1e-3 * given[2:]
     normal = -np.sign(normal @ middle) * normal
     sides = np.roll(corners, -1, axis=0) - corners
