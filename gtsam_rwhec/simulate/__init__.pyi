@@ -17,3 +17,7 @@ from .simulation import frame_distance as frame_distance
 from .simulated_clouds import Shape as Shape
 from .simulated_clouds import SimulatedClouds as SimulatedClouds
 from .simulated_clouds import clouds_of_thing as clouds_of_thing
+from .lidar_scenes import LidarPlaces as LidarPlaces
+from .lidar_scenes import SimulatedLidar as SimulatedLidar
+from .lidar_scenes import lidar_cloud as lidar_cloud
+from .lidar_scenes import lidar_places as lidar_places
