@@ -25,11 +25,12 @@ BUDGET = {
     # errors of trajectories that last, by kind, with their file 230; a drift that tracks share 40
     # issue 27: clocks' rates 150, errors of the view 200, tags that are alike in one stack 70
     # issue 28: while the robot stands there: plan 2,000, stream and stopping rule 1,400, live with its sources 2,100
-    # issue 29: clouds of 3D cameras and LiDARs, points and planes in the certified problem: 5,000
-    "lines": 98_000,
-    "code": 61_400,
+    # issue 29: points and planes in the certified problem 1,300; objects 1,600; formats and the road 1,600; LiDARs,
+    # boards and shapes in clouds 1,300; simulated clouds and scans 500. The Stream's shared errors and cameras: 300
+    "lines": 99_300,
+    "code": 62_000,
     # capture has 25 files, and is a package of its own
-    "files": 435,
+    "files": 438,
     "packages": 20,
     "names that occur twice": 0,
     "lines of tests and benchmarks": 73_500,
