@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rwhec_factors import se3
@@ -224,3 +225,22 @@ def test_real_things_agree(shared_data: Path, tmp_path: Path, name: str) -> None
     assert result["verdict"] != "do_not_use"
     # Eight things of this cell agreed within these, by another road (motions of pairs, and no joint registration).
     assert np.abs(sensor(tmp_path / "out")[:3, 3] - [0.0711, -0.0352, 0.0598]).max() < 0.0015
+
+
+def test_depth_images_are_clouds(made: SimulatedClouds, tmp_path: Path) -> None:
+    """Images of 16 bits, in tenths of a millimetre."""
+    (tmp_path / "depth").mkdir()
+    for number, cloud in enumerate(made.clouds):
+        x, y, z = cloud.points.T
+        u, v = (np.rint(300.0 * axis / z + 99.5).astype(int) for axis in (x, y))
+        image = np.zeros((200, 200), np.uint16)
+        image[v, u] = np.rint(1e4 * z)
+        cv2.imwrite(str(tmp_path / "depth" / f"{number}.png"), image)
+    write_poses(made.A, tmp_path / "poses.txt")
+    intrinsics = "intrinsics: {K: [300.0, 300.0, 99.5, 99.5], size: [200, 200]}, unit_m: 0.0001"
+    text = RIG.replace("clouds: clouds", f"clouds: depth, {intrinsics}")
+    (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
+    run("calibrate", tmp_path, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    degrees, mm = off(sensor(tmp_path / "out"), made.T_sensorcarrier_sensor)
+    assert degrees < 0.1  # pixels are a millimetre wide
+    assert mm < 0.5
