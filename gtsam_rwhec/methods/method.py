@@ -237,6 +237,11 @@ def check_problem(method: Method[Any], problem: Problem) -> None:
         raise ScaleError(
             f"this method takes scale={' or '.join(map(repr, scales))}, and the problem has scale={problem.scale!r}"
         )
+    if problem.directed and Takes.PRIORS not in takes:
+        raise OptionError(
+            f"this method takes whole poses, and measurements of {next(iter(problem.directed))} weigh by direction "
+            "(points, planes, directional=True); take 'certified'"
+        )
     motions = [pair.sensor for pair in problem.pairs if pair.is_motion]
     if motions and Takes.MOTIONS not in takes:
         raise FrameError(f"this method solves A X = Y B, and {motions[0]} has motions of its own (A Y = Y B)")

@@ -13,7 +13,15 @@ from rwhec_factors import se3
 from scipy.optimize import least_squares
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, NoiseError, NotUniqueWarning, PoseError, ScaleError
+from gtsam_rwhec.errors import (
+    CountError,
+    MeasurementsNotKeptError,
+    NoiseError,
+    NotUniqueWarning,
+    OptionError,
+    PoseError,
+    ScaleError,
+)
 from gtsam_rwhec.problem.directions import aligned
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.selection import aligned_at
@@ -261,3 +269,9 @@ def test_what_the_certified_form_cannot_hold_is_refused() -> None:
     of.problem.add_prior("point_0", np.eye(4), sigma=0.1)
     with pytest.raises(ScaleError, match="weigh by direction"):
         rw.solve(of.problem)
+
+
+def test_methods_of_whole_poses_refuse_them() -> None:
+    of = mixed_set(1, ("point_0", "tag_1"), scale="known")
+    with pytest.raises(OptionError, match="takes whole poses"):
+        rw.methods.run("shah2013", of.problem)
