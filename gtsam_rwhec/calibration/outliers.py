@@ -427,4 +427,4 @@ def spare_equations(problem: Problem) -> int:
     if scales is None:
         scales = len({pair.target for pair in problem.pairs} - set(problem.fixed_scales))
     known = sum(3 * (prior.sigma is not None) + 3 * (prior.kappa is not None) for prior in beliefs)
-    return 6 * problem.number_of_measurements + known - 6 * len(free) - scales
+    return problem.number_of_equations + known - 6 * len(free) - scales

@@ -45,6 +45,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import aligned_at
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.solver.solution import Solution, solve
 
@@ -179,6 +180,10 @@ def calibrate(
     check_observations(problem, options)
     run = Run(problem, options, progress or silent, recording)
     check_offsets(run)
+    if problem.directed:  # residuals of every stage are then those of what is measured
+        first, _ = _solved(run)
+        problem = problem if first is None else aligned_at(problem, first.X, first.Y, first.scale)
+        run = replace(run, problem=problem)
     found = _calibrated(run)
     if recording is None or not recording.far_off or (found.refined is not None and found.refined.intrinsics):
         return found

@@ -62,6 +62,7 @@ class _PairRows:
     e: Array
     J: Array
     unknowns: np.ndarray
+    seen: np.ndarray  #: (n, 6): which residuals are measured
 
 
 def judged(
@@ -85,7 +86,7 @@ def judged(
         known[pair.rows] = True
     keep = keep & known
     noise_of = keep if noise_of is None else noise_of & known
-    nu = max(0.5 * (DOF * int(noise_of.sum()) - size), 1.0)
+    nu = max(0.5 * (float(measured.told[noise_of].sum()) - size), 1.0)
     threshold = DOF * float(fdtri(DOF, nu, 1.0 - rejected_share(confidence, len(keep))))
     square = np.full(len(keep), np.inf)
     residuals = [pair.e for pair in pairs]
@@ -93,7 +94,7 @@ def judged(
     if size > MOST_UNKNOWNS:
         for pair, variance in zip(pairs, variances, strict=True):
             square[pair.rows] = np.sum(pair.e**2 / variance, axis=1)
-        return square <= threshold
+        return measured.as_of_six(square) <= threshold
     for _ in range(2):  # the step moves residuals a little, and these the variances
         residuals, _ = _as_if_fitted(pairs, keep, variances, size)
         variances = _variances(pairs, residuals, noise_of, size, robust=robust)
@@ -107,7 +108,7 @@ def judged(
         values, vectors = np.linalg.eigh(share)
         whitened = np.einsum("nij,ni->nj", vectors, e / deviation)
         square[pair.rows] = np.where(values > 1e-6, whitened**2 / np.maximum(values, 1e-6), 0.0).sum(axis=1)
-    return square <= threshold
+    return measured.as_of_six(square) <= threshold
 
 
 def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple[list[_PairRows], int]:
@@ -135,8 +136,9 @@ def _linearized(problem: Problem, measured: Measured, fit: WeightedFit) -> tuple
         unknowns = [np.arange(start, start + J.shape[2]) for start, J in blocks.items()]
         W = _whitening(measured, rows)
         J = np.concatenate([np.zeros((len(W), DOF, 0)), *blocks.values()], axis=2)
-        e = np.einsum("nij,nj->ni", W, at.residual)
-        pairs.append(_PairRows(rows, pair.sensor, e, W @ J, np.concatenate([np.zeros(0, dtype=np.int64), *unknowns])))
+        e = np.einsum("nij,nj->ni", W, at.residual) * measured.seen[rows]
+        columns = np.concatenate([np.zeros(0, dtype=np.int64), *unknowns])
+        pairs.append(_PairRows(rows, pair.sensor, e, W @ J, columns, measured.seen[rows]))
     return pairs, DOF * len(free) + len(set(scales.values()))
 
 
@@ -155,19 +157,22 @@ def _variances(
     pairs: list[_PairRows], residuals: list[Array], keep: np.ndarray, size: int, *, robust: bool
 ) -> list[Array]:
     """Variances (6,) of each pair's residuals, by axis and sensor."""
-    kept = [e[keep[pair.rows]] for pair, e in zip(pairs, residuals, strict=True)]
+    # What is not measured is no residual.
+    kept = [np.where(pair.seen, e, np.nan)[keep[pair.rows]] for pair, e in zip(pairs, residuals, strict=True)]
     number = sum(map(len, kept))
     if not number:
         return [np.full(DOF, SMALLEST) for _ in pairs]
-    spare = max(1.0 - size / (DOF * number), 0.05)  # the unknowns take the rest
+    spare = max(1.0 - size / max(sum(int(np.isfinite(e).sum()) for e in kept), 1), 0.05)  # the unknowns take the rest
 
     def of(parts: list[Array]) -> Array:
         square = np.concatenate(parts) ** 2
+        has = np.isfinite(square).any(axis=0)
+        result, square = np.ones(DOF), square[:, has]
         if robust:
-            middle: Array = np.median(square, axis=0) / float(chdtri(1, 0.5)) / spare
-            return middle
-        mean: Array = square.mean(axis=0) / spare
-        return mean
+            result[has] = np.nanmedian(square, axis=0) / float(chdtri(1, 0.5)) / spare
+        else:
+            result[has] = np.nanmean(square, axis=0) / spare
+        return result
 
     by_axis = of(kept)
     mean = np.repeat(by_axis.reshape(2, 3).mean(axis=1), 3)

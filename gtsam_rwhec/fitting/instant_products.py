@@ -40,6 +40,8 @@ class Measurements:
     #: (M,): The measurements of these instants, and the place of each one's instant in ``shared``.
     members: np.ndarray
     shared_of: np.ndarray
+    #: (6, 6, N): What is added to the variances, whatever the standard deviations are.
+    slides: Array | None = None
 
     @staticmethod
     def of(rows: Rows, side: About, basis: Array, directions: Array | None) -> Measurements:
@@ -67,6 +69,7 @@ class Measurements:
         return Measurements(
             instants, np.concatenate(parts, axis=2), np.concatenate(places, axis=1), m, states, tuple(terms), stacked,
             np.flatnonzero(is_shared), members, (np.cumsum(is_shared) - 1)[instants.index[members]],
+            None if rows.slides is None else np.ascontiguousarray(rows.slides.transpose(1, 2, 0)),
         )  # fmt: skip
 
     @property
@@ -85,6 +88,8 @@ class Measurements:
         n, m = len(self.columns), self.m
         weights = np.array([sigma[a] * sigma[b] for a, b in self.pairs])
         variance = (weights @ self.terms.reshape(len(weights), -1)).reshape(6, 6, n)
+        if self.slides is not None:
+            variance += self.slides
         L = np.linalg.cholesky(variance.transpose(2, 0, 1))
         log_det = 2.0 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
         root = np.ascontiguousarray(lower_inverse(np.ascontiguousarray(L.transpose(1, 2, 0))).transpose(2, 0, 1))

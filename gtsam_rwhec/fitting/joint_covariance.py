@@ -292,6 +292,10 @@ def free_space_of(
         for scale in changes.keys() & slots.keys():  # d alpha = alpha d log alpha
             basis[slots[scale]] = state.scales[scale] * changes[scale]
         columns.append(basis)
+        for i, direction in zip(*np.nonzero(part.unseen), strict=True):  # what means nothing has no deviation
+            column = np.zeros((size, 1))
+            column[slots[Unknown(UnknownKind.FRAME, part.free[i])]][direction] = 1.0
+            columns.append(column)
     offsets, shrinkage = free_offsets(data, variables)
     directions += offsets
     for offset in offsets:

@@ -336,6 +336,8 @@ def noise_of_pairs(
 ) -> dict[Pair, PairNoise]:
     """The noise of each pair's B: root mean square over measurements and axes, depth included, jitter not."""
     variances = np.einsum("nii->ni", model.white(sigma | {C.JITTER: 0.0}))
+    if model.rows.slides is not None:  # what is not measured has no noise
+        variances = np.maximum(variances - np.einsum("nii->ni", model.rows.slides), 0.0)
     in_order = np.empty_like(variances)
     in_order[model.rows.instants.order] = variances
     result, first = {}, 0

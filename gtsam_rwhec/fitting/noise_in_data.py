@@ -131,7 +131,12 @@ class NoiseInData:
     @property
     def size_words_of_B(self) -> str:
         """How large the noise of B is, in short."""
-        return f"{self._size(C.ROTATION)} and {self._size(C.TRANSLATION)}"
+        return " and ".join(self._size(component) for component in self._of_B)
+
+    @property
+    def _of_B(self) -> list[Component]:
+        """B's components; of points alone, no rotation is measured."""
+        return [component for component in (C.ROTATION, C.TRANSLATION) if component in self.deviations]
 
     @property
     def systematic_words(self) -> str:
@@ -144,7 +149,7 @@ class NoiseInData:
     def sentences(self) -> tuple[str, ...]:
         """What was found, each with its evidence."""
         said = [
-            f"Noise of B for each axis: {self._words(C.ROTATION)} and {self._words(C.TRANSLATION)}, and on top "
+            f"Noise of B for each axis: {' and '.join(self._words(each) for each in self._of_B)}, and on top "
             f"{self._words(C.DEPTH)} along the sensor's z axis."
         ]
         if any(component in self.deviations for component in CARRIER):
@@ -269,8 +274,7 @@ def noise_in(
     white = found.white or found
     middle, low, high = mixture.quantiles((0.5, 0.05, 0.95))
     active = found.fit.sizes.active
-    given = np.sqrt(np.einsum("nii->i", found.model.rows.given) / len(found.model.rows.given))
-    stated = {C.ROTATION: float(given[:3].mean()), C.TRANSLATION: float(given[3:].mean())}
+    stated = dict(zip((C.ROTATION, C.TRANSLATION), found.model.rows.typical_given, strict=True))
     simple = white.model.evaluate(white.fit.sizes.values(white.fit.logs)).covariance
     ratios = [0.0]
     for unknown, place in task.layout.slots.items():

@@ -68,7 +68,7 @@ class NoiseModel:
         """D (N, 6, 6): the noise of single measurements, of B and of stamps."""
         found: Array = sum(
             (sigma[a] * sigma[b] * term for (a, b), term in white_terms(self.rows).items()),
-            start=np.zeros_like(self.rows.given),
+            start=np.zeros_like(self.rows.given) if self.rows.slides is None else self.rows.slides,
         )
         return found
 

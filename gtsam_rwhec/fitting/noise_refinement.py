@@ -23,10 +23,12 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables
 from gtsam_rwhec.fitting.view_errors import errors_of_view
+from gtsam_rwhec.fitting.weighted_fit import as_of_six
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.problem.selection import aligned_at
+from gtsam_rwhec.solver.answers import parts_about
 from gtsam_rwhec.solver.solution import Solution
 
 #: The Jacobian of all measurements may have this many numbers: 160 MB.
@@ -73,7 +75,7 @@ class UnderNoise:
         ]
         freedom = min((mixture.degrees_of_freedom(found.model.basis[rows]) for rows in frames), default=float(np.inf))
         # Two kinds of noise at least share what equations there are to spare.
-        spare = 6 * task.problem.number_of_measurements - len(layout.unit)
+        spare = task.problem.number_of_equations - len(layout.unit)
         freedom = min(freedom, max(0.5 * spare, FEWEST))
         freedom = freedom if worst is None else min(freedom, worst.freedom)
         task.tell("covariances: the graph of the answer")
@@ -113,10 +115,11 @@ def under_noise(
     """
     how, options, tell = how or RefineOptions(noise="estimate"), options or NoiseOptions(), progress or silent
     check_inputs(problem, solution, how)
+    problem = aligned_at(problem, solution.X, solution.Y, solution.scale)
     offsets = sensors_with_offset(problem, how)
     variables = Variables.of(problem, offsets, clocks_with_rate(problem, offsets, how.carrier_path))
     unknowns = sum(unknown.dimension for unknown in variables.unknowns)
-    equations = 6 * problem.number_of_measurements
+    equations = problem.number_of_equations
     if equations - unknowns < SPARE_EQUATIONS:
         raise CountError(
             f"{equations} equations for {unknowns} unknowns leave {equations - unknowns} to estimate the noise of A "
@@ -129,7 +132,8 @@ def under_noise(
         )
     data = data_of(problem, variables, how)
     state = variables.start(solution)
-    space = free_space_of(parts_of(problem), variables, state, data)
+    parts = parts_about(problem, solution.X, solution.Y, solution.scale)
+    space = free_space_of(parts, variables, state, data)
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
     task = Task(problem, data, variables, layout, Instants.of(data), options, space.directions, tell)
     task = task.cut_at_jumps(state)
@@ -218,7 +222,8 @@ def agreeing(
         covariance += away.reshape(-1, 1, 1) * (G @ G.transpose(0, 2, 1))
     squares = np.einsum("ni,ni->n", left, np.linalg.solve(covariance, left[:, :, None])[:, :, 0])
     freedom = max(6 * int(keep.sum()) - found.model.basis.shape[1], 1)
-    agrees = squares <= 6.0 * fdtri(6, freedom, 1.0 - FALSE_ALARM / len(squares))
+    told = np.concatenate([item.told for item in data])[rows.instants.order]
+    agrees = as_of_six(squares, told) <= 6.0 * fdtri(6, freedom, 1.0 - FALSE_ALARM / len(squares))
     in_order = np.empty(len(agrees), dtype=bool)
     in_order[rows.instants.order] = agrees
     result = {pair: np.zeros(len(inliers[pair]), dtype=bool) for pair in whole.pairs}

@@ -230,6 +230,8 @@ class Rows:
     length: Array
     #: (N, 4, 4): A.
     carriers: Array
+    #: (N, 6, 6): The covariance of directions in which nothing is measured, whatever the noise.
+    slides: Array | None
 
     @staticmethod
     def of(
@@ -260,7 +262,9 @@ class Rows:
         inverse, predicted = se3.inverse(A), np.linalg.inv(Y) @ A @ X
         alpha = [1.0 if scale is None else state.scales[scale] for scale in scales]
         predicted[:, :3, 3] *= np.repeat(alpha, counts)[:, None]
-        given = np.concatenate([item.covariance for item in data])
+        given = np.concatenate([item.measured for item in data])
+        slides = np.concatenate([item.covariance for item in data]) - given
+        has_slides = any(item.slides is not None for item in data)
         # A Expmap(e) on the target carrier's side; Expmap(e) A = A Expmap(Ad(A^-1) e) on the sensor carrier's.
         parts = [
             residual, given, B[:, 2, :3], right, right @ se3.adjoint(inverse), _configuration(A),
@@ -273,12 +277,22 @@ class Rows:
         return Rows(
             instants, residual, by_unknowns, given, axis, {"targetcarrier": right, "sensorcarrier": left},
             {"targetcarrier": moving_target, "sensorcarrier": moving_sensor}, rate, predicted, length, A,
+            slides[instants.order] if has_slides else None,
         )  # fmt: skip
 
     @property
     def jacobian(self) -> Array:
         """The derivative (N, 6, d) by all unknowns."""
         return self.by_unknowns.whole
+
+    @property
+    def typical_given(self) -> tuple[float, float]:
+        """The standard deviations of rotations and translations as given, over all axes that are measured: rad, m."""
+        variances = np.maximum(np.einsum("nii->ni", self.given), 0.0)
+        has = variances > 0.0
+        by_axis = np.sqrt(variances.sum(axis=0) / np.maximum(has.sum(axis=0), 1))
+        rotation, translation = (float(of[of > 0.0].mean()) if of.any() else 1.0 for of in (by_axis[:3], by_axis[3:]))
+        return rotation, translation
 
     def thinned(self, every: int) -> Rows:
         """The rows of every so-many-th instant of each track."""
@@ -334,7 +348,9 @@ def _without_noise(every: list[Linearization], residual: Array, white: Array) ->
 
 
 def _taken(part: Any, rows: np.ndarray) -> Any:
-    """Some rows of a part, or of each side of it."""
+    """Some rows of a part, or of each side of it; None of none."""
+    if part is None:
+        return None
     return {side: of[rows] for side, of in part.items()} if isinstance(part, dict) else part[rows]
 
 

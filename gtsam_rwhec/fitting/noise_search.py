@@ -381,17 +381,30 @@ def likeness_of_neighbours(tracks: Sequence[Array]) -> float:
 QUIETEST = 1e-7
 
 
+def _measured_squares(rows: Rows) -> list[Array]:
+    """The mean squares of the rotation residuals, and of the translation residuals, of rows that measure any."""
+    has = np.einsum("nii->ni", rows.given) > 0.0
+    squares = []
+    for part in (slice(0, 3), slice(3, 6)):
+        number = has[:, part].sum(axis=1)
+        square = np.where(has[:, part], rows.residual[:, part] ** 2, 0.0).sum(axis=1)
+        squares.append(square[number > 0] / number[number > 0] if number.any() else np.zeros(1))
+    return squares
+
+
 def typical_sizes(
     rows: Rows, drift: DriftPrior | None, *, has_scale: bool, carrier: bool, systematic: bool
 ) -> dict[Component, float]:
     """The components that are in the model, with their typical sizes."""
-    r = rows.residual
-    size_r, size_t = (max(float(np.sqrt(np.median((part**2).mean(axis=1)))), QUIETEST) for part in (r[:, :3], r[:, 3:]))
-    given = np.sqrt(np.einsum("nii->i", rows.given) / len(r))
-    active: list[Component] = list(WHITE)
+    size_r, size_t = (max(float(np.sqrt(np.median(of))), QUIETEST) for of in _measured_squares(rows))
+    given = rows.typical_given
+    measures_turns = bool(rows.given[:, :3, :3].any())
+    if not measures_turns:  # of points: A turns them by their distance
+        size_r = size_t / max(_root_mean_square(rows.predicted[:, :3, 3]), QUIETEST)
+    active: list[Component] = [c for c in WHITE if measures_turns or c is not C.ROTATION]
     typical: dict[Component, float] = {
-        C.ROTATION: size_r / float(given[:3].mean()),
-        C.TRANSLATION: size_t / float(given[3:].mean()),
+        C.ROTATION: size_r / given[0],
+        C.TRANSLATION: size_t / given[1],
         C.DEPTH: size_t,
         C.CARRIER_ROTATION: size_r,
         C.CARRIER_TRANSLATION: size_t,

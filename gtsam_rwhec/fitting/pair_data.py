@@ -13,6 +13,7 @@ from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, NoiseGroups, RefineOptions
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import SAME_POSE, LocalPaths, Trajectory
+from gtsam_rwhec.problem.directions import slides_of
 from gtsam_rwhec.problem.measurements import Pair, checked_covariances
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import VarianceFactors
@@ -34,6 +35,20 @@ class PairData:
     stamps_ns: np.ndarray | None
     #: The carriers' motion about each stamp, where the sensor's clock has an offset.
     paths: LocalPaths | None = None
+    #: (N, 6, 6): the part of the covariance that is of directions in which nothing is measured.
+    slides: Array | None = None
+
+    @property
+    def measured(self) -> Array:
+        """The covariance (N, 6, 6) of what is measured, without the slides'."""
+        return self.covariance if self.slides is None else self.covariance - self.slides
+
+    @property
+    def told(self) -> Array:
+        """(N,): how many entries of each residual are measured."""
+        lost = 0 if self.slides is None else np.linalg.matrix_rank(self.slides, hermitian=True)
+        told: Array = np.full(self.count, 6.0) - lost
+        return told
 
     @property
     def count(self) -> int:
@@ -63,6 +78,7 @@ class PairData:
             None if options.carrier_noise is None else carrier_covariances(options.carrier_noise, pair, raw.A),
             raw.stamps_ns,
             paths,
+            slides_of(raw),
         )
 
     def at(self, offset_s: float, more_s: Array | float = 0.0) -> BatchResiduals:
@@ -96,6 +112,7 @@ class PairData:
             None if self.carrier is None else self.carrier[mask],
             None if self.stamps_ns is None else self.stamps_ns[mask],
             None if self.paths is None else self.paths.selected(mask),
+            None if self.slides is None else self.slides[mask],
         )
 
 
@@ -219,10 +236,10 @@ def group_label(group: Group) -> str:
 
 
 def measurement_covariance(data: PairData, factors: VarianceFactors) -> Array:
-    """B's covariances (N, 6, 6): D Sigma D, with the square roots of the factors on D's diagonal."""
+    """B's covariances (N, 6, 6): D Sigma D, with the square roots of the factors on D's diagonal; slides stay."""
     d = np.sqrt(np.repeat(factors, 3))
-    scaled: Array = data.covariance * d[:, None] * d
-    return scaled
+    scaled: Array = data.measured * d[:, None] * d
+    return scaled if data.slides is None else scaled + data.slides
 
 
 def residual_covariance(data: PairData, at: Linearization, factors: VarianceFactors) -> Array:

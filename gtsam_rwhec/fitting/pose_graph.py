@@ -43,6 +43,8 @@ Isotropic = gtsam.noiseModel.Isotropic
 
 #: A step that lowers the cost by less than this is the last: what is left is far below a thousandth of a deviation.
 LAST_STEP = 1e-9
+#: What means nothing of a target stays within this (rad, m), and all else of it is free within this.
+MEANS_NOTHING, WEIGHTLESS = 1e-4, 1e8
 #: Steps of variables that are held have this standard deviation (rad, m, s).
 HELD = 10.0
 
@@ -251,7 +253,11 @@ def add_fixed(graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: 
 def add_priors(
     graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem, residual: ResidualKind
 ) -> None:
-    """Priors: |t - t_0|^2 / sigma_0^2, and kappa_0 |R - R_0|_F^2 (design fact 11) or 2 kappa_0 theta^2 of the angle."""
+    """Priors: |t - t_0|^2 / sigma_0^2, and kappa_0 |R - R_0|_F^2 (design fact 11) or 2 kappa_0 theta^2 of the angle.
+
+    And a target stays, in directions in which all its measurements slide, where these were slid to: they fit as well
+    there as anywhere.
+    """
     for name, priors in problem.priors.items():
         if name in problem.fixed:
             continue
@@ -263,6 +269,11 @@ def add_priors(
                 graph.add(rotation_prior_factor(key, pose.rotation(), noise, residual=residual))
             if prior.sigma is not None:
                 graph.add(position_prior_factor(key, pose.translation(), Isotropic.Sigma(3, prior.sigma)))
+    for name, (T, slides) in problem.held.items():
+        if name in variables.frames and slides.shape[1]:
+            root = slides @ slides.T / MEANS_NOTHING + np.eye(6) / WEIGHTLESS
+            by_direction = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+            graph.add(gtsam.PriorFactorPose3(variables.frames[name], to_pose3(T[:3, :3], T[:3, 3]), by_direction))
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,14 @@ from gtsam_rwhec.fitting.pose_fit import ChordalModel, GeodesicModel, Model, Set
 from gtsam_rwhec.fitting.refined import FactorGraph, Movement, PairNoise, Refined
 from gtsam_rwhec.fitting.robust_solution import Inliers, robust_solution
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
+from gtsam_rwhec.fitting.weighted_fit import as_of_six
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import WINDOW_S
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED, selected
+from gtsam_rwhec.problem.selection import AS_STATED, aligned_at, selected
+from gtsam_rwhec.solver.answers import parts_about
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.solution import Solution, contradicted_by, solve
 from gtsam_rwhec.solver.solve_options import check_against_knowledge
@@ -59,6 +61,9 @@ def refine(
     check_progress(progress)
     tell = progress or silent
     check_inputs(problem, solution, options)
+    if problem.directed:
+        near = solution or _any_inliers(problem, options, tell)
+        problem = aligned_at(problem, near.X, near.Y, near.scale)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
     everything = Variables.of(problem, sensors_with_offset(problem, options))
     data = data_of(problem, everything, options)
@@ -89,13 +94,14 @@ def refine(
         start, inliers, factors = _chosen_under_full_noise(whole, data, start, inliers, options, estimates, tell)
     if inliers:
         problem = selected(whole, inliers)
-    variables, parts = _variables(whole, problem, options), parts_of(problem)
+    variables = _variables(whole, problem, options)
     kept = _kept(problem, data, inliers)
-    model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts, variables)
+    model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts_of(problem), variables)
     tell("refining")
     settled = fit(problem, model, variables, variables.start(start), options, estimates, tell, factors)
     state = variables.state(settled.optimum.values)
     tell("covariances")
+    parts = parts_about(problem, state.X, state.Y, scale_of(problem, state))
     space = free_space_of(parts, variables, state, kept, None if options.robust in ("none", "gnc") else settled.factors)
     if space.directions:
         warnings.warn(
@@ -190,7 +196,7 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit
     if options.robust not in ("none", "gnc"):  # a loss changes the cost
         return
     beliefs = [p for name, priors in problem.priors.items() if name not in problem.fixed for p in priors]
-    equations = 6 * problem.number_of_measurements + sum(
+    equations = problem.number_of_equations + sum(
         3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs
     )
     cost = settled.optimum.cost
@@ -292,8 +298,13 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
         A = item.residuals.A
         if item.paths is not None:
             A = A @ item.paths.motion(state.offsets_s[item.pair.sensor])
+        raw = problem.measurements(*item.pair)
+        if item.slides is not None:  # what weighs by direction keeps its directions
+            unit = np.repeat([1.0, scale], 3)
+            edges[item.pair] = replace(raw, A=A, covariances=C * unit[:, None] * unit)
+            continue
         edges[item.pair] = replace(
-            problem.measurements(*item.pair),
+            raw,
             A=A,
             sigma=scale * np.sqrt(np.linalg.eigvalsh(C[:, 3:, 3:])[:, -1]),
             kappa=0.5 / np.linalg.eigvalsh(C[:, :3, :3])[:, -1],
@@ -315,7 +326,7 @@ def inliers_of(
         r = at[item.pair].residual
         C = residual_covariance(item, at[item.pair], factors.get(item.pair, everywhere))
         square: Array = np.einsum("ni,ni->n", r, np.linalg.solve(C, r[:, :, None])[:, :, 0])
-        result[item.pair] = square <= threshold
+        result[item.pair] = as_of_six(square, item.told) <= threshold
     return result
 
 

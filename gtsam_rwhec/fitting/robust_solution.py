@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
+import gtsam
 import numpy as np
 from scipy.special import chdtr, chdtri
 
@@ -36,7 +37,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors, reweighted, selected
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors, aligned_at, reweighted, selected
 from gtsam_rwhec.solver.solution import Solution, solve
 
 NoiseScale = Literal["given", "estimate"]
@@ -118,6 +119,10 @@ def robust_solution(
         that agree, and the other poses do not use the rejected ones.
     """
     tell = progress or silent
+    if problem.directed:
+        fit = weighted_fit(problem, None)
+        X, Y = ({n: gtsam.Pose3(fit.poses[n]) for n in names} for names in (problem.targets, problem.sensors))
+        problem = aligned_at(problem, X, Y, fit.alpha)
     work = TruncatedLeastSquares(problem, confidence, tell)
     try:
         _, keep = work.run(noise_scale)
@@ -172,7 +177,9 @@ def _doubts(work: TruncatedLeastSquares, inliers: Inliers, noise_scale: NoiseSca
             f"less than half of the measurements agree with the answer for {', '.join(named[:NAMED])}{more}. Check "
             "whether the frame has moved, or has another frame's name. The poses rest on the measurements that agree"
         )
-    rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
+    turns = work.measured.told[:, 0] > 0.0
+    kappa = np.median(work.measured.kappa[turns]) if turns.any() else np.inf
+    rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / kappa))
     if noise_scale == "estimate" and work.searches and rotation_rad > GROSS_RAD:
         said.append(
             f"the estimated noise, {np.degrees(rotation_rad):.0f} degrees an axis, is too large for a sensor: more "
@@ -229,7 +236,8 @@ class TruncatedLeastSquares:
         """Equations less unknowns when one measurement is left out."""
         owners = {pair.target for pair in self.problem.pairs} - self.problem.fixed_scales.keys()
         scales = {"known": 0, "shared": 1, "per_target": len(owners)}[self.problem.scale]
-        return DOF * (len(self.measured.A) - 1) - 6 * len(self.free_frames) - scales
+        unseen = sum(int(self.problem.unseen(name).sum()) for name in self.problem.targets)
+        return int(self.measured.told[1:].sum()) - 6 * len(self.free_frames) + unseen - scales
 
     def is_clean(self, everything: WeightedFit, everyone: np.ndarray, noise_scale: NoiseScale) -> bool:
         """Whether the fit to all measurements shows no outlier, so that there is nothing to do.
@@ -240,8 +248,8 @@ class TruncatedLeastSquares:
         count = len(everyone)
         if noise_scale == "given":
             return bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
-        unknowns = DOF * (count - 1) - self.spare_equations
-        if unknowns > PULLED * DOF * count:
+        unknowns = int(self.measured.told[1:].sum()) - self.spare_equations
+        if unknowns > PULLED * float(self.measured.told.sum()):
             return False
         if not judged(self.problem, self.measured, everything, everyone, self.confidence, robust=True).all():
             return False
@@ -391,8 +399,11 @@ class TruncatedLeastSquares:
         return fit, keep
 
     def _from_median(self, squares: Squares) -> VarianceFactors:
-        median = float(chdtri(DOF // 2, 0.5))
-        return self._factors(*(float(np.median(each)) / median for each in (squares.rotation, squares.translation)))
+        found = []
+        for each, told in zip((squares.rotation, squares.translation), self.measured.told.T, strict=True):
+            has = told > 0.0
+            found.append(float(np.median(each[has] / chdtri(told[has], 0.5))) if has.any() else 1.0)
+        return self._factors(*found)
 
     def _from_inliers(self, squares: Squares, inliers: np.ndarray) -> VarianceFactors:
         """The inliers' mean squares over the share of its variance that a truncated chi-square keeps.
@@ -403,10 +414,10 @@ class TruncatedLeastSquares:
         if number == 0:
             return self.factors
         kept = float(chdtr(DOF + 2, self.threshold) / chdtr(DOF, self.threshold))
-        freedom = kept * max(3.0 * (number - len(self.free_frames)), 1.0)
-        return self._factors(
-            *(float(each[inliers].sum()) / freedom for each in (squares.rotation, squares.translation))
-        )
+        told = self.measured.told[inliers].sum(axis=0)
+        freedom = kept * np.maximum(told - 3.0 * len(self.free_frames), 1.0)
+        found = [float(each[inliers].sum()) for each in (squares.rotation, squares.translation)]
+        return self._factors(*(s / f if n else 1.0 for s, f, n in zip(found, freedom, told, strict=True)))
 
     def _factors(self, rotation: float, translation: float) -> VarianceFactors:
         least = self.smallest_factors

@@ -24,7 +24,6 @@ from gtsam_rwhec.fitting.pair_data import (
     PairData,
     group_label,
     group_of,
-    measurement_covariance,
     residual_covariance,
 )
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, Variables
@@ -96,7 +95,8 @@ def from_measurements(
         inverse = np.linalg.inv(C)
         J, rows = jacobian_of(item, linear, variables, joint)
         left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # the expectation of r r'
-        whole = measurement_covariance(item, factors[pair])
+        d = np.sqrt(np.repeat(factors[pair], 3))
+        whole = item.measured * d[:, None] * d
         whitened = np.einsum("nij,nj->ni", inverse, linear.residual)
         total = sums.setdefault(group_of(pair, groups), _Sums())
         scaled = []
@@ -125,11 +125,15 @@ def from_measurements(
 
 def _step(group: Group, total: _Sums, consistency: float) -> Array:
     """The numbers (2,) that multiply the factors of rotation and translation."""
+    has = np.diagonal(total.fisher) > 0.0  # of points no rotation is measured
     for k, component in enumerate(COMPONENTS):
-        _check(group, component, float(total.expected[k]), float(total.fisher.sum()))
+        if has[k]:
+            _check(group, component, float(total.expected[k]), float(total.fisher.sum()))
     found = total.found / consistency
-    ratios = found / total.expected
+    ratios = np.where(has, found / np.where(has, total.expected, 1.0), 1.0)
     size = np.sqrt(np.diagonal(total.fisher))
+    if not has.all():
+        return np.maximum(ratios, 1e-12)
     if abs(total.fisher[0, 1]) < 0.05 * size[0] * size[1]:
         # A sum below zero (rotation and translation are correlated, far from their sizes) has no ratio: a step down.
         result: Array = np.where(ratios < 0.0, 0.5, np.maximum(ratios, 1e-12))

@@ -21,11 +21,13 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from rwhec_factors import se3
+from scipy.special import chdtri
 
 from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.pose_graph import optimise
 from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.geometry.poses import Array, to_pose3
+from gtsam_rwhec.problem.directions import axes_seen, axes_told
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
@@ -68,14 +70,19 @@ def weighted_fit(problem: Problem, previous: WeightedFit | None) -> WeightedFit:
     """
     poses: dict[str, Array] = {}
     alpha: dict[str, float] = {}
-    parts = parts_of(problem)
+    known = previous if problem.directed else None
+    about, scale = (None, 1.0) if known is None else (known.poses, known.alpha.get(problem.pairs[0].target, 1.0))
+    parts = parts_of(problem, about, scale if problem.scale == "shared" else 1.0)
     for part in parts:
         answer = _solve(part, previous)
         for name, R, t in zip(part.free, answer.R, answer.t, strict=True):
             poses[name] = se3.pose(R, t + part.frame_shift(name))
         poses |= {name: problem.fixed[name] for name in part.fixed}
         alpha |= scales_of(part, answer)
-    return at_physical_optimum(problem, parts, WeightedFit(poses, alpha))
+    found = WeightedFit(poses, alpha)
+    if problem.directed and previous is None and found.has_positive_scales:
+        return weighted_fit(problem, found)  # with the directions there
+    return at_physical_optimum(problem, parts, found)
 
 
 def at_physical_optimum(problem: Problem, parts: list[Part], fit: WeightedFit) -> WeightedFit:
@@ -159,6 +166,10 @@ class Measured:
     whitening: Array | None
     #: (N, 3, 3): inverse Cholesky factors of the translation blocks alone.
     whitening_of_translation: Array | None
+    #: (N, 2): how many directions of rotation and of translation are measured.
+    told: Array
+    #: (N, 6): which entries of a residual are measured.
+    seen: np.ndarray
 
     @staticmethod
     def of(problem: Problem, pairs: tuple[Pair, ...] | None = None) -> Measured:
@@ -180,6 +191,8 @@ class Measured:
             np.concatenate([np.empty(0), *(one.kappa for one in raw)]),
             whitening,
             whitening_of_translation,
+            np.concatenate([np.empty((0, 2)), *(axes_told(one) for one in raw)]),
+            np.concatenate([np.empty((0, 6), dtype=bool), *(axes_seen(one) for one in raw)]),
         )
 
     def pair_of(self, index: int) -> Pair:
@@ -215,7 +228,7 @@ class Measured:
             error = None
         else:
             seen = self.B[:, :3, :3].transpose(0, 2, 1) @ R_Y.transpose(0, 2, 1)  # into the measured target's axes
-            error = se3.logmap(se3.pose(seen @ R, np.einsum("nij,nj->ni", seen, t)))
+            error = se3.logmap(se3.pose(seen @ R, np.einsum("nij,nj->ni", seen, t))) * self.seen
             rotation = _norms(self.whitening[:, :3, :3], error[:, :3])  # L is lower triangular
             translation = _norms(self.whitening_of_translation, error[:, 3:])
             error[~known] = np.inf
@@ -224,12 +237,30 @@ class Measured:
     def together(self, squares: Squares, factors: VarianceFactors) -> Array:
         """Squared residuals (N,) of all six components, about chi-square with 6 degrees of freedom at the truth."""
         if squares.error is None or self.whitening is None:
-            return squares.rotation / factors.rotation + squares.translation / factors.translation
+            return self.as_of_six(squares.rotation / factors.rotation + squares.translation / factors.translation)
         known = np.isfinite(squares.rotation)
         scaled = squares.error[known] / np.sqrt(np.repeat(factors, 3))
         result = np.full(len(known), np.inf)
         result[known] = _norms(self.whitening[known], scaled)
-        return result
+        return self.as_of_six(result)
+
+    def as_of_six(self, squares: Array) -> Array:
+        """Squared residuals (N,) as those of six components."""
+        return as_of_six(squares, self.told.sum(axis=1))
+
+
+#: Residuals of fewer components are compared with those of six where one of a thousand good ones is larger.
+RARE = 1e-3
+#: The components of a pose's residual.
+DOF = 6
+
+
+def as_of_six(squares: Array, told: Array) -> Array:
+    """Squared residuals (N,) of ``told`` (N,) components as those of six: one threshold then serves all."""
+    if (told == DOF).all():
+        return squares
+    result: Array = squares * float(chdtri(DOF, RARE)) / chdtri(np.maximum(told, 1.0), RARE)
+    return result
 
 
 def _norms(whitening: Array, error: Array) -> Array:

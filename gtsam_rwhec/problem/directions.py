@@ -11,6 +11,7 @@ of each other, so a sphere's centre counts whole, whatever the frame's origin is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +25,10 @@ from gtsam_rwhec.geometry.real_numbers import is_between, real_array
 from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, GivenMeasurements, Kind, Measurements
 
 #: Standard deviations of directions that mean nothing, rad and m: their information is lost beside any other.
-MEANINGLESS_RAD = 100.0
-MEANINGLESS_M = 100.0
+MEANINGLESS_RAD = 30.0
+MEANINGLESS_M = 30.0
+#: Variances, rad^2 or m^2, from which on a direction slides: nothing that is measured is so rough.
+SLIDES = 25.0
 #: Which directions [omega, v] of a target's own axes a kind of measurement does not see.
 UNSEEN = {
     Kind.POSE: np.zeros(6, dtype=bool),
@@ -177,7 +180,10 @@ class Weighing:
         arm = np.einsum("nii->n", of_rotation)[:, None, None] * np.eye(3) - of_rotation
         centre = -np.linalg.solve(arm, moment[:, :, None])[:, :, 0]
         is_point, is_plane, z = raw.is_of(Kind.POINT), raw.is_of(Kind.PLANE), np.array([0.0, 0.0, 1.0])
-        centre[is_point], centre[is_plane, 2] = 0.0, 0.0
+        centre[is_point] = 0.0
+        # Of a plane only (omega x c)_z counts: where it tells least of its tilt.
+        tilt = np.linalg.solve(of_rotation[is_plane, :2, :2], crossed[is_plane, 2, :2, None])[:, :, 0]
+        centre[is_plane] = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
         moved = np.concatenate([-se3.hat(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
         there = moved @ noise @ moved.transpose(0, 2, 1)
         information, turns = np.linalg.eigh(np.linalg.inv(of_rotation))
@@ -190,6 +196,20 @@ class Weighing:
         of_turns[is_plane] = 2.0 / np.einsum("nii->n", of_rotation[is_plane, :2, :2])[:, None] * z
         of_axes[is_plane] = 1.0 / there[is_plane, 2, 2, None] * z
         return Weighing(turns, of_turns, centre, axes, of_axes, mean)
+
+    def holding_slides(self, slides: np.ndarray, part: float) -> Weighing:
+        """The weights in which some measurements (N,) hold what they do not tell, with a part of their largest weight.
+
+        Slid to where an answer predicts it, such a residual is zero there. Without a weight the target would slide off
+        to where the rest of the noise fits better.
+        """
+        told = self.of_turns.sum(axis=1, keepdims=True) - self.of_turns
+        held = []
+        for weights in (told, self.of_axes):
+            largest = weights.max(axis=1, keepdims=True)
+            held.append(np.where(slides[:, None] & (weights < SEEN * largest), part * largest, weights))
+        of_turns = np.maximum(0.5 * held[0].sum(axis=1, keepdims=True) - held[0], 0.0)
+        return replace(self, of_turns=np.where(slides[:, None], of_turns, self.of_turns), of_axes=held[1])
 
     @property
     def equations(self) -> tuple[int, int]:
@@ -227,11 +247,65 @@ def aligned(raw: Measurements, X: Array, Y: Array, scale: float = 1.0) -> Measur
     moved = se3.adjoint(se3.inverse(slid) @ B)
     moved[raw.is_of(Kind.POSE)] = np.eye(6)
     covariances = moved @ covariances @ moved.transpose(0, 2, 1)
+    for kind in (Kind.POINT, Kind.PLANE):  # what means nothing tells nothing of the rest
+        mine, seen = raw.is_of(kind), ~UNSEEN[kind]
+        stated = np.where(seen, 0.0, np.einsum("nii->ni", raw.covariances[mine]))
+        covariances[mine] = covariances[mine] * (seen[:, None] & seen) + stated[:, :, None] * np.eye(6)
     return replace(raw, B=slid, covariances=0.5 * (covariances + covariances.transpose(0, 2, 1)))
 
 
-#: Variances, rad^2 or m^2, from which on a direction slides.
-SLIDES = 1.0
+def slides_of(raw: Measurements) -> Array | None:
+    """The part of the covariances (N, 6, 6) that is of directions in which nothing is measured; None without any."""
+    if raw.kinds is None or raw.covariances is None:
+        return None
+    slides = np.zeros_like(raw.covariances)
+    for kind in (Kind.POINT, Kind.PLANE):
+        mine = raw.is_of(kind)
+        slides[mine] = np.where(UNSEEN[kind], np.einsum("nii->ni", raw.covariances[mine]), 0.0)[:, :, None] * np.eye(6)
+    other = raw.is_of(Kind.DIRECTIONAL)
+    variances, along = np.linalg.eigh(raw.covariances[other])
+    # A difference: what is left of an axis along which all slides is then zero, and not rounding.
+    measured = (along * np.where(variances >= SLIDES, 0.0, variances)[:, None, :]) @ along.transpose(0, 2, 1)
+    slides[other] = raw.covariances[other] - measured
+    return slides
+
+
+def common_slides(several: Sequence[Measurements]) -> Array:
+    """The directions (6, k) of a target's axes in which none of its measurements, slid to one answer, is measured."""
+    total, count = np.zeros((6, 6)), 0
+    for raw in several:
+        slides = slides_of(raw)
+        if slides is not None:
+            variances, along = np.linalg.eigh(slides)
+            total += np.einsum("nik,nk,njk->ij", along, (variances > 0.5 * SLIDES).astype(float), along)
+        count += len(raw.A)
+    shares, directions = np.linalg.eigh(total / count)
+    return directions[:, shares > ALIKE]
+
+
+#: Slides are one direction where this share of each is in it.
+ALIKE = 0.99
+
+
+def axes_seen(raw: Measurements) -> np.ndarray:
+    """(N, 6): which entries of a residual Log(B^-1 Y^-1 A X) are measured: all but those of points and planes."""
+    seen = np.ones((len(raw.A), 6), dtype=bool)
+    for kind in (Kind.POINT, Kind.PLANE):
+        seen[raw.is_of(kind)] = ~UNSEEN[kind]
+    return seen
+
+
+def axes_told(raw: Measurements) -> Array:
+    """(N, 2): how many directions of rotation and of translation each measurement tells."""
+    told = np.full((len(raw.A), 2), 3.0)
+    told[raw.is_of(Kind.POINT)], told[raw.is_of(Kind.PLANE)] = (0.0, 3.0), (2.0, 1.0)
+    other = raw.is_of(Kind.DIRECTIONAL)
+    if raw.covariances is not None and other.any():
+        noise = raw.covariances[other]
+        whole = (np.linalg.eigvalsh(noise) < SLIDES).sum(axis=1)
+        told[other, 0] = (np.linalg.eigvalsh(noise[:, :3, :3]) < SLIDES).sum(axis=1)
+        told[other, 1] = whole - told[other, 0]  # a turn about an arm moves the origin
+    return told
 
 
 def unseen_by(raw: Measurements) -> np.ndarray:

@@ -21,7 +21,7 @@ from gtsam_rwhec.errors import (
     ScaleError,
 )
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
+from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, Array, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.corners import (
     EachImage,
@@ -31,7 +31,7 @@ from gtsam_rwhec.problem.corners import (
     check_in_image,
     seen_corners,
 )
-from gtsam_rwhec.problem.directions import planes_as_given, points_as_given, unseen_by
+from gtsam_rwhec.problem.directions import axes_told, planes_as_given, points_as_given, unseen_by
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
 from gtsam_rwhec.problem.many_measurements import GivenMany, KeptMeasurements, Section, Sorted
 from gtsam_rwhec.problem.measurements import (
@@ -126,6 +126,9 @@ class Problem(Knowledge):
         self.is_relative = False  # whether the noise of some measurements is not stated
         self._kind: dict[str, Literal["target", "sensor"]] = {}
         self._kept: dict[Pair, KeptMeasurements] = {}
+        #: Poses (4, 4) of targets to which measurements that weigh by direction were slid (`aligned_at`), and the
+        #: directions (6, k) of their own axes in which all of them slide.
+        self.held: dict[str, tuple[Array, Array]] = {}
         self._accumulator = Accumulator()
         self._long: frozenset[str] = frozenset()  # which of "A" and "B" had the millimetre warning
 
@@ -529,6 +532,13 @@ class Problem(Knowledge):
     def directed(self) -> frozenset[Pair]:
         """The pairs with measurements that weigh by direction; all of such a pair's measurements do."""
         return frozenset(pair for pair, kept in self._kept.items() if kept.has_kinds)
+
+    @property
+    def number_of_equations(self) -> int:
+        """Six for each measurement, and for those that weigh by direction as many as they tell."""
+        of_directed = sum(int(axes_told(batch).sum()) for pair in self.directed for batch in self._kept[pair].batches)
+        others = self.number_of_measurements - sum(self._kept[pair].count for pair in self.directed)
+        return 6 * others + of_directed
 
     def unseen(self, name: str) -> np.ndarray:
         """(6,): which directions [omega, v] of a frame's own axes mean nothing: nothing that was stated sees them."""

@@ -19,6 +19,7 @@ from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator, Row
 from gtsam_rwhec.problem.corners import candidates_of
+from gtsam_rwhec.problem.directions import aligned, common_slides
 from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
@@ -118,6 +119,32 @@ def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Meas
         kappa=raw.kappa * w / factors.rotation,
         covariances=covariances,
     )
+
+
+def aligned_at(
+    problem: Problem,
+    X: Mapping[str, gtsam.Pose3],
+    Y: Mapping[str, gtsam.Pose3],
+    scale: float | Mapping[str, float] = 1.0,
+) -> Problem:
+    """The problem whose measurements that weigh by direction are slid to where an answer predicts them (`aligned`).
+
+    The answer's cost stays the same. Pairs of frames that it lacks stay.
+    """
+    pairs = [pair for pair in problem.directed if (pair.target in X or pair.is_motion) and pair.sensor in Y]
+    if not pairs:
+        return problem
+    every = {pair: problem.measurements(*pair) for pair in problem.pairs}
+    for pair in pairs:
+        of_target = (Y if pair.is_motion else X)[pair.target].matrix()
+        alpha = scale[pair.target] if isinstance(scale, Mapping) else scale
+        every[pair] = aligned(every[pair], of_target, Y[pair.sensor].matrix(), alpha)
+    slid = problem.with_measurements(every)
+    for name in dict.fromkeys(pair.target for pair in pairs if not pair.is_motion):
+        own = [every[pair] for pair in problem.pairs if pair.target == name]
+        if name not in problem.fixed and name not in problem.priors:
+            slid.held = slid.held | {name: (X[name].matrix(), common_slides(own))}
+    return slid
 
 
 #: Two rotations belong to the same pose of an image if their entries differ by less than this.

@@ -17,8 +17,9 @@ from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.problem.knowledge import checked_scale
 from gtsam_rwhec.problem.measurements import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.descent import SearchForm, homogeneous
-from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.rotations import unvec, vec
 
 
@@ -170,6 +171,14 @@ def given_poses(part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]
         one_transform(of[name], f"{what}[{name!r}]") for name, (of, what) in zip(part.free, of_frames, strict=True)
     ]
     return np.array(poses).reshape(-1, 4, 4)
+
+
+def parts_about(
+    problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float]
+) -> list[Part]:
+    """The parts of a problem, with the directions of measurements at an answer."""
+    shared = float(scale) if problem.scale == "shared" and not isinstance(scale, Mapping) else 1.0
+    return parts_of(problem, poses_of(X, Y) if problem.directed else None, shared)
 
 
 def poses_of(X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]) -> dict[str, Array]:

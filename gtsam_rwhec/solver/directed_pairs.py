@@ -21,8 +21,8 @@ from gtsam_rwhec.problem.problem import Problem
 
 #: Rows of this many measurements are computed at once: some megabytes.
 BLOCK = 2048
-#: The weight of what holds a direction that means nothing, 1 / rad^2 and 1 / m^2: next to nothing, and never paid.
-HELD = 1.0
+#: What holds a direction that means nothing has this part of one measurement's weight: little, and it is never paid.
+HELD = 1e-2
 #: Rounded operations of an entry of a row: the product of three matrices, and A about the gauge.
 OPERATIONS = 20
 
@@ -56,6 +56,8 @@ class DirectedPair:
     A: Array  #: (N, 4, 4)
     B: Array  #: (N, 4, 4)
     weighing: Weighing
+    #: The weights of ``weighing`` without those that only hold, (N, 3) each: of turns and of axes.
+    told: tuple[Array, Array]
     equations: tuple[int, int]  #: how many they are, of rotation and of translation
     unseen: np.ndarray  #: (6,): which directions of the target mean nothing
 
@@ -73,7 +75,10 @@ class DirectedPair:
                 of_frame = T[:3, :3] @ raw.B[has, :3, :3] if T is Y else raw.A[has, :3, :3] @ T[:3, :3]
                 axes[has], of_axes[has] = of_frame @ w.axes[has], w.of_axes[has]
         weighing = replace(w, axes=axes, of_axes=of_axes)
-        return DirectedPair(e, raw.A, raw.B, weighing, w.equations, problem.unseen(pair.target))
+        told = w.of_turns, of_axes
+        if X is not None and Y is not None:
+            weighing = weighing.holding_slides(raw.is_of(Kind.DIRECTIONAL), HELD)
+        return DirectedPair(e, raw.A, raw.B, weighing, told, w.equations, problem.unseen(pair.target))
 
     def holding(self, X: Array | None, Y: Array, scale: float) -> DirectedPair:
         """The pair with one more row of measurements, which holds what means nothing where convention has it.
@@ -87,17 +92,26 @@ class DirectedPair:
             T[:3, 3] = normal * (normal @ X[:3, 3])
         B, w = inverse(Y)[None] @ A @ T, self.weighing
         B[:, :3, 3] *= scale
+        along = HELD * float(w.of_axes.max())
+        about = HELD * float(w.of_turns.max()) or along
         more = Weighing(
             turns=np.eye(3)[None],
-            of_turns=HELD * np.array([[1.0, 1.0, float(self.unseen[0])]]),
+            of_turns=about * np.array([[1.0, 1.0, float(self.unseen[0])]]),
             centre=np.zeros((1, 3)),
             axes=A[:, :3, :3] @ T[:3, :3],
-            of_axes=HELD * self.unseen[None, 3:] * (X is not None),
+            of_axes=along * self.unseen[None, 3:] * (X is not None),
             mean=np.zeros(1),
         )
         whole = {part.name: np.concatenate([getattr(w, part.name), getattr(more, part.name)]) for part in fields(w)}
         A, B = np.concatenate([self.A, A]), np.concatenate([self.B, B])
-        return replace(self, A=A, B=B, weighing=Weighing(**whole))
+        of_turns, of_axes = (np.concatenate([of, np.zeros((1, 3))]) for of in self.told)
+        return replace(self, A=A, B=B, weighing=Weighing(**whole), told=(of_turns, of_axes))
+
+    @property
+    def slides(self) -> bool:
+        """Whether the measurements do not tell all of the target's pose."""
+        measured = np.concatenate(self.told, axis=1).any(axis=1)
+        return sum(self.equations) < 6 * int(measured.sum())
 
     @property
     def count(self) -> int:
@@ -135,7 +149,11 @@ class DirectedPair:
 
     def weights(self, at: slice) -> Array:
         """(k, 12) weights of the rows of some measurements."""
-        return np.concatenate([np.tile(self.weighing.of_turns[at], 3), self.weighing.of_axes[at]], axis=1)
+        return self._by_row(self.weighing.of_turns[at], self.weighing.of_axes[at])
+
+    @staticmethod
+    def _by_row(of_turns: Array, of_axes: Array) -> Array:
+        return np.concatenate([np.tile(of_turns, 3), of_axes], axis=1)
 
     def forms(self, a: Array, c: Array, reach: float) -> tuple[Array, Array, Array]:
         """The forms (25, 25) of translations and of rotations, and a diagonal (25,) that dominates their rounding.
@@ -154,9 +172,10 @@ class DirectedPair:
 
     def costs(self, a: Array, c: Array, x: Array) -> tuple[float, float]:
         """J_t and J_R at values of the pair's variables (25,)."""
-        squares = np.zeros(12)
-        for rows, _, weights in self.rows(a, c):
-            squares += 0.5 * (weights * (rows @ x) ** 2).sum(axis=0)
+        squares, weights, first = np.zeros(12), self._by_row(*self.told), 0
+        for rows, _, _ in self.rows(a, c):
+            squares += 0.5 * (weights[first : first + len(rows)] * (rows @ x) ** 2).sum(axis=0)
+            first += len(rows)
         return float(squares[9:].sum()), float(squares[:9].sum())
 
     def information(self, a: Array, c: Array, X: Array, Y: Array, alpha: float) -> tuple[Array, Array]:
@@ -174,9 +193,10 @@ class DirectedPair:
         move[:, :, 0:3], move[:, :, 7:10] = -arm @ R, (alpha * hat(lever) + arm) @ R_Y
         move[:, :, 3:6], move[:, :, 10:13] = alpha * R, -alpha * R_Y
         move[:, :, 14] = alpha * lever
-        told = w.of_turns.sum(axis=1, keepdims=True) - w.of_turns
+        of_turns, of_axes = self.told
+        told = of_turns.sum(axis=1, keepdims=True) - of_turns
         found = []
-        for axes, weights, J in ((w.turns, told, turn), (w.axes, w.of_axes, move)):
+        for axes, weights, J in ((w.turns, told, turn), (w.axes, of_axes, move)):
             one = (axes.transpose(0, 2, 1) @ J).reshape(-1, 15)
             found.append((one * weights.reshape(-1, 1)).T @ one)
         return found[0], found[1]
@@ -200,11 +220,17 @@ class DirectedPair:
         result: Array = (rows.reshape(m, -1, 12) @ matrix).reshape(rows.shape)
         return result
 
-    def reach(self, at: slice) -> Array:
-        """(12, 12): the largest size of each entry of the rows' matrix, of some measurements."""
+    def reach(self, at: slice, sizes: Array) -> Array:
+        """Bounds on the rows' sizes from those of E row by row and e, (..., 12), of some measurements."""
         w = self.weighing
-        reach: Array = np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
-        return reach
+        result: Array = sizes @ np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0).T
+        return result
+
+    def reach_back(self, at: slice, sizes: Array) -> Array:
+        """Bounds on the sizes of what ``turned_back`` gives, from those of the rows (..., 12)."""
+        w = self.weighing
+        result: Array = sizes @ np.abs(_turning(w.turns[at], w.centre[at], w.axes[at])).max(axis=0)
+        return result
 
 
 def _turning(turns: Array, centre: Array, axes: Array) -> Array:

@@ -199,16 +199,15 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         k, m = stack.weight.shape
         if stack.directed is None:
             r = r if rest is None else r + rest
-            weights = np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
+            weights: Array = np.stack([stack.kappa, stack.weight], axis=2) @ _KINDS
         else:
             directed, part = stack.directed
-            turn = directed.reach(part)
-            rounded = (low + DOUBLED * _reach(r)).reshape(k, D, 12) * (1.0 + 1e-9)
-            low = np.matmul(rounded, turn.T).reshape(k, outputs)
+            rounded: Array = (low + DOUBLED * _reach(r)) * (1.0 + 1e-9)
+            low = np.reshape(directed.reach(part, rounded.reshape(k, D, 12)), (k, outputs))
             r, weights = directed.turned(part, r, rest), directed.weights(part)[None]
         residuals = r.reshape(k, m, D, 12)
         weighted = residuals * weights[:, :, None, :]
-        flat = weighted.reshape(k, m, outputs)
+        flat: Array = weighted.reshape(k, m, outputs)
         unit = gamma(m + _FEW)
         of_ones = np.sqrt(np.ones(m) @ weights)[:, None, :]
         # |r| has an error of low: by Cauchy and Schwarz each root of a sum of squares is off by sqrt(total) low.
@@ -224,8 +223,8 @@ def weighted_sums(measured: Measured, coefficients: Coefficients, *, exact: bool
         in_rows, rows_error = of_ones * root, of_ones * (unit * root + slack)
         if stack.directed is not None:
             flat = directed.turned_back(part, flat)
-            rows_error = np.matmul((rows_error + gamma(_FEW + 12) * in_rows) * (1.0 + 1e-9), turn)
-            in_rows = np.matmul(in_rows, turn)
+            grown: Array = (rows_error + gamma(_FEW + 12) * in_rows) * (1.0 + 1e-9)
+            rows_error, in_rows = directed.reach_back(part, grown), directed.reach_back(part, in_rows)
         one_size, one_error = in_rows.reshape(k, 1, outputs), rows_error.reshape(k, 1, outputs)
         of_poses, of_errors = [], []
         for poses, rounding in ((A, off), (stack.B, np.zeros((k, 12))))[of_A_and_B]:

@@ -247,25 +247,23 @@ def solve(
         about = None if initial is None else poses_of(*initial[:2])
         scale = 1.0 if initial is None or problem.scale != "shared" else checked_scale(initial[2], "the start's scale")
         results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
+        cost = np.inf
         # Directions of translations are those of an answer: they are taken there again until the answer stays.
         for _ in range(MOST_ROUNDS if problem.directed else 0):
-            before, about = about, {name: T for result in results for name, T in result.poses.items()}
-            if before is not None and max(_turned(before[name], T) for name, T in about.items()) < STILL_RAD:
+            before, cost = cost, sum(result.certificate.cost for result in results)
+            if abs(cost - before) <= STILL * max(cost, 1.0):
                 break
+            about = {name: T for result in results for name, T in result.poses.items()}
             scale = results[0].answer.scale
             results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
     return _merge(problem, results)
 
 
-#: Rounds about the answer of the round before; three are usual.
-MOST_ROUNDS = 12
-#: Directions stay where no rotation turns by more than this: far below what any sensor tells.
-STILL_RAD = 1e-9
-
-
-def _turned(before: Array, after: Array) -> float:
-    """The angle between the rotations of two poses, rad, nearly."""
-    return float(np.linalg.norm(before[:3, :3] - after[:3, :3]) / np.sqrt(2.0))
+#: Rounds about the answer of the round before; four to seven are usual.
+MOST_ROUNDS = 20
+#: An answer stays where a round changes its cost by no more than this part of it, or of 1: it moved by less than a
+#: thousandth of a standard deviation.
+STILL = 1e-8
 
 
 def _solved(
