@@ -55,6 +55,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "acceptance": ("", "--runs 20"),
     "trajectories": ("--runs 6", "--runs 1 --kinds walk --movers held"),
     "odometry_bounds": ("--runs 40", "--runs 1"),
+    "object_clouds": ("--runs 300", "--runs 6 --views 9"),
     "odometry_planar": ("--runs 200", "--runs 1"),
     "fleet_scale": ("", None),
     "fleet_kills": ("", None),

@@ -9,7 +9,7 @@ from enum import StrEnum
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.solver.certificate import Status
-from gtsam_rwhec.solver.free_directions import FEW
+from gtsam_rwhec.solver.free_directions import FEW, FreeReason
 from gtsam_rwhec.solver.solution import Solution
 
 
@@ -346,7 +346,10 @@ def proof_of(refined: RefinedPoses | None) -> str:
     nothing_against = (
         "no other poses fit them better" if refined is None else "nothing that was looked for speaks against them"
     )
-    return f"the measurements determine every pose, and {nothing_against}"
+    directions = () if refined is None else refined.free_directions
+    sliding = dict.fromkeys(name for one in directions for name in one.frames)
+    but = f" but what slides of {', '.join(sliding)}" if sliding else ""
+    return f"the measurements determine every pose{but}, and {nothing_against}"
 
 
 def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) -> list[Finding]:
@@ -368,8 +371,12 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
         gap = rounded(100.0 * solution.certificate.relative_gap)
         words = f"a better answer may exist; its cost would be lower by at most {gap} %"
         found = [Finding(Ground.NOT_CERTIFIED, words)]
+    directions = [*solution.identifiability.free_directions, *(() if refined is None else refined.free_directions)]
     is_unique = solution.identifiability.is_unique and status is not Status.CERTIFIED_NOT_UNIQUE
-    if not is_unique or (refined is not None and refined.free_directions):
+    # A target that slides leaves its own pose free, and no other frame's.
+    if directions and all(one.reason is FreeReason.SLIDES for one in directions):
+        is_unique, directions = True, []
+    if not is_unique or directions:
         most = max((residual.number_of_measurements for residual in solution.residuals.values()), default=0)
         words = "the measurements do not determine all poses; other poses fit them equally well"
         if most <= FEW:

@@ -53,7 +53,7 @@ def move_of(poses: Array, predicted: Array, covariances: Array, units: Array, si
     by_thing = told @ se3.adjoint(se3.inverse(predicted))
     base = np.concatenate([by_thing, told], axis=2).reshape(-1, 12)
     _, before, free = _fitted(base, residuals, int(is_told.sum()))
-    patterns = [(k, False, order == k) for k in order]
+    patterns = [(k, False, order == k) for k in range(len(poses))]
     patterns += [(k, True, order >= k) for k in range(FEWEST, len(poses) - FEWEST + 1)]
     best, least = None, FALSE_ALARMS / len(patterns)
     for first, stays, mask in patterns:
@@ -63,7 +63,7 @@ def move_of(poses: Array, predicted: Array, covariances: Array, units: Array, si
             chance = float(fdtrc(free - left, left, (before - after) / (free - left) / (after / left)))
             far = float(np.linalg.norm(solved[15:]))
             if chance < least and far > max(FAR * np.sqrt(3.0 * after / left), LARGE * size_m):
-                best, least = Move(int(first), stays, far), chance
+                best, least = Move(first, stays, far), chance
     return best
 
 

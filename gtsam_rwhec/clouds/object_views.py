@@ -20,6 +20,7 @@ from gtsam_rwhec.clouds.registered_views import (
     ViewFinding,
     Views,
     certified_pose,
+    check_agreement,
     prepared,
     registered_in_turn,
 )
@@ -111,16 +112,17 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     solution of the motions, and then all at once by points to planes and edges.
     """
     views, out = prepared(clouds, A, options or ObjectOptions())
-    registrations, Y, _ = registered_in_turn(views, options or ObjectOptions())
+    registrations, Y = registered_in_turn(views, options or ObjectOptions())
     together = largest_group(len(views.at), registrations.i, registrations.j)
-    out += [_apart(views, k) for k in np.flatnonzero(~together)]
+    out += [_apart(views, int(k)) for k in np.flatnonzero(~together)]
     kept, place = views.selected(together), np.cumsum(together) - 1
     if len(kept.at) < FEWEST_VIEWS:
         raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
     inside = registrations.selected(together[registrations.i] & together[registrations.j]).renamed(place)
     joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, inside, GATE * views.spacing.faces_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
-    stays, Y, is_certified = _where_it_was(kept, joint, inside, origin)
+    stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
+    check_agreement(kept, inside, Y)
     out += [_moved(kept, k, far) for k, far in stays.items()]
     B = se3.inverse(joint.T_common_sensor) @ origin
     turn = se3.adjoint(se3.inverse(B))
@@ -150,11 +152,13 @@ def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None
     Arguments and errors as in `seen_object`, which is better where the sensor sees one thing: it registers all at once.
     """
     views, _ = prepared(clouds, A, options or ObjectOptions())
-    return registered_in_turn(views, options or ObjectOptions())[0].renamed(views.at)
+    registrations, Y = registered_in_turn(views, options or ObjectOptions())
+    check_agreement(views, registrations, Y)
+    return registrations.renamed(views.at)
 
 
 def _where_it_was(
-    views: Views, joint: JointPoses, pairs: Registrations, origin: Array
+    views: Views, joint: JointPoses, pairs: Registrations, Y: Array, origin: Array
 ) -> tuple[dict[int, float], Array, bool]:
     """Views in which the thing was elsewhere, with the distance (m); the certified pose of the sensor by the others.
 
@@ -164,7 +168,6 @@ def _where_it_was(
     unit = np.array([units(each.faces.points)[0] for each in views.surfaces])
     size = float(np.median([each.size_m for each in views.surfaces]))
     moved: dict[int, float] = {}
-    Y = np.eye(4)
     for _ in views.at:
         still = ~np.isin(np.arange(len(views.at)), list(moved))
         chosen = pairs.selected(still[pairs.i] & still[pairs.j])
@@ -179,7 +182,7 @@ def _where_it_was(
         name = views.surfaces[at[move.first]].name
         if move.stays:
             raise CloudError(
-                f"the thing moved by {1e3 * move.distance_m:.1f} mm before {name}, and stayed there: calibrate with the "
+                f"the thing moved by {1e3 * move.distance_m:.1f} mm before {name}, and stayed: calibrate with the "
                 "views before it, or with those from it on, or give each part a target of its own"
             )
         moved[int(at[move.first])] = move.distance_m

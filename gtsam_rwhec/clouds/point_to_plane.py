@@ -33,9 +33,9 @@ class Matches:
 
     ``residuals`` (m,) are distances across the mean of both normals, in metres: where a surface is curved, neighbours
     that lie beside each other are off the tangent plane of either, but not of this mean (Rusinkiewicz 2019, "A
-    symmetric objective function for ICP"). ``rows`` (m, 6) are derivatives by a right perturbation of T_other_surface (rotation
-    first) across the other's normals, ``own_rows`` across the surface's own. ``kind`` is 0 for faces and 1 for edges;
-    ``at`` are places among the surface's faces, then edges.
+    symmetric objective function for ICP"). ``rows`` (m, 6) are derivatives by a right perturbation of T_other_surface
+    (rotation first) across the other's normals, ``own_rows`` across the surface's own. ``kind`` is 0 for faces and 1
+    for edges; ``at`` are places among the surface's faces, then edges.
     """
 
     points: Array
@@ -54,7 +54,7 @@ def matches(surface: Surface, other: Surface, T_other_surface: Array, gate_m: fl
     found: list[_Arrays] = []
     first = 0
     for kind, (own, its) in enumerate(((surface.faces, other.faces), (surface.edges, other.edges))):
-        distances, nearest = its.tree.query(own.points @ R.T + t, distance_upper_bound=gate_m)
+        distances, nearest = its.nearest(own.points @ R.T + t, gate_m)
         at = np.flatnonzero(np.isfinite(distances))
         normals = its.normals[nearest[at]] @ R
         cosine = np.einsum("ij,ij->i", normals, own.normals[at])

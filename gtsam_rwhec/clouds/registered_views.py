@@ -14,9 +14,17 @@ from rwhec_factors import se3
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.first_registration import Start, first_poses
 from gtsam_rwhec.clouds.registration import Registrations, aligned, overlapping_pairs, registered
-from gtsam_rwhec.clouds.surfaces import FEWEST_POINTS, FINER, Spacing, Surface, spacing_of, surface_of
+from gtsam_rwhec.clouds.surfaces import FEWEST_POINTS, FINER, Spacing, Surface, spacing_of, surface_of, without_border
 from gtsam_rwhec.errors import CloudError, RwhecWarning
-from gtsam_rwhec.geometry.poses import Array, PoseLike, PosesLike, as_transforms, one_transform
+from gtsam_rwhec.geometry.poses import (
+    Array,
+    PoseLike,
+    PosesLike,
+    as_transforms,
+    checked_rows,
+    one_transform,
+    rows_to_transforms,
+)
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.solution import solve
@@ -73,8 +81,8 @@ class ViewFinding:
     def __str__(self) -> str:
         if self.fault is ViewFault.MOVED:
             return (
-                f"{self.name} shows the thing {1e3 * self.off_m:.1f} mm from where its pose puts it: it was elsewhere in "
-                "this view alone, or the pose is of another"
+                f"{self.name} shows the thing {1e3 * self.off_m:.1f} mm from where its pose puts it: it was elsewhere "
+                "in this view alone, or the pose is of another"
             )
         if self.fault is ViewFault.FEW_POINTS:
             return f"{self.name} has too few points to tell a pose"
@@ -102,6 +110,8 @@ class Views:
 def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> tuple[Views, list[ViewFinding]]:
     """The surfaces of all views, and those that have too few points."""
     transforms = as_transforms(A, None, "A")
+    if len(transforms):
+        transforms = rows_to_transforms(checked_rows(transforms, 0, "A").rows)
     given = iter(clouds)
     first = list(islice(given, SPACED))
     spacing = spacing_of([each.points for each in first], len(transforms)) if len(transforms) else Spacing(0.0, 0.0)
@@ -118,19 +128,19 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
     at = np.setdiff1d(np.arange(len(surfaces)), [each.view for each in few])
     if len(at) < FEWEST_VIEWS:
         raise CloudError(
-            f"{len(at)} views have {FEWEST_POINTS} points and more; at least {FEWEST_VIEWS} are needed, and about ten are "
-            "good" + "".join(f"; {each}" for each in few)
+            f"{len(at)} views have {FEWEST_POINTS} points and more; at least {FEWEST_VIEWS} are needed, and about ten "
+            "are good" + "".join(f"; {each}" for each in few)
         )
-    return Views(at, [surfaces[k] for k in at], transforms[at], spacing), few
+    kept = without_border([surfaces[k] for k in at], GATE * spacing.faces_m)
+    return Views(at, kept, transforms[at], spacing), few
 
 
-def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrations, Array, bool]:
+def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrations, Array]:
     """Registrations of pairs and the certified pose of the sensor on its carrier, in turn until both are still."""
     spacing = views.spacing.faces_m
     Y = _first(views, options).T_sensorcarrier_sensor
     i, j = overlapping_pairs(views.surfaces, se3.inverse(views.A) @ Y, GATE * spacing)
-    starts = np.zeros((0, 4, 4))
-    is_certified = False
+    starts: Array = np.zeros((0, 4, 4))
     for _ in range(ROUNDS):
         poses = se3.inverse(views.A) @ Y
         predicted = se3.inverse(poses[i]) @ poses[j]
@@ -142,19 +152,24 @@ def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrati
             raise CloudError(_no_overlap(views, i, j))
         i, j, starts = pairs.i, pairs.j, pairs.B
         before = Y
-        Y, is_certified = certified_pose(pairs, Y)
+        Y, _ = certified_pose(pairs, Y)
         moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
         if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
+    return pairs, Y
+
+
+def check_agreement(views: Views, pairs: Registrations, Y: Array) -> None:
+    """Raise a CloudError if registrations are none of a thing that stood still at these poses."""
+    poses = se3.inverse(views.A) @ Y
     off = np.linalg.norm(_at_middle(views, poses[pairs.i] @ pairs.B - poses[pairs.j], pairs.j), axis=1)
     size = float(np.median([each.size_m for each in views.surfaces]))
     if np.median(off) > CONTRADICTION * size:
         raise CloudError(
             f"registrations of the clouds contradict the poses: they differ by {1e3 * np.median(off):.1f} mm (median "
-            f"of {len(off)} pairs of views) for a thing of {1e3 * size:.0f} mm. Look whether the thing stood still, and "
-            "whether A is T_sensorcarrier_targetcarrier with the right order of angles"
+            f"of {len(off)} pairs of views) for a thing of {1e3 * size:.0f} mm. Look whether the thing stood still, "
+            "and whether A is T_sensorcarrier_targetcarrier with the right order of angles"
         )
-    return pairs, Y, is_certified
 
 
 def _at_middle(views: Views, change: Array, at: np.ndarray) -> Array:
@@ -175,7 +190,7 @@ def certified_pose(pairs: Registrations, Y: Array) -> tuple[Array, bool]:
         # The caller's own problem is judged by `calibrate`, with A's noise.
         warnings.simplefilter("ignore", RwhecWarning)
         solution = solve(problem)
-    return solution.Y[SENSOR].matrix(), solution.certificate.status is Status.CERTIFIED
+    return np.asarray(solution.Y[SENSOR].matrix()), solution.certificate.status is Status.CERTIFIED
 
 
 def _first(views: Views, options: ObjectOptions) -> Start:
@@ -192,9 +207,9 @@ def _first(views: Views, options: ObjectOptions) -> Start:
             for each in found
         )
         raise CloudError(
-            f"{len(found)} poses of the sensor on its carrier explain the clouds equally well ({words}): the thing looks "
-            "the same from several sides. State roughly where the sensor is (ObjectOptions.start), or take a thing "
-            "without symmetry"
+            f"{len(found)} poses of the sensor on its carrier explain the clouds equally ({words}): the "
+            "thing looks the same from several sides. State roughly where the sensor is (ObjectOptions.start), or take "
+            "a thing without symmetry"
         )
     return found[0]
 

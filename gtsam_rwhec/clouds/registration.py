@@ -82,14 +82,10 @@ def overlapping_pairs(surfaces: Sequence[Surface], poses: Array, gate_m: float) 
         i, j = i[at], j[at]
     probes = [s.faces.points[draw.integers(0, len(s.faces.points), PROBED)] for s in surfaces]
     T = se3.inverse(poses[i]) @ poses[j]
-    overlap = np.array(
-        [
-            np.isfinite(
-                surfaces[a].faces.tree.query(probes[b] @ M[:3, :3].T + M[:3, 3], distance_upper_bound=gate_m)[0]
-            ).mean()
-            for a, b, M in zip(i, j, T, strict=True)
-        ]
-    )
+    overlap = np.zeros(len(i))
+    for k, (a, b, M) in enumerate(zip(i.tolist(), j.tolist(), T, strict=True)):
+        distances, _ = surfaces[a].faces.nearest(probes[b] @ M[:3, :3].T + M[:3, 3], gate_m)
+        overlap[k] = np.isfinite(distances).mean()
     enough = overlap >= OVERLAP
     i, j, overlap = i[enough], j[enough], overlap[enough]
     if len(surfaces) <= ALL_PAIRS_TO:

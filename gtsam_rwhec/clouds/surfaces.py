@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,11 @@ class Features:
     normals: Array
     tree: cKDTree
 
+    def nearest(self, points: Array, gate_m: float = np.inf) -> tuple[Array, np.ndarray]:
+        """Distances (m,) of points (m, 3) to the nearest here, infinite beyond the gate, and the places of these."""
+        distances, places = self.tree.query(points, distance_upper_bound=gate_m)
+        return np.asarray(distances), np.asarray(places)
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -86,7 +91,7 @@ def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
     for points in clouds:
         few = points[:: max(1, len(points) // SAMPLED)]
         points = points[:: max(1, len(points) // DENSE)]
-        own.append(float(np.median(cKDTree(points).query(few, 2)[0][:, 1])))
+        own.append(float(np.median(np.asarray(cKDTree(points).query(few, 2)[0])[:, 1])))
         spacing = THINNED * own[-1]
         for _ in range(10):
             count = len(small_gicp.voxelgrid_sampling(few, spacing).points())
@@ -118,7 +123,7 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     lop = np.linalg.norm(points[neighbours].mean(axis=1) - points, axis=1)
     at = np.flatnonzero(lop > LOPSIDED * np.linalg.norm(points[neighbours[:, -1]] - points, axis=1))
     points, to = points[at], points[neighbours[at]] - points[at, None]
-    normals = faces.normals[faces.tree.query(points)[1]]
+    normals = faces.normals[faces.nearest(points)[1]]
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     second = np.cross(normals, first)
@@ -130,3 +135,26 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     inwards = x.mean(axis=1)[on, None] * first[on] + y.mean(axis=1)[on, None] * second[on]
     outwards = -inwards / np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-12)
     return Features(points[on], outwards, cKDTree(points[on]))
+
+
+def without_border(surfaces: Sequence[Surface], spacing_m: float) -> list[Surface]:
+    """The same without edges where the sensor's view ends, in the rectangle of what all views see in a camera's image.
+
+    There a surface ends for the sensor alone, at the same place of each view. A sensor that sees behind itself (z < 0)
+    has no such rectangle.
+    """
+    if any((each.faces.points[:, 2] <= 0.0).any() for each in surfaces):
+        return list(surfaces)
+    image = [each.faces.points[:, :2] / each.faces.points[:, 2:] for each in surfaces]
+    low, high = (
+        np.min([each.min(axis=0) for each in image], axis=0),
+        np.max([each.max(axis=0) for each in image], axis=0),
+    )
+    result = []
+    for each in surfaces:
+        points = each.edges.points
+        inside = np.minimum(points[:, :2] / points[:, 2:] - low, high - points[:, :2] / points[:, 2:]).min(axis=1)
+        kept = inside * points[:, 2] > spacing_m
+        edges = Features(points[kept], each.edges.normals[kept], cKDTree(points[kept]))
+        result.append(replace(each, edges=edges))
+    return result

@@ -288,7 +288,7 @@ class Rows:
     @property
     def typical_given(self) -> tuple[float, float]:
         """The standard deviations of rotations and translations as given, over all axes that are measured: rad, m."""
-        variances = np.einsum("nii->ni", self.given)
+        variances = np.maximum(np.einsum("nii->ni", self.given), 0.0)
         has = variances > 0.0
         by_axis = np.sqrt(variances.sum(axis=0) / np.maximum(has.sum(axis=0), 1))
         rotation, translation = (float(of[of > 0.0].mean()) if of.any() else 1.0 for of in (by_axis[:3], by_axis[3:]))

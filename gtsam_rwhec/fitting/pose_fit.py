@@ -102,7 +102,7 @@ class GeodesicModel:
         """
         result = {}
         for item in self.data:
-            variances = np.einsum("nii->ni", item.measured).reshape(-1, 2, 3)
+            variances = np.maximum(np.einsum("nii->ni", item.measured), 0.0).reshape(-1, 2, 3)
             variances = variances.sum(axis=2) / np.maximum((variances > 0.0).sum(axis=2), 1)
             rotation, translation = np.sqrt(np.median(variances, axis=0)).tolist()
             result[item.pair] = (rotation, translation)

@@ -264,7 +264,9 @@ def slides_of(raw: Measurements) -> Array | None:
         slides[mine] = np.where(UNSEEN[kind], np.einsum("nii->ni", raw.covariances[mine]), 0.0)[:, :, None] * np.eye(6)
     other = raw.is_of(Kind.DIRECTIONAL)
     variances, along = np.linalg.eigh(raw.covariances[other])
-    slides[other] = (along * np.where(variances >= SLIDES, variances, 0.0)[:, None, :]) @ along.transpose(0, 2, 1)
+    # A difference: what is left of an axis along which all slides is then zero, and not rounding.
+    measured = (along * np.where(variances >= SLIDES, 0.0, variances)[:, None, :]) @ along.transpose(0, 2, 1)
+    slides[other] = raw.covariances[other] - measured
     return slides
 
 

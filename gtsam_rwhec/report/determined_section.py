@@ -41,6 +41,7 @@ CURES: Mapping[FreeReason, str] = {
     FreeReason.NOISE: "Turn by larger angles about the axes that were used least, or measure far more often.",
     FreeReason.COMPENSATED: "Turn about a second axis, or state what is known: a size, a scale, or one of the poses.",
     FreeReason.STANDSTILL: "Measure while the carriers move and turn, faster and with changes of direction.",
+    FreeReason.SLIDES: "Nothing, if only the sensors' poses are wanted; else show another side, or another thing.",
     FreeReason.SYMMETRY: "Turn by other angles than half a turn, and about axes that are not in one plane.",
 }
 #: What the sign of a pair means. The shapes differ, so that nobody needs to see colours.

@@ -108,6 +108,12 @@ class DirectedPair:
         return replace(self, A=A, B=B, weighing=Weighing(**whole), told=(of_turns, of_axes))
 
     @property
+    def slides(self) -> bool:
+        """Whether the measurements do not tell all of the target's pose."""
+        measured = np.concatenate(self.told, axis=1).any(axis=1)
+        return sum(self.equations) < 6 * int(measured.sum())
+
+    @property
     def count(self) -> int:
         """The number of measurements, and of what holds."""
         return len(self.A)

@@ -56,6 +56,8 @@ class FreeReason(StrEnum):
     #: The motion turned enough, and still the information is no more than noise alone would create.
     NOISE = "noise", "the measurements say no more about it than their noise would"
     COMPENSATED = "compensated", "with these motions, translations of the frames have the same effect"
+    #: A target that looks the same along it: no measurement of it, and no other frame's pose, is about this direction.
+    SLIDES = "slides", "all that was seen of it slides in this direction, and no other frame's pose depends on it"
     STANDSTILL = "standstill", "the carriers moved no faster than the noise of their poses makes it seem"
     SYMMETRY = "symmetry", "the motion is symmetric or has half turns only, and two answers fit it"
 

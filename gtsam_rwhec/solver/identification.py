@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -290,6 +290,12 @@ def identify_with_basis(
     weak = _weakest_of_part(part, told, noise)
     basis = sparse_basis(weak.directions[:, weak.free], alone.length)
     free = free_directions_of(part.free, basis, alone.length, alone.reasons_of_frames() if basis.shape[1] else {})
+    sliding = {
+        part.free[part.ends[each.e, 0]] for each in part.directed if each.slides and not part.moments.motion[each.e]
+    }
+    free = tuple(
+        replace(one, reason=FreeReason.SLIDES) if sliding.issuperset(one.frames) and one.frames else one for one in free
+    )
     known = Identifiability(
         is_unique=not free,
         free_directions=free,

@@ -1,0 +1,163 @@
+"""Things without a pattern as targets: a robot's own clouds, and simulated ones whose truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robot_clouds import views_of
+from rwhec_factors import se3
+from scipy.spatial.transform import Rotation
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.clouds import Cloud, ViewFault, seen_object
+from gtsam_rwhec.errors import CloudError, PoseError
+from gtsam_rwhec.simulate import Noise, SimulatedClouds, clouds_of_thing
+from gtsam_rwhec.simulate.simulated_clouds import seen_points, thing
+
+#: chi-square with 6 degrees of freedom, 95 %
+CHI2_95 = 12.59
+
+
+def answer(clouds: list[Cloud], A: np.ndarray) -> tuple[rw.Calibration, np.ndarray, np.ndarray]:
+    """The calibration by a thing, the sensor's pose on its carrier and its covariance."""
+    problem = rw.Problem()
+    seen_object(clouds, A).add_to(problem, "thing", "camera")
+    calibration = rw.calibrate(problem)
+    return calibration, calibration.refined.Y["camera"].matrix(), calibration.refined.covariance("camera")
+
+
+def apart(T: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return se3.logmap((np.linalg.inv(T) @ other)[None])[0]
+
+
+@pytest.fixture(scope="module")
+def bust() -> SimulatedClouds:
+    return clouds_of_thing("bust", 9, 0)
+
+
+def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
+    answers = {name: answer(*views_of(shared_data / "clouds", name)) for name in ("David", "Plane", "Sphere")}
+    for calibration, _, _ in answers.values():
+        assert calibration.solution.certificate.status is rw.Status.CERTIFIED
+        assert calibration.verdict is not rw.Verdict.DO_NOT_USE
+    (_, David, of_David), (_, Plane, of_Plane), (_, Sphere, of_Sphere) = answers.values()
+    difference = apart(David, Plane)
+    assert np.linalg.norm(David[:3, 3] - Plane[:3, 3]) < 1.5e-3
+    assert np.degrees(np.linalg.norm(difference[:3])) < 0.35
+    for covariance in (of_David, of_Plane):
+        assert difference @ np.linalg.solve(covariance, difference) < CHI2_95
+    to_David = apart(Sphere, David)
+    assert to_David @ np.linalg.solve(of_Sphere + of_David, to_David) < CHI2_95
+
+
+@pytest.mark.parametrize("shape", ["bust", "cube"])
+def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: str) -> None:
+    views = clouds_of_thing(shape, 9, 1)
+    _, Y, _ = answer(views.clouds, views.A)
+    error = apart(views.T_sensorcarrier_sensor, Y)
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.02
+    assert np.linalg.norm(Y[:3, 3] - views.T_sensorcarrier_sensor[:3, 3]) < 1e-4
+
+
+@pytest.mark.parametrize(("shape", "slides"), [("sphere", 3), ("cylinder", 2), ("bust", 0)])
+def test_what_slides_has_no_weight(shape: str, slides: int) -> None:
+    views = clouds_of_thing(shape, 9, 2)
+    seen = seen_object(views.clouds, views.A)
+    unknown = np.linalg.eigvalsh(seen.covariances[seen.used]) > 1e-2**2
+    assert (unknown.sum(axis=1) == slides).all()
+    if shape == "sphere":  # its centre is known although its turn is not: the frame is in the centre
+        assert np.sqrt(np.diagonal(seen.covariances, axis1=1, axis2=2)[:, 3:].max()) < 1e-3
+
+
+def test_the_information_of_a_pair_is_what_repeated_noise_shows() -> None:
+    views = clouds_of_thing("relief", 3, 3)
+    distance = thing("relief", np.random.default_rng(3).spawn(5)[0])
+    errors, expected = [], []
+    for draw in range(12):
+        clouds = [
+            Cloud.of(seen_points(distance, T, 1e-4, 100 * draw + k))
+            for k, T in enumerate(se3.inverse(views.T_sensor_object))
+        ]
+        pairs = rw.clouds.motions(clouds, views.A, rw.clouds.ObjectOptions(start=views.T_sensorcarrier_sensor))
+        truth = views.T_sensor_object[pairs.i] @ se3.inverse(views.T_sensor_object[pairs.j])
+        error = se3.logmap(se3.inverse(truth) @ pairs.B)
+        errors.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(pairs.covariances), error).mean())
+        expected.append(6.0)
+    assert 0.2 < np.sum(errors) / np.sum(expected) < 2.0
+
+
+def test_noise_of_the_arm_is_in_the_ellipsoid() -> None:
+    noise = Noise(sigma_m=3e-4, kappa=0.5 / np.radians(0.1) ** 2)
+    views = clouds_of_thing("heap", 12, 4, noise_in_A=noise)
+    _, Y, covariance = answer(views.clouds, views.A)
+    error = apart(views.T_sensorcarrier_sensor, Y)
+    assert error @ np.linalg.solve(covariance, error) < 22.5  # 99.9 %
+
+
+def test_a_thing_on_the_hand_before_a_still_camera_is_the_same(bust: SimulatedClouds) -> None:
+    """A fixed camera's carrier is the base and the thing's the hand: A = T_base_hand has the same form."""
+    seen = seen_object(bust.clouds, bust.A)
+    shift = se3.pose(Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix(), [0.3, -0.2, 0.9])
+    turned = seen_object(bust.clouds, shift @ bust.A)
+    moved = np.linalg.inv(shift @ bust.T_sensorcarrier_sensor) @ turned.T_sensorcarrier_sensor
+    still = np.linalg.inv(bust.T_sensorcarrier_sensor) @ seen.T_sensorcarrier_sensor
+    assert np.abs(moved - still).max() < 1e-3
+
+
+def test_a_view_in_which_the_thing_was_elsewhere_is_left_out(bust: SimulatedClouds) -> None:
+    A = bust.A.copy()
+    A[4] = A[4] @ se3.pose(np.eye(3), [0.012, 0.0, 0.005])
+    seen = seen_object(bust.clouds, A)
+    assert list(seen.left_out) == [4]
+    assert seen.left_out[4].fault is ViewFault.MOVED
+    assert seen.left_out[4].off_m == pytest.approx(0.013, abs=0.001)
+    assert "mm from where its pose puts it" in str(seen.left_out[4])
+    assert np.isnan(seen.T_sensor_object[4]).all()
+    assert not seen.used[4]
+    assert seen.used.sum() == 8
+
+
+def test_a_thing_that_moved_and_stayed_is_an_error(bust: SimulatedClouds) -> None:
+    A = bust.A.copy()
+    A[5:] = A[5:] @ se3.pose(np.eye(3), [0.010, 0.0, 0.010])
+    with pytest.raises(CloudError, match=r"the thing moved by 1\d\.\d mm before view 5 .*, and stayed"):
+        seen_object(bust.clouds, A)
+
+
+def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
+    millimetres = bust.A.copy()
+    millimetres[:, :3, 3] *= 1e3
+    for A, words in (
+        (np.roll(bust.A, 1, axis=0), "with A shifted by minus one row the clouds fit"),
+        (millimetres, "poses look like millimetres, and clouds like metres: with A's translations times 0.001"),
+        (se3.inverse(bust.A), "A is inverted"),
+        (np.random.default_rng(0).permutation(bust.A), "do the clouds overlap"),
+    ):
+        with pytest.raises(CloudError, match=words):
+            seen_object(bust.clouds, A)
+
+
+def test_what_is_too_little_is_said(bust: SimulatedClouds) -> None:
+    with pytest.raises(CloudError, match="2 views have 50 points and more; at least 3"):
+        seen_object(bust.clouds[:2], bust.A[:2])
+    with pytest.raises(CloudError, match="9 clouds and 8 poses in A"):
+        seen_object(bust.clouds, bust.A[:8])
+    with pytest.raises(CloudError, match="0 views have"):
+        seen_object([], np.empty((0, 4, 4)))
+    broken = bust.A.copy()
+    broken[3, 0, 0] = np.nan
+    with pytest.raises(PoseError, match="measurement 3"):
+        seen_object(bust.clouds, broken)
+
+
+def test_views_of_other_things_and_of_few_points_are_left_out(bust: SimulatedClouds) -> None:
+    clouds = list(bust.clouds)
+    clouds[2] = clouds_of_thing("bust", 3, 77).clouds[0]
+    clouds[6] = Cloud.of(clouds[6].points[:30])
+    seen = seen_object(clouds, bust.A)
+    assert {view: finding.fault for view, finding in seen.left_out.items()} == {
+        2: ViewFault.APART,
+        6: ViewFault.FEW_POINTS,
+    }
