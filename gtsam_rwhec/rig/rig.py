@@ -267,10 +267,7 @@ def _clouds(rig: RigFile) -> Iterator[Fault]:
             f"clouds show one object, and {objects[0]} is one; all that stands still is that object",
         )
     if objects and not of_clouds and rig.sensors:
-        yield (
-            ("targets", objects[0], "type"),
-            "an object is seen in clouds, and no sensor has any; give one: clouds: PATH",
-        )
+        yield (("targets", objects[0]), "an object is seen in clouds, and no sensor has any; give one: clouds: PATH")
 
 
 def _names(rig: RigFile) -> Iterator[Fault]:
