@@ -56,6 +56,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "trajectories": ("--runs 6", "--runs 1 --kinds walk --movers held"),
     "odometry_bounds": ("--runs 40", "--runs 1"),
     "odometry_planar": ("--runs 200", "--runs 1"),
+    "lidar_camera": ("", "--runs 3 --biased 1 --splits 2"),
     "fleet_scale": ("", None),
     "fleet_kills": ("", None),
     "fleet_s3": ("", None),

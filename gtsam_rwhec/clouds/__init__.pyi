@@ -1,4 +1,5 @@
 from .cloud import Cloud as Cloud
+from .beams import deskewed as deskewed
 from .lidar_boards import BeamBiases as BeamBiases
 from .lidar_boards import LidarBoard as LidarBoard
 from .lidar_boards import LidarBoardOptions as LidarBoardOptions
