@@ -7,12 +7,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
+from rwhec_factors.se3 import expmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gtsam_rwhec.clouds.cloud import Cloud
-from gtsam_rwhec.errors import CloudError
+from gtsam_rwhec.errors import CloudError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import real_array
 
 #: Beams are apart by more than this angle, where the cloud does not number them; radians.
 APART_RAD = float(np.radians(0.25))
@@ -122,6 +126,33 @@ def beams_of(cloud: Cloud, where: str) -> Beams:
     if not len(steps):
         raise CloudError(f"{where}: no beam has two points; give one whole turn of the LiDAR")
     return Beams(cloud.points, directions, ranges, azimuths, rings, cloud.times_s, float(np.median(steps)))
+
+
+def deskewed(cloud: Cloud, twist: ArrayLike) -> Cloud:
+    """A cloud as it would be, had the LiDAR stood where it was at the cloud's stamp.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        With ``times_s``.
+    twist : (6,)
+        The LiDAR's motion in its own frame, [omega (rad/s), v (m/s)], constant over the turn: of its odometry.
+
+    Raises
+    ------
+    CloudError
+        The cloud tells no times.
+    OptionError
+        The twist is not six finite numbers.
+    """
+    if cloud.times_s is None:
+        where = cloud.source or cloud.frame_id or "the cloud"
+        raise CloudError(f"{where}: the points have no times (times_s), so a motion cannot be taken off; stand still")
+    motion = real_array(twist)
+    if motion.shape != (6,) or not np.isfinite(motion).all():
+        raise OptionError(f"twist={brief(twist)}; give [omega (rad/s), v (m/s)], six finite numbers")
+    moved = expmap(np.outer(cloud.times_s, motion))
+    return replace(cloud, points=(moved[:, :3, :3] @ cloud.points[:, :, None])[..., 0] + moved[:, :3, 3])
 
 
 @dataclass(frozen=True)

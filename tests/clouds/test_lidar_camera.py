@@ -78,6 +78,21 @@ def test_a_cloud_without_beam_numbers_has_the_same_board(places: LidarPlaces) ->
     assert np.allclose(with_rings.T_sensor_board, without.T_sensor_board, atol=2e-4)
 
 
+def test_a_motion_during_the_turn_is_taken_off(places: LidarPlaces) -> None:
+    truth, twist = places.T_lidar_board[1], np.array([0.0, 0.05, 0.2, 0.6, 0.1, 0.0])
+    cloud = lidar_cloud(SimulatedLidar(), truth, places.size_m, np.random.default_rng(0), twist=twist)
+    off = {}
+    for name, each in (("as it is", cloud), ("deskewed", rw.clouds.deskewed(cloud, twist))):
+        board = rw.clouds.find_board(each, places.size_m)
+        off[name] = float(np.linalg.norm(board.T_sensor_board[:3, 3] - truth[:3, 3]))
+    assert off["as it is"] > 0.02
+    assert off["deskewed"] < 0.006
+    with pytest.raises(CloudError, match="no times"):
+        rw.clouds.deskewed(rw.clouds.Cloud.of(cloud.points), twist)
+    with pytest.raises(OptionError, match="six finite numbers"):
+        rw.clouds.deskewed(cloud, [0.0, 1.0])
+
+
 @pytest.mark.parametrize("count", [3, 10])
 def test_camera_and_lidar_are_calibrated(places: LidarPlaces, seen: rw.clouds.SeenBoards, count: int) -> None:
     which = slice(0, count)
