@@ -185,7 +185,7 @@ def calibrate(
     A log needs a rig file, which states the sizes of the targets. Its calibration writes calibration.mcap, result.json,
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, and the cameras for Kalibr, ROS, OpenCV and COLMAP.
     """
-    is_of_clouds = rig is None and not is_log(source) and source.is_dir() and bool(rw.rig.cloud_folders(source))
+    is_of_clouds = rig is None and not is_log(source) and source.is_dir() and _has_clouds(source)
     if rig is not None or is_log(source) or is_of_clouds:
         refuse(context, NOT_FOR_A_LOG)
         described = None if rig is None else rw.rig.read_rig(rig)
@@ -293,6 +293,14 @@ def _write_report(output: Path, evidence: rw.results.Evidence | None) -> Path | 
     page = report_path(output)
     rw.report.write_html(output, page)
     return page
+
+
+def _has_clouds(folder: Path) -> bool:
+    """Whether a folder has clouds; folders of other files are told without the packages that read clouds."""
+    from gtsam_rwhec.logs.image_folder import CLOUD_FORMATS
+
+    several = (path.suffix.lower() for pattern in ("*", "*/*", "*/*/*") for path in folder.glob(pattern))
+    return not set(CLOUD_FORMATS).isdisjoint(several) and bool(rw.rig.cloud_folders(folder))
 
 
 def _proposed(folder: Path, stage: StageDisplay) -> rw.rig.Rig:

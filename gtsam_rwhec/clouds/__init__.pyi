@@ -1,5 +1,4 @@
 from .cloud import Cloud as Cloud
-<<<<<<< HEAD
 from .cloud_files import read_cloud as read_cloud
 from .registered_views import ObjectOptions as ObjectOptions
 from .object_views import SeenObject as SeenObject
@@ -8,9 +7,7 @@ from .registered_views import ViewFinding as ViewFinding
 from .object_views import motions as motions
 from .object_views import seen_object as seen_object
 from .registration import Registrations as Registrations
-=======
 from .beams import deskewed as deskewed
->>>>>>> lidar
 from .lidar_boards import BeamBiases as BeamBiases
 from .lidar_boards import LidarBoard as LidarBoard
 from .lidar_boards import LidarBoardOptions as LidarBoardOptions

@@ -13,7 +13,7 @@ from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, NoiseGroups, RefineOptions
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import SAME_POSE, LocalPaths, Trajectory
-from gtsam_rwhec.problem.directions import slides_of
+from gtsam_rwhec.problem.directions import SLIDES, slides_of
 from gtsam_rwhec.problem.measurements import Pair, checked_covariances
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import VarianceFactors
@@ -46,7 +46,7 @@ class PairData:
     @property
     def told(self) -> Array:
         """(N,): how many entries of each residual are measured."""
-        lost = 0 if self.slides is None else np.linalg.matrix_rank(self.slides, hermitian=True)
+        lost = 0 if self.slides is None else np.linalg.matrix_rank(self.slides, tol=0.5 * SLIDES, hermitian=True)
         told: Array = np.full(self.count, 6.0) - lost
         return told
 

@@ -266,7 +266,8 @@ def slides_of(raw: Measurements) -> Array | None:
     variances, along = np.linalg.eigh(raw.covariances[other])
     # A difference: what is left of an axis along which all slides is then zero, and not rounding.
     measured = (along * np.where(variances >= SLIDES, 0.0, variances)[:, None, :]) @ along.transpose(0, 2, 1)
-    slides[other] = raw.covariances[other] - measured
+    has = (variances >= SLIDES).any(axis=1)[:, None, None]
+    slides[other] = np.where(has, raw.covariances[other] - measured, 0.0)
     return slides
 
 

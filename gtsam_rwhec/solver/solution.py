@@ -244,8 +244,12 @@ def solve(
             )
         check_against_knowledge(problem, *initial)
     with one_blas_thread(), np.errstate(all="ignore"):
-        about = None if initial is None else poses_of(*initial[:2])
-        scale = 1.0 if initial is None or problem.scale != "shared" else checked_scale(initial[2], "the start's scale")
+        about = None if initial is None or not problem.directed else poses_of(*initial[:2])
+        scale = (
+            1.0
+            if initial is None or about is None or problem.scale != "shared"
+            else checked_scale(initial[2], "the start's scale")
+        )
         results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
         cost = np.inf
         # Directions of translations are those of an answer: they are taken there again until the answer stays.
@@ -323,9 +327,11 @@ def certify(
     """
     check_types(problem, options, progress)
     options = options or SolveOptions()
+    parts = parts_of(problem)
     check_against_knowledge(problem, X, Y, scale)
-    shared = checked_scale(scale, "the answer's scale of all targets") if problem.scale == "shared" else 1.0
-    parts = parts_of(problem, poses_of(X, Y) if problem.directed else None, shared)
+    if problem.directed:
+        shared = checked_scale(scale, "the answer's scale of all targets") if problem.scale == "shared" else 1.0
+        parts = parts_of(problem, poses_of(X, Y), shared)
     certificates = []
     for part in parts:
         given = given_answer(part, X, Y, scale)

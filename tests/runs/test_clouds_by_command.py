@@ -122,6 +122,7 @@ def test_init_finds_how_poses_are_read_and_calibrate_needs_no_rig_file(
     np.testing.assert_allclose(sensor(tmp_path / "out"), sensor(out), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_log_of_the_folder_and_its_stages_give_the_same_to_the_last_bit(
     folder: Path, out: Path, tmp_path: Path
 ) -> None:
@@ -147,6 +148,7 @@ def test_a_log_of_the_folder_and_its_stages_give_the_same_to_the_last_bit(
     assert all("/calibration/camera/clouds" in topics for topics in kept.values())
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_does_not_register_again(
     folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,7 +41,7 @@ def test_workers_are_refused_where_detection_is_skipped(stage_log: Path, tmp_pat
 
 
 def test_images_are_refused_where_the_log_has_none(stage_log: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=rf"--images.*{stage_log.name} has no images to copy"):
+    with pytest.raises(OptionError, match=rf"--images.*{stage_log.name} has no images or clouds to copy"):
         calibrate_log(stage_log, made.rig(), tmp_path / "out", images="copy")
     assert not (tmp_path / "out").exists()
 
@@ -63,7 +63,7 @@ def test_a_drivers_detections_need_no_workers_and_have_no_images(stage: Any, tmp
     raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
     with pytest.raises(OptionError, match=r"workers=2 \(--workers\).*no sensor of the rig file has images: leave"):
         stage(raw, made.rig(), tmp_path / "out", workers=2)
-    with pytest.raises(OptionError, match=r"--images.*raw\.mcap has no images to copy. Leave the option out"):
+    with pytest.raises(OptionError, match=r"--images.*raw\.mcap has no images or clouds to copy. Leave the option out"):
         stage(raw, made.rig(), tmp_path / "out", images="copy")
     assert list(tmp_path.iterdir()) == [raw]
 
