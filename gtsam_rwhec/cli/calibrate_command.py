@@ -297,7 +297,7 @@ def _write_report(output: Path, evidence: rw.results.Evidence | None) -> Path | 
 
 def _has_clouds(folder: Path) -> bool:
     """Whether a folder has clouds; folders of other files are told without the packages that read clouds."""
-    from gtsam_rwhec.logs.image_folder import CLOUD_FORMATS
+    from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS
 
     several = (path.suffix.lower() for pattern in ("*", "*/*", "*/*/*") for path in folder.glob(pattern))
     return not set(CLOUD_FORMATS).isdisjoint(several) and bool(rw.rig.cloud_folders(folder))

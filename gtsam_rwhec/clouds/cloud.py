@@ -11,6 +11,9 @@ from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import real_array
 
+#: The endings of files of one cloud; of images the depths.
+CLOUD_FORMATS = (".pcd", ".ply", ".npy", ".npz", ".bin", ".png", ".tif", ".tiff")
+
 
 @dataclass(frozen=True)
 class Cloud:

@@ -20,14 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS, Cloud
 from gtsam_rwhec.clouds.named_fields import METRE, cloud_of_depth, cloud_of_fields
 from gtsam_rwhec.errors import CloudError, LogWarning
 from gtsam_rwhec.files.budgets import CLOUD, POINT
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.logs.image_folder import CLOUD_FORMATS, FORMATS
+from gtsam_rwhec.logs.image_folder import FORMATS
 from gtsam_rwhec.logs.records import ImageRecord
 
 #: The fields (N,) of a file by name, and the shape of an organised one.

@@ -40,8 +40,6 @@ Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz t
 FORMATS = {
     ".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".bmp": "bmp", ".tif": "tiff", ".tiff": "tiff",
 }  # fmt: skip
-#: The endings of files of one cloud; of images the depths.
-CLOUD_FORMATS = (".pcd", ".ply", ".npy", ".npz", ".bin", ".png", ".tif", ".tiff")
 #: Bytes of the largest file that is taken as an image. A log keeps images as they are.
 LARGEST_IMAGE = MESSAGE
 

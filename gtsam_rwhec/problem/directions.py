@@ -266,7 +266,7 @@ def slides_of(raw: Measurements) -> Array | None:
     variances, along = np.linalg.eigh(raw.covariances[other])
     # A difference: what is left of an axis along which all slides is then zero, and not rounding.
     measured = (along * np.where(variances >= SLIDES, 0.0, variances)[:, None, :]) @ along.transpose(0, 2, 1)
-    has = (variances >= SLIDES).any(axis=1)[:, None, None]
+    has = (variances[:, -1] >= SLIDES)[:, None, None]
     slides[other] = np.where(has, raw.covariances[other] - measured, 0.0)
     return slides
 

@@ -13,7 +13,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.trial_fits import Spread, fitted
-from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS, Cloud
 from gtsam_rwhec.clouds.cloud_files import read_cloud
 from gtsam_rwhec.clouds.first_registration import first_poses
 from gtsam_rwhec.clouds.object_views import seen_object
@@ -24,7 +24,7 @@ from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import natural_key, rounded
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs.image_folder import CLOUD_FORMATS, FORMATS, TABLES
+from gtsam_rwhec.logs.image_folder import FORMATS, TABLES
 from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.logs.pose_trees import TREES
 from gtsam_rwhec.problem.measurements import Pair
