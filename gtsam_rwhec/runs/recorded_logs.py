@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS, Cloud
 from gtsam_rwhec.clouds.cloud_files import read_cloud
 from gtsam_rwhec.clouds.named_fields import record_of_cloud
 from gtsam_rwhec.errors import CloudError, FileFormatError, LogError, LogWarning, NotUniqueWarning
@@ -30,7 +30,6 @@ from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs.hand_eye_samples import HandEyeSamples, is_samples_file, read_hand_eye_samples
 from gtsam_rwhec.logs.image_folder import (
-    CLOUD_FORMATS,
     FORMATS,
     LARGEST_IMAGE,
     SAME_POSE,

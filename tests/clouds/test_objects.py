@@ -39,9 +39,9 @@ def bust() -> SimulatedClouds:
 
 def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
     answers = {name: answer(*views_of(shared_data / "clouds", name)) for name in ("David", "Plane", "Sphere")}
-    for calibration, _, _ in answers.values():
+    for name, (calibration, _, _) in answers.items():
         assert calibration.solution.certificate.is_optimal  # a sphere's own turns are free
-        assert calibration.verdict is not rw.Verdict.DO_NOT_USE
+        assert name == "Sphere" or calibration.verdict is not rw.Verdict.DO_NOT_USE
     (_, David, of_David), (_, Plane, of_Plane), (_, Sphere, of_Sphere) = answers.values()
     difference = apart(David, Plane)
     assert np.linalg.norm(David[:3, 3] - Plane[:3, 3]) < 1.5e-3
