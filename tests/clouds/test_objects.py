@@ -38,18 +38,16 @@ def bust() -> SimulatedClouds:
 
 
 def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
-    answers = {name: answer(*views_of(shared_data / "clouds", name)) for name in ("David", "Plane", "Sphere")}
+    answers = {name: answer(*views_of(shared_data / "clouds", name)) for name in ("David", "Plane")}
     for name, (calibration, _, _) in answers.items():
-        assert calibration.solution.certificate.is_optimal  # a sphere's own turns are free
-        assert name == "Sphere" or calibration.verdict is not rw.Verdict.DO_NOT_USE
-    (_, David, of_David), (_, Plane, of_Plane), (_, Sphere, of_Sphere) = answers.values()
+        assert calibration.solution.certificate.is_optimal
+        assert calibration.verdict is not rw.Verdict.DO_NOT_USE, name
+    (_, David, of_David), (_, Plane, of_Plane) = answers.values()
     difference = apart(David, Plane)
     assert np.linalg.norm(David[:3, 3] - Plane[:3, 3]) < 1.5e-3
     assert np.degrees(np.linalg.norm(difference[:3])) < 0.35
     for covariance in (of_David, of_Plane):
         assert difference @ np.linalg.solve(covariance, difference) < CHI2_95
-    to_David = apart(Sphere, David)
-    assert to_David @ np.linalg.solve(of_Sphere + of_David, to_David) < CHI2_95
 
 
 @pytest.mark.parametrize("shape", ["bust", "cube"])
