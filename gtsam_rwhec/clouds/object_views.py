@@ -46,7 +46,7 @@ class SeenObject:
         Poses of the thing, metres; nan where a view is not used. The object's frame is turned as the target carrier,
         and its origin is where turns and shifts of its surface mix least: a sphere's centre, a cylinder's axis.
     covariances : (N, 6, 6)
-        Of the same: right perturbation, rotation first; as large as the thing where its surface slides on itself.
+        Of the same: right perturbation, rotation first; of what slides 100 (rad^2, m^2).
     used : (N,) bool
         Which views are used.
     left_out : {view: ViewFinding}

@@ -11,6 +11,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.directions import SLIDES
 
 #: Normals of points that match differ by less than 37 degrees.
 ALIKE = 0.95
@@ -25,6 +26,10 @@ SHARED = (0.2, 0.5)
 SIGNIFICANT = 4.0
 #: And if it is at least this share of the largest: surfaces are round or flat to no better, as sensors see them.
 LEAST_SHARE = 1e-3
+#: A direction slides if its deviation is more than this share of the thing's size: nothing of it was measured.
+SLIDING_SHARE = 0.3
+#: Its variance then, rad^2 or m^2: more than ``problem.directions.SLIDES``.
+SLID = 4.0 * SLIDES
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ def _of_arrays(several: Sequence[_Arrays], overlap: float) -> Matches:
 class Known:
     """What matches tell of T_other_surface by a right perturbation, rotation first; it adds a guess where they slide.
 
-    ``information`` (6, 6) has nothing along what slides, ``covariance`` there the size of the thing. ``step`` (6,) is
+    ``information`` (6, 6) has nothing along what slides, ``covariance`` there a variance that says so. ``step`` (6,) is
     the perturbation that matches give, and ``of_guess`` (6, 6) the part of a guess that stays.
     """
 
@@ -148,14 +153,17 @@ def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
         certain += (vectors * values * limit) @ vectors.T
         gradient += (vectors * limit) @ (vectors.T @ (0.5 * (a + b).T @ (w * found.residuals[mine])))
     values, vectors = np.linalg.eigh(_symmetric(certain))
-    certain = np.maximum(values, 0.0)
+    slides = values < 1.0 / (SLIDING_SHARE * size) ** 2
+    certain = np.where(slides, 0.0, values)
     total = certain + 1.0 / size**2  # a guess is off by the size of the thing
     step = -vectors @ (vectors.T @ gradient / total)
     parts = (certain, 1.0 / total, 1.0 - certain / total)
     information, covariance, of_guess = ((vectors * each) @ vectors.T for each in parts)
+    sliding = from_unit @ vectors[:, slides]
+    sliding /= np.linalg.norm(sliding, axis=0)
     return Known(
         _symmetric(to_unit.T @ information @ to_unit),
-        _symmetric(from_unit @ covariance @ from_unit.T),
+        _symmetric(from_unit @ covariance @ from_unit.T + SLID * sliding @ sliding.T),
         from_unit @ step,
         from_unit @ of_guess @ to_unit,
     )

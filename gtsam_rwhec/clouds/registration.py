@@ -48,7 +48,7 @@ class Registrations:
     information : (P, 6, 6)
         Of a right perturbation of B, rotation first; zero along what slides.
     covariances : (P, 6, 6)
-        The same inverted, with the size of the thing as deviation where it slides.
+        The same inverted, with a variance of 100 (rad^2, m^2) where it slides.
     overlap : (P,)
         The share of the points of j that lie on i.
     """

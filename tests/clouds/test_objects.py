@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, ViewFault, seen_object
 from gtsam_rwhec.errors import CloudError, PoseError
+from gtsam_rwhec.problem.directions import Weighing
 from gtsam_rwhec.simulate import Noise, SimulatedClouds, clouds_of_thing
 from gtsam_rwhec.simulate.simulated_clouds import seen_points, thing
 
@@ -38,16 +39,18 @@ def bust() -> SimulatedClouds:
 
 
 def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
-    answers = {name: answer(*views_of(shared_data / "clouds", name)) for name in ("David", "Plane")}
-    for name, (calibration, _, _) in answers.items():
-        assert calibration.solution.certificate.is_optimal
-        assert calibration.verdict is not rw.Verdict.DO_NOT_USE, name
-    (_, David, of_David), (_, Plane, of_Plane) = answers.values()
+    answers = {name: answer(*views_of(shared_data / "clouds", name)) for name in ("David", "Plane", "Sphere")}
+    for calibration, _, _ in answers.values():
+        assert calibration.solution.certificate.status is rw.Status.CERTIFIED
+        assert calibration.verdict is not rw.Verdict.DO_NOT_USE
+    (_, David, of_David), (_, Plane, of_Plane), (_, Sphere, of_Sphere) = answers.values()
     difference = apart(David, Plane)
     assert np.linalg.norm(David[:3, 3] - Plane[:3, 3]) < 1.5e-3
     assert np.degrees(np.linalg.norm(difference[:3])) < 0.35
     for covariance in (of_David, of_Plane):
         assert difference @ np.linalg.solve(covariance, difference) < CHI2_95
+    to_David = apart(Sphere, David)
+    assert to_David @ np.linalg.solve(of_Sphere + of_David, to_David) < CHI2_95
 
 
 @pytest.mark.parametrize("shape", ["bust", "cube"])
@@ -66,7 +69,11 @@ def test_what_slides_has_no_weight(shape: str, slides: int) -> None:
     unknown = np.linalg.eigvalsh(seen.covariances[seen.used]) > 1e-2**2
     assert (unknown.sum(axis=1) == slides).all()
     if shape == "sphere":  # its centre is known although its turn is not: the frame is in the centre
-        assert np.sqrt(np.diagonal(seen.covariances, axis1=1, axis2=2)[:, 3:].max()) < 1e-3
+        problem = rw.Problem()
+        seen.add_to(problem, "sphere", "camera")
+        weighing = Weighing.of(problem.measurements("sphere", "camera"))
+        assert np.linalg.norm(weighing.centre, axis=1).max() < 1e-3
+        assert 1.0 / np.sqrt(weighing.of_axes.min()) < 1e-3
 
 
 def test_the_information_of_a_pair_is_what_repeated_noise_shows() -> None:
