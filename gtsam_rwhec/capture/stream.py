@@ -30,8 +30,9 @@ from gtsam_rwhec.fitting.weighted_fit import WeightedFit
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
+from gtsam_rwhec.problem.additions import seen_pair
 from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
-from gtsam_rwhec.problem.problem import Problem, seen_pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors, of_moments
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.parts import connected_components, parts_of

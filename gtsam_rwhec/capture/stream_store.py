@@ -10,11 +10,12 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, MeasurementsNotKeptError, NoiseError, StampError
 from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.problem.additions import SIDES
 from gtsam_rwhec.problem.many_measurements import Sorted
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge
-from gtsam_rwhec.problem.problem import SIDES, Problem
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import VarianceFactors, of_moments
 
 #: What a measurement may state besides its two poses: all of a stream state the same.

@@ -28,7 +28,7 @@ SIGNIFICANT = 4.0
 LEAST_SHARE = 1e-3
 #: A direction slides if its deviation is more than this share of the thing's size: nothing of it was measured.
 SLIDING_SHARE = 0.3
-#: Its variance then, rad^2 or m^2: more than ``problem.directions.SLIDES``.
+#: Its variance then, rad^2 or m^2: so large that a problem takes the direction for one that slides.
 SLID = 4.0 * SLIDES
 
 
