@@ -148,7 +148,6 @@ def test_a_log_of_the_folder_and_its_stages_give_the_same_to_the_last_bit(
     assert all("/calibration/camera/clouds" in topics for topics in kept.values())
 
 
-@pytest.mark.slow
 def test_an_interrupted_run_does_not_register_again(
     folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
