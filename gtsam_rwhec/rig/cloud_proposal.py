@@ -132,13 +132,14 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             notes.append(f"not used: {clouds.path}, no poses fit its {len(clouds.files)} clouds")
             continue
         if chosen is None:
-            tell(f"trying readings of the poses of {clouds.path}")
+            tell(f"trying readings of the poses in {', '.join(tables)}")
             chosen = _best(folder, clouds, tables, tell)
         poses = chosen[0].poses if chosen[0].poses.path in tables else None
         path = tables[0] if poses is None else poses.path
         name = free_name("camera" if clouds.path in (".", "*") else camera_name(clouds.path, ""), taken)
         sensors[name] = Sensor(clouds=clouds.path, poses=path, unit_m=clouds.unit_m if clouds.unit_m != 1.0 else None)
-        notes.append(f"sensor {clouds.path}: {len(clouds.files)} clouds, poses in {path}")
+        place = "this folder" if clouds.path == "." else clouds.path
+        notes.append(f"sensor {name}: {len(clouds.files)} clouds in {place}, poses in {path}")
         if clouds.unit_m != 1.0:
             notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
     if chosen is None:
