@@ -121,6 +121,7 @@ class _Search:
         gradient, normal = np.zeros((len(Y), 6)), np.zeros((len(Y), 6, 6))
         inverse = se3.inverse(Y)
         for points, other, motion in zip(self.pairs.points, self.pairs.others, self.pairs.motions, strict=True):
+            turning = se3.hat(points)
             T = inverse @ motion @ Y
             R = T[:, :3, :3]
             moved = np.einsum("hij,nj->hni", R, points) + T[:, None, :3, 3]
@@ -128,20 +129,17 @@ class _Search:
             distances, nearest = faces.tree.query(moved, distance_upper_bound=gate)
             misfits.append((np.minimum(distances / gate, 1.0) ** 2).mean(axis=1))
             near.append(np.isfinite(distances).mean(axis=1))
-            h, n = np.nonzero(np.isfinite(distances))
-            at = nearest[h, n]
-            residuals = np.einsum("mi,mi->m", faces.normals[at], moved[h, n] - faces.points[at])
-            weights = (1.0 - (distances[h, n] / gate) ** 2) ** 2
-            local = np.einsum("mi,mij->mj", faces.normals[at], R[h])
+            at = np.minimum(nearest, len(faces.points) - 1)  # one past the last is none, and weighs nothing
+            weights = np.maximum(1.0 - (distances / gate) ** 2, 0.0) ** 2
+            normals = faces.normals[at]
+            residuals = np.einsum("hni,hni->hn", normals, moved - faces.points[at])
+            local = normals @ R
             # d T = T (x - Ad(T^-1) x) for Y exp(x)
             by_Y = np.eye(6) - se3.adjoint(se3.inverse(T))
-            rows = np.einsum("mi,mij->mj", np.hstack([np.cross(points[n], local), local]), by_Y[h])
-            starts = np.searchsorted(h, np.arange(len(Y)))
-            filled = np.flatnonzero(np.diff(np.r_[starts, len(h)]))
-            if len(filled):
-                weighted = weights[:, None] * rows
-                gradient[filled] += np.add.reduceat(weighted * residuals[:, None], starts[filled])
-                normal[filled] += np.add.reduceat(weighted[:, :, None] * rows[:, None, :], starts[filled])
+            rows = np.concatenate([np.einsum("nij,hnj->hni", turning, local), local], axis=2) @ by_Y
+            weighted = weights[:, :, None] * rows
+            gradient += np.einsum("hni,hn->hi", weighted, residuals)
+            normal += weighted.transpose(0, 2, 1) @ rows
         return np.array(misfits).T, np.array(near).T, gradient, normal
 
     def refined(self, Y: Array, gate: float, steps: int, *, fine: bool) -> tuple[Array, Array]:

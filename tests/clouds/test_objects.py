@@ -132,7 +132,8 @@ def test_a_thing_that_moved_and_stayed_is_an_error(bust: SimulatedClouds) -> Non
 
 
 def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
-    clouds, poses = bust.clouds[:6], bust.A[:6]
+    clouds = [cloud.selected(np.arange(0, len(cloud), 3)) for cloud in bust.clouds[:6]]
+    poses = bust.A[:6]
     millimetres = poses.copy()
     millimetres[:, :3, 3] *= 1e3
     for A, words in (
