@@ -169,6 +169,7 @@ def test_what_is_drawn_is_where_the_truth_says(imported: Callable[[str], ModuleT
     assert np.abs(middle - (at * area[:, None]).sum(axis=0) / area.sum()).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_rendered_cell_is_calibrated_and_compared_with_fixed_models(
     imported: Callable[[str], ModuleType], tmp_path: Path
 ) -> None:
@@ -188,6 +189,7 @@ def test_a_rendered_cell_is_calibrated_and_compared_with_fixed_models(
     assert table["left out of those whose board is read"].met == (found["left_out"] <= 0.01 * found["read"])
 
 
+@pytest.mark.slow
 def test_simulated_trajectories_are_right_but_for_their_own_error(imported: Callable[[str], ModuleType]) -> None:
     trajectories = imported("trajectories")
     for kind in trajectories.KINDS:

@@ -209,6 +209,7 @@ def test_init_finds_how_real_poses_are_read(shared_data: Path, tmp_path: Path) -
     assert poses.columns == ("rx", "ry", "rz", "tx", "ty", "tz")
 
 
+@pytest.mark.slow
 def test_a_real_thing_by_one_command(shared_data: Path, tmp_path: Path) -> None:
     """That things give one answer is tested where they are registered."""
     run("calibrate", real_clouds(shared_data, "Plane"), "-o", tmp_path / "out")
