@@ -56,7 +56,7 @@ from .target_sections import TagTarget as TagTarget
 from .rig_file import rig_text as rig_text
 
 # The first rig file of a log, or of a folder of images.
-from .cloud_proposal import cloud_folders as cloud_folders
+from .folder_contents import cloud_folders as cloud_folders
 from .folder_contents import is_folder_without_logs as is_folder_without_logs
 from .folder_proposal import propose_folder_rig as propose_folder_rig
 from .log_proposal import propose_rig as propose_rig

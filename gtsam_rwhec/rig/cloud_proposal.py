@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,24 +12,22 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.trial_fits import Spread, fitted
-from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS, Cloud
-from gtsam_rwhec.clouds.cloud_files import read_cloud
 from gtsam_rwhec.clouds.first_registration import first_poses
 from gtsam_rwhec.clouds.object_views import seen_object
 from gtsam_rwhec.clouds.registered_views import ObjectOptions
 from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
-from gtsam_rwhec.errors import CloudError, FileFormatError, RigError
+from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import natural_key, rounded
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs.image_folder import FORMATS, TABLES
+from gtsam_rwhec.logs.image_folder import TABLES
 from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.logs.pose_trees import TREES
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig.carrier_roles import Role
-from gtsam_rwhec.rig.folder_contents import DEPTH, FolderPoses, poses_read
+from gtsam_rwhec.rig.folder_contents import FAR_UNITS, CloudFolder, FolderPoses, poses_read, readable_cloud
 from gtsam_rwhec.rig.log_contents import camera_name, free_name
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import first_rig_text
@@ -38,18 +35,12 @@ from gtsam_rwhec.rig.section_types import is_text
 from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import ObjectTarget
 
-#: Endings of files that are clouds and nothing else.
-ENDINGS = tuple(ending for ending in CLOUD_FORMATS if ending not in FORMATS)
-#: A folder of clouds has at least this number.
-LEAST_CLOUDS = 3
 #: Readings are judged by at most this number of clouds, spread evenly.
 LOOKED_AT = 12
 #: A reading lets clouds agree if their points are nearer to each other than this share of the gate's square.
 AGREES = 0.45
 #: Another reading explains the registered clouds as well if its residuals' product is below this many times the best.
 AS_WELL = 2.0
-#: Clouds of which the median point is farther away than this many units are in millimetres.
-FAR_UNITS = 50.0
 #: Names for the frames of a folder's poses; files do not name them.
 PARENT, CHILD, OBJECT = "base", "flange", "object"
 #: Units that files may leave open, in the order in which they are tried.
@@ -57,15 +48,6 @@ LENGTHS: tuple[Literal["mm"] | None, ...] = (None, "mm")
 ANGLES: tuple[Literal["radians", "degrees"], ...] = ("radians", "degrees")
 #: Conventions of three angles, the commonest first.
 AXES = ("xyz", "ZYX", "XYZ", "rotation_vector", "ZYZ", "zyx")
-
-
-@dataclass(frozen=True)
-class CloudFolder:
-    """Clouds of one sensor."""
-
-    path: str  #: Or pattern, from the folder that was looked at
-    files: tuple[Path, ...]  #: In natural order
-    unit_m: float  #: Metres of one unit, as far away as the points are
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,30 +70,6 @@ class _Reading:
         if said.quaternion:
             words = [f"quaternions {said.quaternion}"]
         return f"{words[0]}, {'mm' if said.length else 'm'}, the sensor on {CHILD if self.role == 'child' else PARENT}"
-
-
-def cloud_folders(folder: Path) -> list[CloudFolder]:
-    """The folders in a folder that have clouds, in natural order."""
-    found = []
-    for place, below, names in os.walk(folder):
-        inside = Path(place).relative_to(folder)
-        below[:] = [] if len(inside.parts) >= DEPTH else [name for name in below if not name.startswith(".")]
-        for ending in ENDINGS:
-            of_ending = sorted((name for name in names if name.lower().endswith(ending)), key=natural_key)
-            if len(of_ending) >= LEAST_CLOUDS and (cloud := _read(Path(place) / of_ending[0])) is not None:
-                is_far = float(np.median(np.linalg.norm(cloud.points, axis=1))) > FAR_UNITS
-                files = tuple(Path(place) / name for name in of_ending)
-                several = any(Path(name).suffix.lower() in CLOUD_FORMATS for name in names if name not in of_ending)
-                path = inside.as_posix() if not several else (inside / f"*{ending}").as_posix()
-                found.append(CloudFolder(path, files, 1e-3 if is_far else 1.0))
-    return sorted(found, key=lambda each: natural_key(each.path))
-
-
-def _read(file: Path, unit_m: float = 1.0) -> Cloud | None:
-    try:
-        return read_cloud(file, unit_m=unit_m)
-    except (CloudError, FileFormatError):
-        return None
 
 
 def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> tuple[str, tuple[str, ...]]:
@@ -227,7 +185,7 @@ def _best(folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progre
     readings = list(_readings(folder, clouds, tables))
     posed = np.flatnonzero(np.isfinite(readings[0].poses.T[:, 0, 0]))
     at = posed[np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).round().astype(int))]
-    seen = {int(i): cloud for i in at if (cloud := _read(clouds.files[i], clouds.unit_m)) is not None}
+    seen = {int(i): cloud for i in at if (cloud := readable_cloud(clouds.files[i], clouds.unit_m)) is not None}
     at = np.array(list(seen))
     spacing = spacing_of([cloud.points for cloud in seen.values()], len(seen))
     surfaces = [surface_of(cloud, clouds.files[i].name, spacing) for i, cloud in seen.items()]

@@ -1,4 +1,4 @@
-"""The content of a folder, for a rig file: folders of images, poses for them, and files of intrinsics.
+"""The content of a folder, for a rig file: folders of images and of clouds, poses for them, and files of intrinsics.
 
 Every file is identified by its content: a file of poses has poses that fit the images, a file of intrinsics has a
 camera of the images' size.
@@ -17,8 +17,10 @@ import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_cameras
+from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS, Cloud
+from gtsam_rwhec.clouds.cloud_files import read_cloud
 from gtsam_rwhec.detect.images import Gray, decode_gray
-from gtsam_rwhec.errors import CameraError, FileFormatError, ImageError, LogError
+from gtsam_rwhec.errors import CameraError, CloudError, FileFormatError, ImageError, LogError
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.geometry.poses import Array
@@ -31,6 +33,12 @@ from gtsam_rwhec.logs.pose_trees import TREES
 DEPTH = 4
 #: A folder of images has at least this number.
 LEAST_IMAGES = 2
+#: Endings of files that are clouds and nothing else.
+ENDINGS = tuple(ending for ending in CLOUD_FORMATS if ending not in FORMATS)
+#: A folder of clouds has at least this number.
+LEAST_CLOUDS = 3
+#: Clouds of which the median point is farther away than this many units are in millimetres.
+FAR_UNITS = 50.0
 #: Files of intrinsics have these endings.
 INTRINSICS = (".yaml", ".yml", ".xml", ".json", ".txt")
 #: A folder with more files than this is not tried as poses or intrinsics: its files are for single images.
@@ -71,6 +79,15 @@ class ImageFolder:
     intrinsics: str  #: The file of intrinsics, from the folder that was looked at; empty if there is none
     camera_name: str  #: The camera's name in that file; empty where it has one alone
     camera: Camera | None  #: Its intrinsics
+
+
+@dataclass(frozen=True)
+class CloudFolder:
+    """Clouds of one sensor."""
+
+    path: str  #: Or pattern, from the folder that was looked at
+    files: tuple[Path, ...]  #: In natural order
+    unit_m: float  #: Metres of one unit, as far away as the points are
 
 
 def is_folder_without_logs(path: Path) -> bool:
@@ -195,3 +212,28 @@ def _intrinsics(
                 name = next((name for name in fitting if name in words), next(iter(fitting)))
                 return _inside(folder, file), name, fitting[name]
     return "", "", None
+
+
+def cloud_folders(folder: Path) -> list[CloudFolder]:
+    """The folders in a folder that have clouds, in natural order."""
+    found = []
+    for place, below, names in os.walk(folder):
+        inside = Path(place).relative_to(folder)
+        below[:] = [] if len(inside.parts) >= DEPTH else [name for name in below if not name.startswith(".")]
+        for ending in ENDINGS:
+            of_ending = sorted((name for name in names if name.lower().endswith(ending)), key=natural_key)
+            if len(of_ending) >= LEAST_CLOUDS and (cloud := readable_cloud(Path(place) / of_ending[0])) is not None:
+                is_far = float(np.median(np.linalg.norm(cloud.points, axis=1))) > FAR_UNITS
+                files = tuple(Path(place) / name for name in of_ending)
+                several = any(Path(name).suffix.lower() in CLOUD_FORMATS for name in names if name not in of_ending)
+                path = inside.as_posix() if not several else (inside / f"*{ending}").as_posix()
+                found.append(CloudFolder(path, files, 1e-3 if is_far else 1.0))
+    return sorted(found, key=lambda each: natural_key(each.path))
+
+
+def readable_cloud(file: Path, unit_m: float = 1.0) -> Cloud | None:
+    """The cloud of a file, with points in metres; None if it cannot be read."""
+    try:
+        return read_cloud(file, unit_m=unit_m)
+    except (CloudError, FileFormatError):
+        return None

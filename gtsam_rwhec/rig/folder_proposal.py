@@ -26,8 +26,7 @@ from gtsam_rwhec.rig.carrier_roles import (
     origin_of,
     rest_of,
 )
-from gtsam_rwhec.rig.cloud_proposal import cloud_folders, propose_cloud_rig
-from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, poses_read, read_folder, read_gray
+from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, cloud_folders, poses_read, read_folder, read_gray
 from gtsam_rwhec.rig.guessed_boards import STATED, guessed_intrinsics
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
 from gtsam_rwhec.rig.log_contents import ImageTopic, camera_name, free_name
@@ -66,6 +65,8 @@ def propose_folder_rig(
     notes: list[str] = []
     of_clouds = cloud_folders(folder)
     if of_clouds and not read_folder(folder):
+        from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig  # needs an extra that images do without
+
         text, of_readings = propose_cloud_rig(folder, of_clouds, tell)
         parse_rig(text, str(path))
         return text, of_readings

@@ -16,7 +16,6 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
-from gtsam_rwhec.runs.cloud_detections import detect_in_clouds
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections, KeptOfLog
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
@@ -142,12 +141,13 @@ def detected(
     for sensor, source in rig.sensors.items():
         if source.detections is not None:
             found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
-    in_file = kept if isinstance(kept, KeptDetections) else None  # a session in memory has no clouds
-    registered = {
-        sensor: detect_in_clouds(log, rig, sensor, cameras.pop(sensor, None), motion, progress=tell, kept=in_file)
-        for sensor, source in rig.sensors.items()
-        if source.clouds is not None
-    }
+    registered = {}
+    for sensor in (name for name, source in rig.sensors.items() if source.clouds is not None):
+        from gtsam_rwhec.runs.cloud_detections import detect_in_clouds  # needs an extra that images do without
+
+        in_file = kept if isinstance(kept, KeptDetections) else None  # a session in memory has no clouds
+        camera = cameras.pop(sensor, None)
+        registered[sensor] = detect_in_clouds(log, rig, sensor, camera, motion, progress=tell, kept=in_file)
     found |= {sensor: of_clouds.seen for sensor, of_clouds in registered.items()}
     report = detection_report(log, rig, found)
     report = report.model_copy(update={"objects": tuple(of_clouds.report for of_clouds in registered.values())})
