@@ -19,6 +19,7 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.free_directions import all_slide
 
 #: Of standard deviations, the largest about and along any axis that a pose may have; the second one, metres, is the
 #: median distance of what was seen where that is known.
@@ -45,7 +46,7 @@ def of_knowledge(
     """The findings: frames that are known to nothing, and free or weak heights; what is known all the same."""
     most_m, is_seen = _most_m(views)
     findings = list(_known_to_nothing(refined, most_m, carriers, is_seen=is_seen))
-    if findings or refined.free_directions:
+    if findings or not all_slide(refined.free_directions):
         ground = Ground.KNOWN_TO_NOTHING if findings else Ground.NOT_UNIQUE
         findings += known_all_the_same(refined, views, ground)
     return [*findings, *_heights(problem, inliers, refined, carriers)]

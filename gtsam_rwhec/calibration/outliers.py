@@ -290,7 +290,9 @@ def without_outliers(
     if why:
         record.choose(OUTLIERS, "every measurement counts", why)
         return first, {}
-    if options.robust == "auto" and lacking > 0:
+    # Where something slides, a few measurements determine the answer exactly, and all others would look wrong.
+    slides = problem.number_of_equations < 6 * problem.number_of_measurements
+    if lacking > 0 and (options.robust == "auto" or slides):
         why = f"{problem.number_of_measurements} measurements are too few to tell a wrong one from the others"
         record.choose(OUTLIERS, "not looked for", f"{why}; {lacking} more would do")
         # No finding: what is wrong shows against a stated noise; where none is stated, the verdict asks for care.

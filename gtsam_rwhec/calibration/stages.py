@@ -46,7 +46,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import aligned_at
-from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
+from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, all_slide
 from gtsam_rwhec.solver.solution import Solution, solve
 
 #: Standard deviations about the axis with the second most turning: below this the carriers turned too little.
@@ -258,7 +258,7 @@ def _calibrated(run: Run) -> Calibration:
             say_estimated_sizes(run, found_sizes, refined)
     if solution is None:
         record.find(Ground.NO_SCALE, why)
-    is_determined = refined is not None and not refined.free_directions
+    is_determined = refined is not None and all_slide(refined.free_directions)
     outliers = outliers_of(run, inliers, is_answered=is_determined)
     is_few = is_determined and spare_equations(problem) < SPARE_EQUATIONS
     if refined is not None and is_few and refined.noise_source == "estimated":

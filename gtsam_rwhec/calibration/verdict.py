@@ -9,7 +9,7 @@ from enum import StrEnum
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.solver.certificate import Status
-from gtsam_rwhec.solver.free_directions import FEW, FreeReason
+from gtsam_rwhec.solver.free_directions import FEW, all_slide
 from gtsam_rwhec.solver.solution import Solution
 
 
@@ -374,7 +374,7 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
     directions = [*solution.identifiability.free_directions, *(() if refined is None else refined.free_directions)]
     is_unique = solution.identifiability.is_unique and status is not Status.CERTIFIED_NOT_UNIQUE
     # A target that slides leaves its own pose free, and no other frame's.
-    if directions and all(one.reason is FreeReason.SLIDES for one in directions):
+    if directions and all_slide(directions):
         is_unique, directions = True, []
     if not is_unique or directions:
         most = max((residual.number_of_measurements for residual in solution.residuals.values()), default=0)

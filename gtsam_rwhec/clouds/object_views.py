@@ -28,6 +28,7 @@ from gtsam_rwhec.clouds.registration import Registrations, largest_group
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms
+from gtsam_rwhec.problem.directions import with_common_slides
 from gtsam_rwhec.problem.problem import Problem
 
 #: If the thing was elsewhere in a larger share of the views, nobody knows where it was.
@@ -127,11 +128,12 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     B = se3.inverse(joint.T_common_sensor) @ origin
     turn = se3.adjoint(se3.inverse(B))
     covariances = turn @ joint.covariances @ turn.transpose(0, 2, 1)
+    covariances = with_common_slides(0.5 * (covariances + covariances.transpose(0, 2, 1)))
     used = np.setdiff1d(np.arange(len(kept.at)), list(stays))
     transforms = as_transforms(A, None, "A")
     poses, of_poses = np.full((len(transforms), 4, 4), np.nan), np.full((len(transforms), 6, 6), np.nan)
     poses[kept.at[used]] = B[used]
-    of_poses[kept.at[used]] = 0.5 * (covariances + covariances.transpose(0, 2, 1))[used]
+    of_poses[kept.at[used]] = covariances[used]
     return SeenObject(
         transforms,
         poses,
@@ -214,4 +216,4 @@ def _centre(surfaces: Sequence[Surface], poses: Array) -> Array:
     across = len(points) * np.eye(3) - normals.T @ normals
     local = points - middle
     right = local.sum(axis=0) - normals.T @ np.einsum("ij,ij->i", normals, local)
-    return np.asarray(middle + np.linalg.solve(across + 1e-3 * len(points) * np.eye(3), right))
+    return np.asarray(middle + np.linalg.solve(across + 1e-6 * len(points) * np.eye(3), right))

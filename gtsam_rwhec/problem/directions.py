@@ -211,6 +211,16 @@ class Weighing:
         of_turns = np.maximum(0.5 * held[0].sum(axis=1, keepdims=True) - held[0], 0.0)
         return replace(self, of_turns=np.where(slides[:, None], of_turns, self.of_turns), of_axes=held[1])
 
+    def without_slides(self, directional: np.ndarray) -> tuple[Array, Array]:
+        """``of_turns`` and ``of_axes`` without what (N,) measurements state for what slides: that tells nothing."""
+        least = np.where(directional, 1.0 / SLIDES, 0.0)[:, None]
+        turns = self.of_turns.sum(axis=1, keepdims=True) - self.of_turns
+        turns = np.where(turns <= least, 0.0, turns)
+        of_turns = np.maximum(0.5 * turns.sum(axis=1, keepdims=True) - turns, 0.0)
+        is_same = (turns > 0.0).all(axis=1, keepdims=True) | ~directional[:, None]
+        of_axes = np.where(self.of_axes <= least, 0.0, self.of_axes)
+        return np.where(is_same, self.of_turns, of_turns), of_axes
+
     @property
     def equations(self) -> tuple[int, int]:
         """How many directions of rotation and of translation the measurements tell."""
@@ -273,19 +283,49 @@ def slides_of(raw: Measurements) -> Array | None:
 
 def common_slides(several: Sequence[Measurements]) -> Array:
     """The directions (6, k) of a target's axes in which none of its measurements, slid to one answer, is measured."""
-    total, count = np.zeros((6, 6)), 0
-    for raw in several:
-        slides = slides_of(raw)
-        if slides is not None:
-            variances, along = np.linalg.eigh(slides)
-            total += np.einsum("nik,nk,njk->ij", along, (variances > 0.5 * SLIDES).astype(float), along)
-        count += len(raw.A)
-    shares, directions = np.linalg.eigh(total / count)
-    return directions[:, shares > ALIKE]
+    has = [each for each in map(slides_of, several) if each is not None]
+    return _alike(np.concatenate([np.zeros((0, 6, 6)), *has]), sum(len(raw.A) for raw in several))
 
 
 #: Slides are one direction where this share of each is in it.
 ALIKE = 0.99
+
+
+def _alike(slides: Array, count: int) -> Array:
+    """The directions (6, k) in which nearly all of ``count`` covariances say that nothing is measured."""
+    variances, along = np.linalg.eigh(slides)
+    total = np.einsum("nik,nk,njk->ij", along, (variances > 0.5 * SLIDES).astype(float), along)
+    shares, directions = np.linalg.eigh(total / count)
+    return np.asarray(directions[:, shares > ALIKE])
+
+
+def with_common_slides(covariances: Array) -> Array:
+    """Covariances (N, 6, 6) of one thing in its axes, in which what slides in all views is one motion of the thing.
+
+    Each view tells where a sphere's centre is to its own noise only. A large turn about one view's centre moves those
+    of the others, and so would look measured. What slides in all is one group of motions; it is taken as known in what
+    each view measures.
+    """
+    slides = motions_of_slides(_alike(covariances, len(covariances)))
+    rest = np.linalg.svd(slides)[0][:, slides.shape[1] :]
+    measured = rest @ np.linalg.inv(rest.T @ np.linalg.inv(covariances) @ rest) @ rest.T
+    return np.asarray(measured + 4.0 * SLIDES * slides @ slides.T)
+
+
+def motions_of_slides(slides: Array) -> Array:
+    """The nearest directions (6, k) that are motions by any amount: turns about one centre, shifts, no screws."""
+    if not slides.size:
+        return slides
+    turns, sizes, mixed = np.linalg.svd(slides[:3])
+    columns, rank = slides @ mixed.T, int((sizes > 0.5).sum())
+    shifts = np.linalg.svd(columns[3:, rank:], full_matrices=False)[0]
+    across = np.eye(3) - shifts @ shifts.T  # a shift that slides moves the centre nowhere
+    omega = (turns[:, :rank] * sizes[:rank]).T
+    arms = -across @ se3.hat(omega)
+    centre = np.linalg.lstsq(arms.reshape(-1, 3), (across @ columns[3:, :rank]).T.ravel(), rcond=1e-6)[0]
+    found = np.zeros_like(slides)
+    found[:3, :rank], found[3:, :rank], found[3:, rank:] = omega.T, (arms @ centre).T, shifts
+    return np.linalg.qr(found)[0]
 
 
 def axes_seen(raw: Measurements) -> np.ndarray:

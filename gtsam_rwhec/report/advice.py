@@ -35,13 +35,23 @@ def advice_of(
     """
     said: list[Styled] = []
     if free and not (judgement is not None and judgement.is_of_the_reading):
-        said += [(words, "bold red") for words in _not_determined(free)]
-        said.append((MEASURE_AGAIN, ""))
+        open_ones = [direction for direction in free if direction.reason is not FreeReason.SLIDES]
+        said += [(words, "bold red") for words in _not_determined(open_ones)]
+        said += [(MEASURE_AGAIN, "")] if open_ones else []
+        sliding = {name for one in free if one.reason is FreeReason.SLIDES for name in one.frames}
+        said += [(SLIDES.format(", ".join(sorted(sliding, key=natural_key))), "")] if sliding else []
     doubts = [] if log is None else log_advice(log, judgement)
     return (*said, *((words, "bold yellow") for words in doubts))
 
 
 MEASURE_AGAIN = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
+
+
+#: What is seen of a target may slide along it, as a sphere turns about its centre.
+SLIDES = (
+    "Some turns or shifts of {} are free, as all that was seen of it slides along itself. The sensors' poses do not "
+    "need them. If you need the whole pose, show another thing, or another side of it."
+)
 
 
 def _not_determined(free: Sequence[FreeDirection]) -> list[str]:

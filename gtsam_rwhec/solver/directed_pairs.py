@@ -75,10 +75,18 @@ class DirectedPair:
                 of_frame = T[:3, :3] @ raw.B[has, :3, :3] if T is Y else raw.A[has, :3, :3] @ T[:3, :3]
                 axes[has], of_axes[has] = of_frame @ w.axes[has], w.of_axes[has]
         weighing = replace(w, axes=axes, of_axes=of_axes)
-        told = w.of_turns, of_axes
+        told = weighing.without_slides(raw.is_of(Kind.DIRECTIONAL))
         if X is not None and Y is not None:
             weighing = weighing.holding_slides(raw.is_of(Kind.DIRECTIONAL), HELD)
-        return DirectedPair(e, raw.A, raw.B, weighing, told, w.equations, problem.unseen(pair.target))
+        return DirectedPair(
+            e,
+            raw.A,
+            raw.B,
+            weighing,
+            told,
+            replace(w, of_turns=told[0], of_axes=told[1]).equations,
+            problem.unseen(pair.target),
+        )
 
     def holding(self, X: Array | None, Y: Array, scale: float) -> DirectedPair:
         """The pair with one more row of measurements, which holds what means nothing where convention has it.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -121,6 +121,11 @@ class FreeDirection:
         for name, v in shifts.items():
             if name not in turning and np.linalg.norm(v) > least:
                 yield f"{name} along {_axis(v)}"
+
+
+def all_slide(directions: Iterable[FreeDirection]) -> bool:
+    """Whether each direction, if there are any, is of a target that slides: then all that may be asked is known."""
+    return all(one.reason is FreeReason.SLIDES for one in directions)
 
 
 def reason_for(axes: int, turned_rad: float, residual_rad: float, measurements: int) -> FreeReason:

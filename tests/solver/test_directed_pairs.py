@@ -22,7 +22,7 @@ from gtsam_rwhec.errors import (
     PoseError,
     ScaleError,
 )
-from gtsam_rwhec.problem.directions import aligned
+from gtsam_rwhec.problem.directions import SLIDES, aligned, motions_of_slides, with_common_slides
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.selection import aligned_at
 from gtsam_rwhec.solver.answers import PairPoses, given_answer, parts_about
@@ -275,3 +275,37 @@ def test_methods_of_whole_poses_refuse_them() -> None:
     of = mixed_set(1, ("point_0", "tag_1"), scale="known")
     with pytest.raises(OptionError, match="takes whole poses"):
         rw.methods.run("shah2013", of.problem)
+
+
+#: What slides of things: twists [omega, v] of their axes, about a centre that is (1, 2, 3) cm from the origin.
+CENTRE = np.array([0.01, 0.02, 0.03])
+TURNS = np.vstack([np.eye(3), -np.array([np.cross(axis, CENTRE) for axis in np.eye(3)]).T])
+ALONG_Z = np.eye(6)[:, 5:]
+SLIDING = {
+    "sphere": TURNS,
+    "revolved": TURNS[:, 2:],
+    "cylinder": np.hstack([TURNS[:, 2:], ALONG_Z]),
+    "plane": np.hstack([TURNS[:, 2:], np.eye(6)[:, 3:5]]),
+    "profile": ALONG_Z,
+    "nothing": np.zeros((6, 0)),
+}
+
+
+def same_span(first: np.ndarray, second: np.ndarray) -> bool:
+    first, second = (np.linalg.qr(each)[0] for each in (first, second))
+    return first.shape == second.shape and np.allclose(first @ first.T, second @ second.T, atol=1e-4)
+
+
+@pytest.mark.parametrize("thing", SLIDING)
+def test_what_slides_in_all_views_is_one_motion(thing: str) -> None:
+    rng, slides = np.random.default_rng(5), SLIDING[thing]
+    turned = np.linalg.qr(slides)[0] @ np.linalg.qr(rng.normal(size=(slides.shape[1],) * 2))[0]
+    assert same_span(motions_of_slides(turned + 1e-6 * rng.normal(size=turned.shape)), slides)
+    covariances = []
+    for _ in range(5):  # each view tells the centre to 30 micrometres
+        own = slides + 3e-5 * rng.normal(size=slides.shape)
+        covariances.append(1e-10 * np.eye(6) + 4.0 * SLIDES * own @ np.linalg.inv(own.T @ own) @ own.T)
+    for covariance in with_common_slides(np.array(covariances)):
+        variances, along = np.linalg.eigh(covariance)
+        assert same_span(along[:, variances > SLIDES], slides)
+        assert np.allclose(variances[variances < SLIDES], 1e-10, rtol=0.2)
