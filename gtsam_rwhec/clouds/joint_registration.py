@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.clouds.point_to_plane import joined, known, matches, sigmas, units
+from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_VIEWS, joined, known, matches, sigmas, units
 from gtsam_rwhec.clouds.registration import Registrations
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
@@ -96,5 +96,5 @@ def _covariances(
         counts = np.bincount(found.at)[found.at]
         # A residual has the noise of two points, the view's own and the other's; of the others there are many.
         share = (1.0 + 1.0 / len(others)) / 2.0
-        result.append(known(found, sigma_m, counts * share).covariance)
+        result.append(known(found, sigma_m, counts * share, SHARED_BY_VIEWS).covariance)
     return np.array(result)

@@ -28,7 +28,7 @@ from gtsam_rwhec.clouds.registration import Registrations, largest_group
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms
-from gtsam_rwhec.problem.directions import with_common_slides
+from gtsam_rwhec.problem.directions import centre_of_slides, with_common_slides
 from gtsam_rwhec.problem.problem import Problem
 
 #: If the thing was elsewhere in a larger share of the views, nobody knows where it was.
@@ -125,10 +125,9 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
     check_agreement(kept, inside, Y)
     out += [_moved(kept, k, far) for k, far in stays.items()]
-    B = se3.inverse(joint.T_common_sensor) @ origin
-    turn = se3.adjoint(se3.inverse(B))
-    covariances = turn @ joint.covariances @ turn.transpose(0, 2, 1)
-    covariances = with_common_slides(0.5 * (covariances + covariances.transpose(0, 2, 1)))
+    centre = centre_of_slides(_about(origin, joint)[1])
+    B, covariances = _about(origin @ se3.pose(np.eye(3), centre), joint)
+    covariances = with_common_slides(covariances)
     used = np.setdiff1d(np.arange(len(kept.at)), list(stays))
     transforms = as_transforms(A, None, "A")
     poses, of_poses = np.full((len(transforms), 4, 4), np.nan), np.full((len(transforms), 6, 6), np.nan)
@@ -146,6 +145,14 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
         joint.sigma_m,
         views.spacing.faces_m,
     )
+
+
+def _about(origin: Array, joint: JointPoses) -> tuple[Array, Array]:
+    """The thing's poses T_sensor_object and their covariances, with its origin here in the common frame."""
+    B = se3.inverse(joint.T_common_sensor) @ origin
+    turn = se3.adjoint(se3.inverse(B))
+    covariances = turn @ joint.covariances @ turn.transpose(0, 2, 1)
+    return B, 0.5 * (covariances + covariances.transpose(0, 2, 1))
 
 
 def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> Registrations:

@@ -11,7 +11,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.directions import SLIDES
+from gtsam_rwhec.problem.directions import SLID
 
 #: Normals of points that match differ by less than 37 degrees.
 ALIKE = 0.95
@@ -22,14 +22,15 @@ CAUCHY = 2.385
 #: What all points of faces, and of edges, are off by together, in their deviations. An edge is seen up to a whole point
 #: inside of where it is, and how far depends on how steep it is seen.
 SHARED = (0.2, 0.5)
+#: The same of one view among many: noise along rays and thinned edges move what every view sees in one direction, 0.03
+#: to 0.05 mm of 0.1 mm of noise. No residual shows it.
+SHARED_BY_VIEWS = (0.4, 0.5)
 #: Information of a direction counts if it is so many of its own deviations above zero.
 SIGNIFICANT = 4.0
 #: And if it is at least this share of the largest: surfaces are round or flat to no better, as sensors see them.
 LEAST_SHARE = 1e-3
 #: A direction slides if its deviation is more than this share of the thing's size: nothing of it was measured.
 SLIDING_SHARE = 0.3
-#: Its variance then, rad^2 or m^2: so large that a problem takes the direction for one that slides.
-SLID = 4.0 * SLIDES
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,11 @@ def units(points: Array) -> tuple[Array, float]:
     return result, size
 
 
-def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
+def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0, shared: tuple[float, float] = SHARED) -> Known:
     """What matches tell, with deviations (2,) of faces and edges.
 
-    ``counts`` (m,) divide the weight of each match: a point that many views match is still one point. Noise of normals
+    ``counts`` (m,) divide the weight of each match: a point that many views match is still one point. ``shared`` is
+    what all points are off by together. Noise of normals
     looks like information where a surface slides, as rows are squared: so rows by one surface's normals are multiplied
     by those of the other's, whose noise is independent, and directions that are not significant count as nothing.
     """
@@ -149,7 +151,7 @@ def known(found: Matches, sigma_m: Array, counts: Array | float = 1.0) -> Known:
         kept = (values > SIGNIFICANT * spread) & (values > LEAST_SHARE * values.max())
         values, vectors = values[kept], vectors[:, kept]
         # All points of one kind share an error, so their information has a limit.
-        limit = 1.0 / (1.0 + values * (SHARED[kind] * sigma_m[kind]) ** 2)
+        limit = 1.0 / (1.0 + values * (shared[kind] * sigma_m[kind]) ** 2)
         certain += (vectors * values * limit) @ vectors.T
         gradient += (vectors * limit) @ (vectors.T @ (0.5 * (a + b).T @ (w * found.residuals[mine])))
     values, vectors = np.linalg.eigh(_symmetric(certain))

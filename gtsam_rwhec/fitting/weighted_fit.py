@@ -27,7 +27,7 @@ from gtsam_rwhec.fitting import pose_graph as graphs
 from gtsam_rwhec.fitting.pose_graph import optimise
 from gtsam_rwhec.fitting.unknowns import State, Variables
 from gtsam_rwhec.geometry.poses import Array, to_pose3
-from gtsam_rwhec.problem.directions import axes_seen, axes_told
+from gtsam_rwhec.problem.directions import axes_seen, axes_told, scaled, slides_of
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors
@@ -166,6 +166,8 @@ class Measured:
     whitening: Array | None
     #: (N, 3, 3): inverse Cholesky factors of the translation blocks alone.
     whitening_of_translation: Array | None
+    #: (N, 6, 6) each, where something slides: the covariances, and the part of what slides.
+    sliding: tuple[Array, Array] | None
     #: (N, 2): how many directions of rotation and of translation are measured.
     told: Array
     #: (N, 6): which entries of a residual are measured.
@@ -176,11 +178,15 @@ class Measured:
         """The measurements of a problem that kept them: of some pairs, in their order, or of all."""
         pairs = problem.pairs if pairs is None else pairs
         raw = [problem.measurements(*pair) for pair in pairs]
-        whitening = whitening_of_translation = None
+        whitening = whitening_of_translation = sliding = None
         if problem.has_covariances:
             covariances = np.concatenate([np.empty((0, 6, 6)), *(one.covariance_of_B() for one in raw)])
             whitening = np.linalg.inv(np.linalg.cholesky(covariances))
             whitening_of_translation = np.linalg.inv(np.linalg.cholesky(covariances[:, 3:, 3:]))
+            if problem.directed:
+                each = [(slides_of(one), len(one.A)) for one in raw]
+                slides = [np.zeros((count, 6, 6)) if found is None else found for found, count in each]
+                sliding = covariances, np.concatenate(slides)
         bounds = np.cumsum([0, *(len(one.A) for one in raw)]).tolist()
         return Measured(
             pairs,
@@ -191,6 +197,7 @@ class Measured:
             np.concatenate([np.empty(0), *(one.kappa for one in raw)]),
             whitening,
             whitening_of_translation,
+            sliding,
             np.concatenate([np.empty((0, 2)), *(axes_told(one) for one in raw)]),
             np.concatenate([np.empty((0, 6), dtype=bool), *(axes_seen(one) for one in raw)]),
         )
@@ -239,9 +246,13 @@ class Measured:
         if squares.error is None or self.whitening is None:
             return self.as_of_six(squares.rotation / factors.rotation + squares.translation / factors.translation)
         known = np.isfinite(squares.rotation)
-        scaled = squares.error[known] / np.sqrt(np.repeat(factors, 3))
-        result = np.full(len(known), np.inf)
-        result[known] = _norms(self.whitening[known], scaled)
+        deviation, error, result = np.sqrt(np.repeat(factors, 3)), squares.error[known], np.full(len(known), np.inf)
+        if self.sliding is None:
+            result[known] = _norms(self.whitening[known], error / deviation)
+        else:
+            covariances, slides = self.sliding
+            noise = scaled(covariances[known], slides[known], deviation)
+            result[known] = np.einsum("ni,ni->n", error, np.linalg.solve(noise, error[:, :, None])[:, :, 0])
         return self.as_of_six(result)
 
     def as_of_six(self, squares: Array) -> Array:

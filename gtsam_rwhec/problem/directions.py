@@ -277,8 +277,20 @@ def slides_of(raw: Measurements) -> Array | None:
     # A difference: what is left of an axis along which all slides is then zero, and not rounding.
     measured = (along * np.where(variances >= SLIDES, 0.0, variances)[:, None, :]) @ along.transpose(0, 2, 1)
     has = (variances[:, -1] >= SLIDES)[:, None, None]
-    slides[other] = np.where(has, raw.covariances[other] - measured, 0.0)
+    of_other = np.where(has, raw.covariances[other] - measured, 0.0)
+    # Where every turn slides, no rounding of it is left to be taken for a measured turn.
+    turns = np.linalg.eigvalsh(of_other[:, :3, :3])[:, 0] > 0.5 * SLIDES
+    for rows, columns in ((slice(0, 3), slice(0, 6)), (slice(0, 6), slice(0, 3))):
+        of_other[turns, rows, columns] = raw.covariances[other][turns, rows, columns]
+    slides[other] = of_other
     return slides
+
+
+def scaled(covariances: Array, slides: Array | None, deviation: Array) -> Array:
+    """Covariances (N, 6, 6) whose deviations are multiplied by (6,); what slides (N, 6, 6) slides as before."""
+    if slides is None:
+        return np.asarray(covariances * deviation[:, None] * deviation)
+    return np.asarray((covariances - slides) * deviation[:, None] * deviation + slides)
 
 
 def common_slides(several: Sequence[Measurements]) -> Array:
@@ -289,12 +301,14 @@ def common_slides(several: Sequence[Measurements]) -> Array:
 
 #: Slides are one direction where this share of each is in it.
 ALIKE = 0.99
+#: The variance of what slides of one thing, and the least that is taken for it: axes of radians and metres mix.
+SLID, ROUGH = 4.0 * SLIDES, 1.0
 
 
-def _alike(slides: Array, count: int) -> Array:
-    """The directions (6, k) in which nearly all of ``count`` covariances say that nothing is measured."""
+def _alike(slides: Array, count: int, least: float = 0.5 * SLIDES) -> Array:
+    """The directions (6, k) in which nearly all of ``count`` covariances have at least this variance."""
     variances, along = np.linalg.eigh(slides)
-    total = np.einsum("nik,nk,njk->ij", along, (variances > 0.5 * SLIDES).astype(float), along)
+    total = np.einsum("nik,nk,njk->ij", along, (variances > least).astype(float), along)
     shares, directions = np.linalg.eigh(total / count)
     return np.asarray(directions[:, shares > ALIKE])
 
@@ -304,18 +318,28 @@ def with_common_slides(covariances: Array) -> Array:
 
     Each view tells where a sphere's centre is to its own noise only. A large turn about one view's centre moves those
     of the others, and so would look measured. What slides in all is one group of motions; it is taken as known in what
-    each view measures.
+    each view measures. Whatever slides has the variance ``SLID``.
     """
-    slides = motions_of_slides(_alike(covariances, len(covariances)))
+    slides, _ = motions_of_slides(_alike(covariances, len(covariances), ROUGH))
     rest = np.linalg.svd(slides)[0][:, slides.shape[1] :]
-    measured = rest @ np.linalg.inv(rest.T @ np.linalg.inv(covariances) @ rest) @ rest.T
-    return np.asarray(measured + 4.0 * SLIDES * slides @ slides.T)
+    variances, along = np.linalg.eigh(covariances)
+    informed = along * np.where(variances > ROUGH, 0.0, 1.0 / np.abs(variances))[:, None, :]
+    values, turned = np.linalg.eigh(rest.T @ informed @ along.transpose(0, 2, 1) @ rest)
+    axes = rest @ turned
+    known = axes * np.where(values > 1.0 / ROUGH, 1.0 / np.abs(values), SLID)[:, None, :]
+    result = known @ axes.transpose(0, 2, 1) + SLID * slides @ slides.T
+    return np.asarray(0.5 * (result + result.transpose(0, 2, 1)))
 
 
-def motions_of_slides(slides: Array) -> Array:
-    """The nearest directions (6, k) that are motions by any amount: turns about one centre, shifts, no screws."""
+def centre_of_slides(covariances: Array) -> Array:
+    """The point (3,) about which turns slide in all covariances (N, 6, 6); the origin where none do."""
+    return motions_of_slides(_alike(covariances, len(covariances), ROUGH))[1]
+
+
+def motions_of_slides(slides: Array) -> tuple[Array, Array]:
+    """The nearest directions (6, k) that are motions by any amount: turns about a centre (3,), shifts, no screws."""
     if not slides.size:
-        return slides
+        return slides, np.zeros(3)
     turns, sizes, mixed = np.linalg.svd(slides[:3])
     columns, rank = slides @ mixed.T, int((sizes > 0.5).sum())
     shifts = np.linalg.svd(columns[3:, rank:], full_matrices=False)[0]
@@ -325,7 +349,7 @@ def motions_of_slides(slides: Array) -> Array:
     centre = np.linalg.lstsq(arms.reshape(-1, 3), (across @ columns[3:, :rank]).T.ravel(), rcond=1e-6)[0]
     found = np.zeros_like(slides)
     found[:3, :rank], found[3:, :rank], found[3:, rank:] = omega.T, (arms @ centre).T, shifts
-    return np.linalg.qr(found)[0]
+    return np.linalg.qr(found)[0], centre
 
 
 def axes_seen(raw: Measurements) -> np.ndarray:

@@ -19,7 +19,7 @@ from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator, Row
 from gtsam_rwhec.problem.corners import candidates_of
-from gtsam_rwhec.problem.directions import aligned, common_slides
+from gtsam_rwhec.problem.directions import aligned, common_slides, scaled, slides_of
 from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
@@ -112,7 +112,7 @@ def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Meas
     covariances = raw.covariances
     if covariances is not None:
         deviation = np.sqrt(np.repeat(factors, 3))
-        covariances = covariances * deviation[:, None] * deviation / w[:, None, None]
+        covariances = scaled(covariances, slides_of(raw), deviation) / w[:, None, None]
     return replace(
         raw,
         sigma=raw.sigma * np.sqrt(factors.translation / w),
