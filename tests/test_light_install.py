@@ -123,18 +123,6 @@ def test_the_command_solves_with_its_extra_alone(tmp_path: Path) -> None:
     assert "pip install 'gtsam-rwhec[log]'" in errors
 
 
-def everything(tmp_path: Path, *extras: str) -> Path:
-    optional = PROJECT["optional-dependencies"]
-    return environment_of(tmp_path / "environment", PROJECT["dependencies"] + [n for e in extras for n in optional[e]])
-
-
-def test_logs_need_no_package_of_clouds(tmp_path: Path) -> None:
-    python = everything(tmp_path, "cli", "log", "report")
-    code = "import sys; from gtsam_rwhec.cli import main; sys.argv[0] = 'gtsam-rwhec'; main()"
-    said, errors = said_by(python, code, "demo")
-    assert said.startswith("Use these poses"), errors
-
-
 def test_the_extra_of_the_readme_has_what_clouds_need() -> None:
     (everyone,) = (name for name in PROJECT["optional-dependencies"]["all"] if name.startswith("gtsam-rwhec["))
     assert "clouds" in everyone
