@@ -18,7 +18,7 @@ from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio
 from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
-from gtsam_rwhec.problem.measurements import Kind, Pair
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by, solve
 
@@ -133,7 +133,7 @@ def _by_the_whole_model(
             Component.CARRIER_TRANSLATION: options.carrier_noise.translation_m,
         }
         side = options.carrier_noise.about
-    if all((problem.measurements(*pair).is_of(Kind.DIRECTIONAL)).all() for pair in problem.pairs):
+    if problem.is_of_registrations:
         # Thousands of points tell what is known of each view. Errors that all views share show in no residuals.
         stated |= {Component.ROTATION: 1.0, Component.TRANSLATION: 1.0}
     noise = NoiseOptions(stated=stated, drift=options.drift, systematic=options.systematic, side=side)

@@ -14,7 +14,7 @@ from gtsam_rwhec.problem.additions import Additions
 from gtsam_rwhec.problem.directions import axes_told, unseen_by
 from gtsam_rwhec.problem.knowledge import check_name
 from gtsam_rwhec.problem.many_measurements import KeptMeasurements, Section, Sorted
-from gtsam_rwhec.problem.measurements import Measurements, Pair
+from gtsam_rwhec.problem.measurements import Kind, Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import Gauge, Moments
 
@@ -108,6 +108,12 @@ class Problem(Additions):
     def directed(self) -> frozenset[Pair]:
         """The pairs with measurements that weigh by direction; all of such a pair's measurements do."""
         return frozenset(pair for pair, kept in self._kept.items() if kept.has_kinds)
+
+    @property
+    def is_of_registrations(self) -> bool:
+        """Whether every measurement is a pose with directions, as clouds give it: its noise is known, A's is not."""
+        batches = [batch for kept in self._kept.values() for batch in kept.batches]
+        return bool(batches) and all(batch.is_of(Kind.DIRECTIONAL).all() for batch in batches)
 
     @property
     def number_of_equations(self) -> int:

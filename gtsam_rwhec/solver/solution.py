@@ -407,7 +407,8 @@ def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
     """Warn where the residuals contradict the weights."""
     # The inverse equation weights residuals otherwise than the physical model, so its cost says nothing about the
     # noise.
-    if problem.is_relative or any(result.part.kind == "inverse" for result in results):
+    # Of clouds the points' noise is stated alone, and every arm has more.
+    if problem.is_relative or problem.is_of_registrations or any(r.part.kind == "inverse" for r in results):
         return
     cost = sum(result.residual_cost for result in results)
     degrees_of_freedom = int(sum(r.part.equations.sum() - r.part.number_of_unknowns for r in results))
