@@ -171,6 +171,7 @@ class LogEvidence:
     roles: RoleEvidence  #: What solving with the cameras on either frame says
     rest: dict[str, Rest]  #: By topic of images, whether they were taken at rest; empty where the poses do not tell
     origin: Origin  #: Where the poses come from
+    path: Trajectory | None  #: T_parent_child
 
 
 def evidence_of_log(
@@ -182,13 +183,13 @@ def evidence_of_log(
     schema = next((topic.schema for topic in contents.topics if topic.name == source.topic), "")
     origin = origin_of([source.topic or "", parent, child], schema, path)
     if path is None:
-        return LogEvidence(evidence_of_roles([]), {}, origin)
+        return LogEvidence(evidence_of_roles([]), {}, origin, None)
     rest = {
         topic.topic: rest_of(np.unique(np.array(topic.stamps_ns, dtype=np.int64)), path)
         for topic in contents.images.values()
         if len(topic.stamps_ns) > 1
     }
-    return LogEvidence(evidence_of_roles(_seen(contents, path, sensors, targets)), rest, origin)
+    return LogEvidence(evidence_of_roles(_seen(contents, path, sensors, targets)), rest, origin, path)
 
 
 def _path(log: Log, contents: LogContents, source: PoseSource) -> Trajectory | None:

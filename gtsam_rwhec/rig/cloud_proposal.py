@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,21 +14,31 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.trial_fits import Spread, fitted
 from gtsam_rwhec.clouds.first_registration import first_poses
+from gtsam_rwhec.clouds.named_fields import cloud_of_record
 from gtsam_rwhec.clouds.object_views import seen_object
 from gtsam_rwhec.clouds.registered_views import ObjectOptions
 from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
-from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.errors import CloudError, RigError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import natural_key, rounded
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import Trajectory
+from gtsam_rwhec.logs import CloudRecord, Log, Topic
 from gtsam_rwhec.logs.image_folder import TABLES
 from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.logs.pose_trees import TREES
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig.carrier_roles import Role
-from gtsam_rwhec.rig.folder_contents import FAR_UNITS, CloudFolder, FolderPoses, poses_read, readable_cloud
+from gtsam_rwhec.rig.folder_contents import (
+    FAR_UNITS,
+    LEAST_CLOUDS,
+    CloudFolder,
+    FolderPoses,
+    poses_read,
+    readable_cloud,
+)
 from gtsam_rwhec.rig.log_contents import camera_name, free_name
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import first_rig_text
@@ -218,6 +229,46 @@ def _best(folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progre
         "neighbouring clouds share a third of what they see"
     )
     return readings[best], words, False
+
+
+@dataclass(frozen=True)
+class CloudEvidence:
+    """What a topic's clouds say: the frame of the poses that carries the sensor (None: nothing), and their unit."""
+
+    role: Role | None
+    unit_m: float
+    misfits: Mapping[str, float]  #: By the frame that would carry the sensor; 0 is perfect, 1 is apart
+
+    def __str__(self) -> str:
+        each = ", ".join(f"{rounded(misfit, 2)} on {frame}" for frame, misfit in self.misfits.items())
+        return f"misfit of the clouds with the sensor {each} (0: they agree, 1: they are apart)"
+
+
+def evidence_of_clouds(log: Log, topic: Topic, path: Trajectory, parent: str, child: str) -> CloudEvidence:
+    """Register some of a topic's clouds with the sensor on either frame of the poses T_parent_child."""
+    wanted = set(np.linspace(0, topic.count - 1, LOOKED_AT).round().astype(int).tolist())
+    stamps, clouds = [], []
+    for number, record in enumerate(log.records([topic.name])):
+        if number in wanted and isinstance(record, CloudRecord):
+            with suppress(CloudError):  # calibration says what is wrong with it
+                clouds.append(cloud_of_record(record))
+                stamps.append(record.stamp_ns)
+    T, gap_s = path.at(np.array(stamps, dtype=np.int64))
+    posed = np.flatnonzero(np.isfinite(gap_s))
+    if len(posed) < LEAST_CLOUDS:
+        return CloudEvidence(None, 1.0, {})
+    middle = np.median([np.median(np.linalg.norm(clouds[i].points, axis=1)) for i in posed])
+    unit_m = 1e-3 if middle > FAR_UNITS else 1.0
+    clouds = [replace(clouds[i], points=unit_m * clouds[i].points) for i in posed]
+    spacing = spacing_of([cloud.points for cloud in clouds], len(clouds))
+    surfaces = [surface_of(cloud, topic.name, spacing) for cloud in clouds]
+    child_misfit, parent_misfit = (
+        first_poses(surfaces, A, spacing.faces_m)[0].misfit for A in (se3.inverse(T[posed]), T[posed])
+    )
+    better, worse = sorted((child_misfit, parent_misfit))
+    tells = better <= AGREES < worse
+    role: Role | None = None if not tells else "child" if child_misfit < parent_misfit else "parent"
+    return CloudEvidence(role, unit_m, {child: child_misfit, parent: parent_misfit})
 
 
 def _residual(A: Array, B: Array) -> Spread:

@@ -15,7 +15,7 @@ from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.detect.tags import BY_TRUST, SeenTag, tags_in_image
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
 from gtsam_rwhec.logs.records import schema_word
 from gtsam_rwhec.rig.guessed_boards import BoardSeen, boards_seen
 from gtsam_rwhec.rig.section_types import is_name, is_text
@@ -168,6 +168,12 @@ def read_contents(log: Log) -> LogContents:
         elif isinstance(record, DetectionRecord):
             _take_detection(contents.drivers.setdefault(record.topic, DriverTopic(record.topic)), record)
     return contents
+
+
+def frame_of(log: Log, topic: str) -> str:
+    """The frame of a topic's first cloud or image; empty if there is none."""
+    first = next(log.records([topic]), None)
+    return first.frame if isinstance(first, CloudRecord | ImageRecord) else ""
 
 
 def _look_at(images: ImageTopic, record: ImageRecord) -> None:

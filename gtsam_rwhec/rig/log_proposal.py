@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
-from gtsam_rwhec.rig.carrier_roles import Origin, RoleEvidence, evidence_of_log, first_time_offset
+from gtsam_rwhec.rig.carrier_roles import Origin, Role, evidence_of_log, first_time_offset
 from gtsam_rwhec.rig.guessed_boards import STATED
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
 from gtsam_rwhec.rig.log_contents import (
@@ -20,6 +20,7 @@ from gtsam_rwhec.rig.log_contents import (
     MovingPair,
     PoseTopic,
     camera_name,
+    frame_of,
     free_name,
     moving_pairs,
     moving_topics,
@@ -30,9 +31,11 @@ from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import first_rig_text, parse_rig
 from gtsam_rwhec.rig.section_types import is_name, is_text
 from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
+from gtsam_rwhec.rig.target_sections import ObjectTarget
 
 #: Written if a log has no intrinsics; a person must replace it.
 _NO_INTRINSICS = Intrinsics(file="camera.yaml")
+MISSING = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
 
 
 @dataclass(frozen=True)
@@ -54,30 +57,81 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     Raises
     ------
     RigError
-        The log has neither images nor detections, or no poses that move; the message has the topics of the log.
+        The log has no images, clouds or detections, or no poses that move; the message has the topics of the log.
     """
     contents = read_contents(log)
     notes: list[str] = []
     cameras = _cameras(contents, notes)
     if not cameras:
         proposed = propose_odometries(contents.poses.values(), log.files[0].path.name)
+        proposed = proposed or _of_clouds(log, contents)
         if proposed is not None:
             parse_rig(proposed[0], str(path))
             return proposed
-        raise RigError(f"{_where(log)}: no images and no detections that can be read; {_topics(contents)}")
-    pairs, remarks = moving_pairs(contents.poses.values(), [camera.frame for camera in cameras])
+        raise RigError(f"{_where(log)}: no images, clouds or detections that can be read; {_topics(contents)}")
+    pair = _moving(log, contents, [camera.frame for camera in cameras], notes)
+    text = _text(log, contents, pair, cameras, notes)
+    parse_rig(text, str(path))
+    return text, tuple(notes)
+
+
+def _moving(log: Log, contents: LogContents, frames: Sequence[str], notes: list[str]) -> MovingPair:
+    """The frames that move, of which one carries the sensors with these frames."""
+    pairs, remarks = moving_pairs(contents.poses.values(), frames)
     notes += remarks
     if not pairs:
         raise RigError(
             f"{_where(log)}: no poses of anything that moves, and without the carriers' motion nothing can be "
             f"calibrated. Record the poses of the robot or of the motion capture too; {_topics(contents)}"
         )
-    pair = pairs[0]
-    notes.append(f"moving: {_pair_words(pair)}")
+    notes.append(f"moving: {_pair_words(pairs[0])}")
     notes += [f"moves too, not used: {_pair_words(other)}" for other in pairs[1:6]]
-    text = _text(log, contents, pair, cameras, notes)
-    parse_rig(text, str(path))
-    return text, tuple(notes)
+    return pairs[0]
+
+
+def _of_clouds(log: Log, contents: LogContents) -> tuple[str, tuple[str, ...]] | None:
+    """The text and the notes for a log with clouds or depth images; None without any."""
+    cameras = {
+        topic: _intrinsics(topic, images.frame, contents.cameras, len(contents.images))[0]
+        for topic, images in contents.images.items()
+        if "depth" in topic.lower() and "info" not in topic.lower()
+    }
+    topics = [topic for topic in contents.topics if topic.has_clouds or topic.name in cameras]
+    topics = [topic for topic in topics if topic.count and is_text(topic.name) and not topic.unreadable]
+    if not topics:
+        return None
+    from gtsam_rwhec.rig.cloud_proposal import OBJECT, evidence_of_clouds  # needs an extra that images do without
+
+    frames = {topic.name: frame_of(log, topic.name) for topic in topics}
+    notes: list[str] = []
+    pair = _moving(log, contents, list(frames.values()), notes)
+    parent, child = pair.source.parent_and_child
+    taken, of_log, solved, words = (
+        {parent, child, OBJECT},
+        evidence_of_log(log, contents, pair.source, {}, []),
+        None,
+        "",
+    )
+    sensors: dict[str, Sensor] = {}
+    remarks: dict[KeyPath, str] = {("targets", OBJECT): "anything that stood still in front of the sensor"}
+    for topic in topics:
+        name = free_name(camera_name(topic.name, frames[topic.name]), taken)
+        frame = frames[topic.name] if is_name(frames[topic.name]) and frames[topic.name] not in taken else None
+        taken |= {frame} if frame else set()
+        intrinsics = cameras.get(topic.name)
+        if intrinsics is None and topic.name in cameras:
+            intrinsics, remarks["sensors", name, "intrinsics"] = _NO_INTRINSICS, MISSING
+        sensor = Sensor(clouds=topic.name, frame=frame, intrinsics=intrinsics)
+        if topic.has_clouds and of_log.path is not None:
+            found = evidence_of_clouds(log, topic, of_log.path, parent, child)
+            sensor = sensor.model_copy(update={"unit_m": found.unit_m if found.unit_m != 1.0 else None})
+            solved, words = (found.role, f"; {found}") if solved is None else (solved, words)
+        sensors[name] = sensor
+        notes.append(f"sensor {name}: {topic.count} {'clouds' if topic.has_clouds else 'depth images'} in {topic.name}")
+    carriers, remarks["carriers", "poses"] = _carriers(pair, solved, words, of_log.origin)
+    carriers = carriers.model_copy(update={"noise": None})  # clouds state theirs, so residuals tell it
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets={OBJECT: ObjectTarget(type="object")})
+    return first_rig_text("log", log.files[0].path.name, rig, remarks), tuple(notes)
 
 
 def _text(log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Camera], notes: list[str]) -> str:
@@ -107,7 +161,8 @@ def _text(log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Came
     if of_log.roles.images:
         notes.append(of_log.roles.in_words(parent, child))
     take_sizes(targets, remarks, of_log.roles.sizes)
-    carriers, remarks["carriers", "poses"] = _carriers(pair, of_log.roles, of_log.origin)
+    words = f"; {of_log.roles.in_words(parent, child)}" if of_log.roles.images else ""
+    carriers, remarks["carriers", "poses"] = _carriers(pair, of_log.roles.role, words, of_log.origin)
     notes.append(f"poses: {of_log.origin.words}")
     if carriers.noise is not None:
         remarks["carriers", "noise"] = (
@@ -118,15 +173,14 @@ def _text(log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Came
     return first_rig_text("log", log.files[0].path.name, rig, remarks)
 
 
-def _carriers(pair: MovingPair, roles: RoleEvidence, origin: Origin) -> tuple[Carriers, str]:
+def _carriers(pair: MovingPair, solved: Role | None, words: str, origin: Origin) -> tuple[Carriers, str]:
+    """Carriers by tf, else as the data are ``solved``, with the comment; ``words`` are of the evidence in the data."""
     parent, child = pair.source.parent_and_child
-    solved = roles.role
     of_tf = "parent" if pair.on_parent > pair.on_child else "child" if pair.on_child else None
     role = of_tf or solved or "child"
     sensors, targets = (parent, child) if role == "parent" else (child, parent)
-    words = f"; {roles.in_words(parent, child)}" if roles.images else ""
     if of_tf is not None and solved not in (of_tf, None):
-        remark = f"TODO {sensors} carries the sensors, as tf has it, but the images say the reverse{words}"
+        remark = f"TODO {sensors} carries the sensors, as tf has it, but the data say the reverse{words}"
     elif of_tf is not None:
         remark = f"{sensors} carries the sensors, as tf has it{words}"
     elif solved is not None:
@@ -155,9 +209,8 @@ def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
         cameras.append(_Camera(name, section, source.frame, remark))
         return name
 
-    missing = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
     for images in _without_copies(contents, notes):
-        name = add(images, "images", len(contents.images), missing)
+        name = add(images, "images", len(contents.images), MISSING)
         notes.append(f"camera {name}: {images.count} images in {images.topic}, {images.looked_at} looked at")
     with_images = {camera.frame for camera in cameras if camera.frame}
     for driver in contents.drivers.values():

@@ -243,7 +243,7 @@ def test_frames_that_a_rig_file_cannot_name(scene: Scene) -> None:
 
 def test_nothing_to_see(scene: Scene) -> None:
     scene.moving("base", "hand").calibration("/cam/info", "cam")
-    with pytest.raises(RigError, match=r"run\.mcap, .*no images and no detections.*topics: /cam/info \(foxg"):
+    with pytest.raises(RigError, match=r"run\.mcap, .*no images, clouds or detections.*topics: /cam/info \(foxg"):
         scene.first()
 
 

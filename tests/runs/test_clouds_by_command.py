@@ -114,12 +114,27 @@ def test_how_poses_are_read_is_found_and_no_rig_file_is_needed(folder: Path, out
     np.testing.assert_allclose(sensor(tmp_path / "out"), sensor(out), atol=1e-4)
 
 
+@pytest.fixture(scope="module")
+def log(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    run("convert", folder, "--rig", folder / "rig.yaml", "-o", path, status=0)
+    return path
+
+
+def test_init_writes_a_rig_file_for_clouds_of_a_log(log: Path, tmp_path: Path) -> None:
+    said = run("init", log, "-o", tmp_path / "rig.yaml", status=0)
+    assert "clouds in clouds" in said
+    rig = rw.rig.read_rig(tmp_path / "rig.yaml")
+    assert (rig.carriers.sensors, rig.carriers.targets) == ("flange", "base")
+    (section,) = rig.sensors.values()
+    assert section.clouds == "clouds"
+    assert rig.object == "object"
+    text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
+    assert "misfit of the clouds with the sensor" in text
+
+
 @pytest.mark.slow
-def test_a_log_of_the_folder_and_its_stages_give_the_same_to_the_last_bit(
-    folder: Path, out: Path, tmp_path: Path
-) -> None:
-    log = tmp_path / "run.mcap"
-    run("convert", folder, "--rig", folder / "rig.yaml", "-o", log, status=0)
+def test_a_log_of_the_folder_and_its_stages_give_the_same_to_the_last_bit(log: Path, out: Path, tmp_path: Path) -> None:
     text = re.sub(r"poses: \{.*\}", "poses: {tf: [base, flange]}", RIG).replace(", poses: poses.txt", "")
     (tmp_path / "log.yaml").write_text(text, encoding="utf-8")
     run("calibrate", log, "--rig", tmp_path / "log.yaml", "-o", tmp_path / "out", "--images")
@@ -241,3 +256,9 @@ def test_depth_images_are_clouds(made: SimulatedClouds, tmp_path: Path) -> None:
     degrees, mm = off(sensor(tmp_path / "out"), made.T_sensorcarrier_sensor)
     assert degrees < 0.1  # pixels are a millimetre wide
     assert mm < 0.5
+    run("convert", tmp_path, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "run.mcap", status=0)
+    said = run("init", tmp_path / "run.mcap", "-o", tmp_path / "log.yaml", status=0)
+    assert f"{VIEWS} depth images in depth" in said
+    proposed = (tmp_path / "log.yaml").read_text(encoding="utf-8")
+    assert "clouds: depth" in proposed
+    assert "TODO no topic has them" in proposed
