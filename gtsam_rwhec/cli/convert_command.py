@@ -72,8 +72,9 @@ def convert(
                     "carriers.poses: {frames: [parent, child]}. Leave --rig out for a bag"
                 )
             images, number = rw.runs.write_folder_log(source, described, output, progress=stage)
+            what = "images" if any(sensor.images is not None for sensor in described.sensors.values()) else "clouds"
             say(
-                f"Written to {shown_path(output)}: {images} images and {number} poses.\n"
+                f"Written to {shown_path(output)}: {images} {what} and {number} poses.\n"
                 f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
             )
             return ExitStatus.DONE

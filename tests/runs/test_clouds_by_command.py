@@ -117,7 +117,8 @@ def test_how_poses_are_read_is_found_and_no_rig_file_is_needed(folder: Path, out
 @pytest.fixture(scope="module")
 def log(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("log") / "run.mcap"
-    run("convert", folder, "--rig", folder / "rig.yaml", "-o", path, status=0)
+    said = run("convert", folder, "--rig", folder / "rig.yaml", "-o", path, status=0)
+    assert f"{VIEWS} clouds and {VIEWS} poses" in said
     return path
 
 
