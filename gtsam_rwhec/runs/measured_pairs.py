@@ -220,8 +220,8 @@ def problem_of(
     if noise != "estimate" and noise.rotation_deg is not None and noise.translation_mm is not None:
         stated = {"sigma": 1e-3 * noise.translation_mm, "kappa": 1.0 / (2.0 * np.radians(noise.rotation_deg) ** 2)}
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
-    if rig.odometries and not has_covariances and noise == "estimate":
-        stated = BEFORE_ESTIMATE  # motions have weights, beside which measurements without any are lost
+    if (rig.odometries or rig.object) and not has_covariances and noise == "estimate":
+        stated = BEFORE_ESTIMATE  # motions and clouds have weights, beside which measurements without any are lost
     for pair, measured in pairs.items():
         used = measured.used
         if not used.any():
@@ -236,8 +236,8 @@ def problem_of(
                 source="the cleaned log",
             )
             continue
-        weights = stated
-        if not stated and has_covariances:
+        weights, is_of_clouds = stated, pair.target == rig.object
+        if is_of_clouds or (not stated and has_covariances):  # clouds slide on each other, whatever the rig file states
             assert measured.covariance is not None
             weights = {"covariances": measured.covariance[used]}
         elif not stated and noise != "estimate":
@@ -252,7 +252,7 @@ def problem_of(
                 measured.B[used],
                 stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
                 source="the cleaned log",
-                directional=pair.target == rig.object and "covariances" in weights,  # clouds slide on each other
+                directional=is_of_clouds,
                 **weights,  # type: ignore[arg-type]
             )
         except NoiseError as error:

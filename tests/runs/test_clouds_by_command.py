@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.runs import cloud_detections
+from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
 from gtsam_rwhec.simulate.simulated_clouds import SimulatedClouds, clouds_of_thing
 
 COMMAND = Path(sys.executable).with_name("gtsam-rwhec")
@@ -132,6 +133,13 @@ def test_init_writes_a_rig_file_for_clouds_of_a_log(log: Path, tmp_path: Path) -
     assert rig.object == "object"
     text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
     assert "misfit of the clouds with the sensor" in text
+
+
+def test_clouds_keep_their_weights_where_the_rig_file_states_noise(out: Path) -> None:
+    rig = rw.rig.parse_rig(RIG + "noise: {rotation_deg: 0.1, translation_mm: 1.0}\n", "rig.yaml")
+    with rw.logs.open_log(out / "calibration.mcap") as kept:
+        pairs = read_pairs(kept, rig)
+    assert problem_of(pairs, rig, {"camera": 0.0}).directed == frozenset(pairs)
 
 
 @pytest.mark.slow
