@@ -20,7 +20,6 @@ from gtsam_rwhec.fleet.topic_copy import local_copy_of_topics
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig.odometry_sections import OdometrySensor
 from gtsam_rwhec.rig.sections import Sensor
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, read_carrier_motion
 from gtsam_rwhec.runs.cleaning_stage import clean_log
@@ -71,7 +70,7 @@ def map_log(task: LogTask, output: str) -> Receipt:
 def _partial(task: LogTask, folder: Path) -> PartialResult:
     """The partial result of a log. Messages about the worker's files name the log instead."""
     rig = task.rig.rig(folder)
-    _refuse_odometry(rig)
+    _refuse_odometry_and_clouds(rig)
     detected, cleaned = folder / DETECTED_LOG, folder / CALIBRATION_LOG
     places = [str(detected), str(cleaned)]
 
@@ -102,13 +101,18 @@ def _partial(task: LogTask, folder: Path) -> PartialResult:
     return replace(partial, facts=partial.facts.model_copy(update={"warnings": list(said)}))
 
 
-def _refuse_odometry(rig: Rig) -> None:
-    """A RigError for sensors that know only their own motion: partial results have no place for their motions."""
-    names = [name for name, sensor in rig.sensors.items() if isinstance(sensor, OdometrySensor)]
+def _refuse_odometry_and_clouds(rig: Rig) -> None:
+    """A RigError for what partial results have no place for: motions, and an object, whose frame each log makes."""
+    names = list(rig.odometries)
     if names:
         raise RigError(
             f"{rig.source.place(('sensors', names[0]))}: {names[0]} knows only its own motion, and a fleet's partial "
             "results have no motions: leave it out of the fleet's rig file, or run gtsam-rwhec calibrate on each log"
+        )
+    if rig.object is not None:
+        raise RigError(
+            f"{rig.source.place(('targets', rig.object))}: {rig.object} is an object in clouds, whose frame is another "
+            "in each log: leave it out of the fleet's rig file, or run gtsam-rwhec calibrate on each log"
         )
 
 

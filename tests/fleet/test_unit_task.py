@@ -55,13 +55,20 @@ def test_a_camera_that_moved_between_logs_is_said(tmp_path: Path) -> None:
     assert still.verdict is rw.Verdict.USE
 
 
-def test_a_robot_with_an_odometry_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("sensor", "target", "named"),
+    [
+        ("wheels: {odometry: {topic: /odom}}", "", "wheels knows only its own motion"),
+        ("lidar: {clouds: /points}", "  thing: {type: object}\n", "thing is an object in clouds"),
+    ],
+)
+def test_a_robot_with_what_a_fleet_cannot_join_is_refused(sensor: str, target: str, named: str, tmp_path: Path) -> None:
     made = write_fleet(tmp_path, 1, 1, images=8, tags=1)
     rig = Path(made.rig)
-    text = rig.read_text(encoding="utf-8").replace("targets:\n", "  wheels: {odometry: {topic: /odom}}\ntargets:\n")
-    rig.write_text(text.replace("  targets: base", "  targets: base", 1), encoding="utf-8")
+    text = rig.read_text(encoding="utf-8").replace("targets:\n", f"  {sensor}\ntargets:\n{target}")
+    rig.write_text(text, encoding="utf-8")
     (row,) = fleet.run(fleet.read_manifest(made.manifest), str(tmp_path / "out")).rows
-    assert "wheels" in str(row.failure)
+    assert named in str(row.failure)
 
 
 LOGS = ("monday.mcap", "tuesday.mcap", "wednesday.mcap")
