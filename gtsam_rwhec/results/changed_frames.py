@@ -139,7 +139,8 @@ def difference(
     first, second = (as_result(each) for each in (old, new))
     check_same_rig(first, second)
     answers = [each.refined or each.solution for each in (first, second)]
-    movements = movements_of(*answers)
+    made_anew = objects_of(first, second)
+    movements = {name: moved for name, moved in movements_of(*answers).items() if name not in made_anew}
     unknown = [name for name in frames if name not in movements]
     if unknown:
         raise FrameError(
@@ -155,8 +156,10 @@ def difference(
     if same_arm:
         counted = without_constant_errors(first), without_constant_errors(second)
     common = quantities(*counted, without)
+    common = common.only(lambda unknown: unknown.owner not in made_anew)
     numbers = _numbers(first.refined, second.refined, common)
     not_compared = {str(unknown): why for unknown, why in common.not_compared.items()}
+    not_compared |= dict.fromkeys(sorted(made_anew), MADE_ANEW)
     if all(abs(common.difference) <= SAME) and all(abs(moved.xi).max() <= SAME for moved in movements.values()):
         return Difference(movements, numbers, None, "", not_compared, tuple(remarks), is_same=True)
     if same_measurements or is_of_the_same_measurements(first, second):
@@ -179,6 +182,16 @@ def difference(
         "stated lens, make alarms rarer than the level says"
     )
     return Difference(movements, numbers, test, "", not_compared, tuple(remarks))
+
+
+#: Why the frame of an object is not compared.
+MADE_ANEW = "its frame is made anew of each log's clouds"
+
+
+def objects_of(*results: Result) -> frozenset[str]:
+    """The targets that are objects in clouds."""
+    logs = (result.log for result in results)
+    return frozenset(each.target for log in logs if log is not None for each in log.detection.objects)
 
 
 def movements_of(old: Solution | RefinedPoses, new: Solution | RefinedPoses) -> dict[str, Movement]:

@@ -21,9 +21,11 @@ from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.change_test import LEVEL, ChangeTest, change_test, checked_level
 from gtsam_rwhec.results.changed_frames import (
+    MADE_ANEW,
     as_result,
     movement_words,
     movements_of,
+    objects_of,
     share_words,
     without_constant_errors,
 )
@@ -236,7 +238,7 @@ def verify(
             "the old calibration has no covariances, because it was not refined, so nothing can be tested; calibrate "
             "with rw.calibrate or gtsam-rwhec calibrate"
         )
-    refined = without_constant_errors(result)
+    refined, made_anew = without_constant_errors(result), objects_of(result)
     problem.require_pairs()
     problem.require_raw_measurements("verify")
     stated = stated_as(refined, problem)
@@ -252,25 +254,28 @@ def verify(
     try:
         found = near(refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress)
         common = quantities(refined, found.refined, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
+        common = common.only(lambda unknown: unknown.owner not in made_anew)
         if targets_may_move:
             common = common.only(lambda unknown: unknown.owner in refined.Y)
         if not common.slots:
             said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
             raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
     except (UnderdeterminedError, CountError) as error:
-        far = {} if targets_may_move else far_off(result, refined, stated)
+        far = {} if targets_may_move or made_anew else far_off(result, refined, stated)
         if not far:
             raise
         return Verification(None, {}, far, _unseen(refined, stated, targets_may_move), targets_may_move, (str(error),))
     not_checked = _unseen(refined, stated, targets_may_move) | in_words(common)
+    not_checked |= dict.fromkeys(sorted(made_anew), MADE_ANEW)
     test = change_test(
         common.difference, common.covariances, common.free, common.groups,
         (refined.degrees_of_freedom, found.degrees_of_freedom), level,
     )  # fmt: skip
-    checks = checks_of(result, refined, found, stated, carrier_path)
+    # An object's old pose predicts nothing of a new one.
+    checks = {} if made_anew else checks_of(result, refined, found, stated, carrier_path)
     return Verification(
         test=test,
-        movements=movements_of(refined, found.refined),
+        movements={name: m for name, m in movements_of(refined, found.refined).items() if name not in made_anew},
         sensors=checks,
         not_checked=not_checked,
         targets_may_move=targets_may_move,

@@ -7,16 +7,19 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.clouds import seen_object
 from gtsam_rwhec.runs import cloud_detections
 from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
 from gtsam_rwhec.simulate.simulated_clouds import SimulatedClouds, clouds_of_thing
@@ -133,6 +136,19 @@ def test_init_writes_a_rig_file_for_clouds_of_a_log(log: Path, tmp_path: Path) -
     assert rig.object == "object"
     text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
     assert "misfit of the clouds with the sensor" in text
+
+
+def test_another_frame_of_the_thing_is_no_change(out: Path, made: SimulatedClouds) -> None:
+    old = rw.results.read_result(out / "result.json")
+    elsewhere = {"thing": gtsam.Pose3(old.refined.X["thing"].matrix() @ se3.pose(np.eye(3), [0.3, 0.0, 0.0]))}
+    found = rw.results.difference(old, replace(old, refined=replace(old.refined, X=elsewhere)))
+    assert set(found.movements) == {"camera"}
+    assert "clouds" in found.not_compared["thing"]
+    problem = rw.Problem()
+    seen_object([replace(c, points=c.points[::2]) for c in made.clouds], made.A).add_to(problem, "thing", "camera")
+    again = rw.results.verify(old, problem)
+    assert again.holds
+    assert set(again.movements) == {"camera"}
 
 
 def test_clouds_keep_their_weights_where_the_rig_file_states_noise(out: Path) -> None:
