@@ -29,6 +29,8 @@ SHARED_BY_VIEWS = (0.4, 0.5)
 SIGNIFICANT = 4.0
 #: And if it is at least this share of the largest: surfaces are round or flat to no better, as sensors see them.
 LEAST_SHARE = 1e-3
+#: Points that are nearer to each other than this, m, are in one place.
+ONE_PLACE = 1e-6
 #: A direction slides if its deviation is more than this share of the thing's size: nothing of it was measured.
 SLIDING_SHARE = 0.3
 
@@ -120,9 +122,12 @@ class Known:
 def units(points: Array) -> tuple[Array, float]:
     """The perturbation (6, 6) that a unit in each direction is, and the size of points (m, 3) in metres.
 
-    About the points' centre, and with turns in units of their size, turns and shifts move points alike.
+    About the points' centre, and with turns in units of their size, turns and shifts move points alike. Points in one
+    place have no size, and count as one metre, beside which they tell nothing.
     """
     size = float(np.sqrt(points.var(axis=0).sum()))
+    if size < ONE_PLACE:
+        size = 1.0
     result = np.eye(6)
     result[:3, :3] /= size
     result[3:, :3] = se3.hat(points.mean(axis=0)) / size

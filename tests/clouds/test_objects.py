@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from robot_clouds import views_of
 from rwhec_factors import se3
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, ViewFault, seen_object
+from gtsam_rwhec.clouds.point_to_plane import known, matches
+from gtsam_rwhec.clouds.surfaces import Features, Surface
 from gtsam_rwhec.errors import CloudError, PoseError
 from gtsam_rwhec.problem.directions import Weighing
 from gtsam_rwhec.simulate import Noise, SimulatedClouds, clouds_of_thing
@@ -133,6 +137,25 @@ def test_a_thing_that_moved_and_stayed_is_an_error(bust: SimulatedClouds) -> Non
     A[5:] = A[5:] @ se3.pose(np.eye(3), [0.010, 0.0, 0.010])
     with pytest.raises(CloudError, match=r"the thing moved by 1\d\.\d mm before view 5 .*, and stayed"):
         seen_object(bust.clouds, A)
+
+
+def test_one_point_that_matches_tells_nothing() -> None:
+    def features(points: np.ndarray, normals: np.ndarray) -> Features:
+        return Features(points, normals, cKDTree(points))
+
+    far, z = np.array([[9.0, 9.0, 9.0]]), np.array([[0.0, 0.0, 1.0]])
+    one = Surface("one", features(np.zeros((1, 3)), z), features(far, z), None, None)
+    found = matches(one, one, np.eye(4), 0.01)
+    tell = known(
+        replace(
+            found,
+            kind=found.kind[:1],
+            **{name: getattr(found, name)[:1] for name in ("points", "residuals", "rows", "own_rows", "at")},
+        ),
+        np.array([1e-4, 1e-4]),
+    )
+    assert np.isfinite(tell.covariance).all()
+    assert (np.linalg.eigvalsh(tell.covariance) > 1.0).all()
 
 
 def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
