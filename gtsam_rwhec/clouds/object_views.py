@@ -87,6 +87,7 @@ class SeenObject:
             directional=True,
             source="clouds",
         )
+        problem.spacings[target] = self.spacing_m
 
 
 def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> SeenObject:

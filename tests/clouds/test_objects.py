@@ -64,7 +64,11 @@ def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
 @pytest.mark.parametrize("shape", ["bust", "cube"])
 def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: str) -> None:
     views = clouds_of_thing(shape, 9, 1)
-    _, Y, _ = answer(views.clouds, views.A)
+    calibration, Y, _ = answer(views.clouds, views.A)
+    # No residual shows what all views are off by together, and points are 2 mm apart.
+    assert calibration.verdict is rw.Verdict.CARE
+    assert rw.Ground.COVARIANCE_DOUBTED in calibration.judgement.grounds
+    assert "mm apart" in calibration.judgement.reason
     error = apart(views.T_sensorcarrier_sensor, Y)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.02
     assert np.linalg.norm(Y[:3, 3] - views.T_sensorcarrier_sensor[:3, 3]) < 1e-4
