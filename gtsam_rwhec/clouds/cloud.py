@@ -63,6 +63,8 @@ class Cloud:
             raise CloudError(f"{where}: points have shape {given.shape}; give (N, 3) or (rows, columns, 3), metres")
         shape = (given.shape[0], given.shape[1]) if given.ndim == 3 else None
         flat = given.reshape(-1, 3)
+        if not len(flat):
+            raise CloudError(f"{where} has no points; look whether the sensor measured")
         seen = np.isfinite(flat).all(axis=1) & (flat != 0.0).any(axis=1)
         if not seen.any():
             raise CloudError(

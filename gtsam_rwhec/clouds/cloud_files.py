@@ -114,17 +114,19 @@ def _by_name(table: np.ndarray) -> dict[str, np.ndarray]:
 
 def _text_table(text: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
     """Lines of numbers as a table of fields."""
+    if not count:
+        return np.zeros(0, dtype)
     if count * 2 > len(text):  # a number and a blank at least
         raise CloudError(f"{path} is cut: {count} points, and {len(text)} bytes of text")
     widths = [int(prod(dtype[name].shape)) for name in dtype.names or ()]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of no lines at all, which the next line says
         try:
-            numbers = np.loadtxt(io.BytesIO(text), np.float64, max_rows=count, ndmin=2) if count else np.empty((0, 1))
+            numbers = np.loadtxt(io.BytesIO(text), np.float64, max_rows=count, ndmin=2)
         except ValueError as error:
             words = f"{path} is cut, or has other lines than {count} of {sum(widths)} numbers: {brief(str(error), 200)}"
             raise CloudError(words) from error
-    if len(numbers) < count or (count and numbers.shape[1] < sum(widths)):
+    if len(numbers) < count or numbers.shape[1] < sum(widths):
         raise CloudError(
             f"{path} is cut: {count} points of {sum(widths)} numbers, and there are {len(numbers)} lines of "
             f"{numbers.shape[1]}"

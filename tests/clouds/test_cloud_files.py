@@ -177,6 +177,8 @@ def test_bad_input_in_words(tmp_path: Path) -> None:
     refused(tmp_path / "b.npy", jpeg, "cannot be read as NPY")
     refused(tmp_path / "b.npz", jpeg, "is no .npz file")
     refused(tmp_path / "c.pcd", pcd(points * np.nan, "binary"), "of 20 points none is seen")
+    for how in ("ascii", "binary"):
+        refused(tmp_path / "c.pcd", pcd(points[:0], how), "c.pcd has no points")
     refused(tmp_path / "c.ply", ply(points * 0.0, "ascii"), "none is seen")
     refused(tmp_path / "d.pcd", pcd(points, "binary").replace(b"x y z", b"x y w"), "no field z; it has x, y, w")
     refused(tmp_path / "d.ply", ply(points, "ascii").replace(b"element vertex", b"element corner"), "no element vertex")
