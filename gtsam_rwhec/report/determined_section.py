@@ -22,7 +22,7 @@ from gtsam_rwhec.report.report_blocks import (
 )
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
-from gtsam_rwhec.solver.free_directions import FreeReason
+from gtsam_rwhec.solver.free_directions import FreeReason, all_slide
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10
@@ -115,7 +115,8 @@ def _grid(shown: ShownResult) -> Iterator[Block]:
     def cell(target: str, sensor: str) -> Words:
         pair = Pair(target, sensor)
         found = alone.get(pair)
-        sign = NOT_OBSERVED if found is None else DETERMINED if found.is_unique else NOT_DETERMINED
+        is_known = found is not None and all_slide(found.free_directions)
+        sign = NOT_OBSERVED if found is None else DETERMINED if is_known else NOT_DETERMINED
         return (f"{sign}{TOGETHER}", *counts[pair]) if pair in counts else sign
 
     by_targets = len(targets) > MOST_COLUMNS and len(targets) > len(sensors)

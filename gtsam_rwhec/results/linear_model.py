@@ -22,6 +22,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import PairNoise
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.directions import SLIDES, scaled
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 
@@ -144,14 +145,21 @@ def _places(where: slice | None, dimension: int) -> np.ndarray:
 
 
 def _noise_of_B(of: MeasuredRows, typical: PairNoise) -> Array:
-    """B's covariances (N, 6, 6): as stated, so that the median measurement of the pair has the noise that was found."""
+    """B's covariances (N, 6, 6): as stated, so that the median measurement of the pair has the noise that was found.
+
+    What slides is no noise, and stays.
+    """
     if of.covariance is None:
         return np.tile(np.diag(np.repeat([typical.rotation_rad**2, typical.translation_m**2], 3)), (len(of.A), 1, 1))
-    mean = np.einsum("nii->ni", of.covariance).reshape(-1, 2, 3).mean(axis=2)
+    slides = np.zeros_like(of.covariance)
+    if np.einsum("nii->n", of.covariance).max(initial=0.0) >= SLIDES:
+        variances, along = np.linalg.eigh(of.covariance)
+        slides = (along * np.where(variances >= SLIDES, variances, 0.0)[:, None, :]) @ along.transpose(0, 2, 1)
+    mean = np.einsum("nii->ni", of.covariance - slides).reshape(-1, 2, 3).mean(axis=2)
     usual = np.median(mean[of.used] if of.used.any() else mean, axis=0)
-    factor = np.repeat(np.array([typical.rotation_rad, typical.translation_m]) / np.sqrt(usual), 3)
-    scaled: Array = of.covariance * factor[:, None] * factor
-    return scaled
+    found = np.array([typical.rotation_rad, typical.translation_m])
+    factor = np.where((usual > 0.0) & (found > 0.0), found / np.sqrt(np.maximum(usual, 1e-300)), 1.0)
+    return scaled(of.covariance, slides, np.repeat(factor, 3))
 
 
 def derivatives(P: Array, scale: float = 1.0) -> Array:

@@ -124,6 +124,7 @@ class PairsAlone:
     turned_rad: Array  #: (E,): root mean square of A's turning
     residual_rad: Array  #: (E,): root mean square of the rotation residuals
     length: float  #: metres that count as one radian
+    sliding: frozenset[str] = frozenset()  #: targets that slide
 
     @staticmethod
     def of(
@@ -212,7 +213,15 @@ class PairsAlone:
         ends = {name: 7 * end for end, name in enumerate(self.pairs[e]) if self.ends[e, end] < len(self.free)}
         rows = [first + k for first in ends.values() for k in range(7)] + [14]
         reasons = dict.fromkeys(ends, self.reason(e))
-        return free_directions_of(tuple(ends), sparse_basis(directions[rows], self.length), self.length, reasons)
+        found = free_directions_of(tuple(ends), sparse_basis(directions[rows], self.length), self.length, reasons)
+        return _that_slide(found, self.sliding)
+
+
+def _that_slide(free: tuple[FreeDirection, ...], sliding: frozenset[str]) -> tuple[FreeDirection, ...]:
+    """The directions, with the reason of those that are of sliding targets alone."""
+    return tuple(
+        replace(one, reason=FreeReason.SLIDES) if sliding.issuperset(one.frames) and one.frames else one for one in free
+    )
 
 
 def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
@@ -290,16 +299,14 @@ def identify_with_basis(
     weak = _weakest_of_part(part, told, noise)
     basis = sparse_basis(weak.directions[:, weak.free], alone.length)
     free = free_directions_of(part.free, basis, alone.length, alone.reasons_of_frames() if basis.shape[1] else {})
-    sliding = {part.pairs[each.e].target for each in part.directed if each.slides} & frozenset(part.targets)
-    free = tuple(
-        replace(one, reason=FreeReason.SLIDES) if sliding.issuperset(one.frames) and one.frames else one for one in free
-    )
+    sliding = frozenset(part.pairs[each.e].target for each in part.directed if each.slides) & frozenset(part.targets)
+    free = _that_slide(free, sliding)
     known = Identifiability(
         is_unique=not free,
         free_directions=free,
         weakest=float(weak.values[0]) if len(weak.values) else np.inf,
         threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
-        pairs=PairVerdicts([alone]),
+        pairs=PairVerdicts([replace(alone, sliding=sliding)]),
         parts=(part.names,),
     )
     return known, basis

@@ -18,6 +18,7 @@ from gtsam_rwhec.clouds.point_to_plane import known, matches
 from gtsam_rwhec.clouds.surfaces import Features, Surface
 from gtsam_rwhec.errors import CloudError, PoseError
 from gtsam_rwhec.problem.directions import Weighing
+from gtsam_rwhec.results.linear_model import LinearModel, measured_rows
 from gtsam_rwhec.simulate import Noise, SimulatedClouds, clouds_of_thing
 from gtsam_rwhec.simulate.simulated_clouds import seen_points, thing
 from gtsam_rwhec.solver.free_directions import FreeReason
@@ -52,6 +53,11 @@ def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
     of_ball = answers["Sphere"][0].refined
     assert np.isinf(np.diag(of_ball.covariance("thing"))[:3]).all()
     assert {one.reason for one in of_ball.free_directions} == {FreeReason.SLIDES}
+    (alone,) = of_ball.solution.identifiability.pairs.values()
+    assert {one.reason for one in alone.free_directions} == {FreeReason.SLIDES}
+    of_sphere = answers["Sphere"][0]
+    model = LinearModel.of(measured_rows(of_sphere.problem, of_sphere), of_sphere)
+    assert np.sqrt((model.whitened()[0] ** 2).mean()) < 3.0  # what slides is no residual
     difference = apart(David, Plane)
     assert np.linalg.norm(David[:3, 3] - Plane[:3, 3]) < 1.5e-3
     assert np.degrees(np.linalg.norm(difference[:3])) < 0.35
