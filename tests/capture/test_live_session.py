@@ -111,6 +111,7 @@ def test_it_takes_by_itself_where_the_robot_stands_still_and_saves_what_calibrat
     assert "0.001 mm at 0.8 m" in session.answer.decision.words
 
 
+@pytest.mark.slow
 def test_it_takes_no_more_by_itself_where_the_wanted_accuracy_is_reached(tmp_path: Path) -> None:
     log = write(tmp_path / "stations.mcap", stations(8))
     rig_file = rig()

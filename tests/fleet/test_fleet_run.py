@@ -105,7 +105,7 @@ def test_who_does_what_when_changes_no_bit(made: MadeFleet, first: tuple[str, fl
             assert one.T.tobytes() == other.T.tobytes()
 
 
-def test_a_calibration_of_each_night_or_log(made: MadeFleet, first: tuple[str, fleet.FleetRun]) -> None:
+def test_a_calibration_of_each_night(made: MadeFleet, first: tuple[str, fleet.FleetRun]) -> None:
     output, _ = first
     manifest = fleet.read_manifest(made.manifest)
     nights = fleet.run(manifest, output, "day")
@@ -118,7 +118,11 @@ def test_a_calibration_of_each_night_or_log(made: MadeFleet, first: tuple[str, f
         ("hall@2026-11-01", True),
         ("hall@2026-11-02", True),
     ]
-    alone = fleet.run(manifest, output, "log")
+
+
+@pytest.mark.slow
+def test_a_calibration_of_each_log(made: MadeFleet, first: tuple[str, fleet.FleetRun]) -> None:
+    alone = fleet.run(fleet.read_manifest(made.manifest), first[0], "log")
     assert [row.unit for row in alone.rows if row.failure is None] == [
         "robot_000@night_00",
         "robot_001@night_00",

@@ -221,7 +221,7 @@ def test_bad_clouds_are_named_and_the_others_used(folder: Path, made: SimulatedC
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("clouds in millimetres", r"millimetres"),
+        pytest.param("clouds in millimetres", r"millimetres", marks=pytest.mark.slow),
         ("empty", r"none of the 8 clouds of camera can be used; the first: .*view3\.npy"),
     ],
 )

@@ -84,6 +84,7 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_l
 
 
 @pytest.mark.filterwarnings("ignore:.*poses have no image")
+@pytest.mark.slow
 def test_two_sensors_with_one_camera_have_one_set_of_intrinsics(workcell_camera2: Path, tmp_path: Path) -> None:
     """The same images stand for two cameras that share intrinsics; one of another size is refused by name."""
     for name in ("left", "right"):
