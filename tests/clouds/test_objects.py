@@ -70,7 +70,7 @@ def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
 @pytest.mark.parametrize("shape", ["bust", "cube"])
 def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: str) -> None:
     views = clouds_of_thing(shape, 9, 1)
-    calibration, Y, _ = answer(views.clouds, views.A)
+    calibration, Y, covariance = answer(views.clouds, views.A)
     # No residual shows what all views are off by together, and points are 2 mm apart.
     assert calibration.verdict is rw.Verdict.CARE
     assert rw.Ground.COVARIANCE_DOUBTED in calibration.judgement.grounds
@@ -78,6 +78,7 @@ def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: str) ->
     error = apart(views.T_sensorcarrier_sensor, Y)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.02
     assert np.linalg.norm(Y[:3, 3] - views.T_sensorcarrier_sensor[:3, 3]) < 1e-4
+    assert error @ np.linalg.solve(covariance, error) < 22.5  # 99.9 %
 
 
 @pytest.mark.parametrize(("shape", "slides"), [("sphere", 3), ("cylinder", 2), ("bust", 0)])

@@ -24,7 +24,7 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.problem.directions import SLIDES, aligned, motions_of_slides, with_common_slides
 from gtsam_rwhec.problem.measurements import Pair
-from gtsam_rwhec.problem.selection import aligned_at
+from gtsam_rwhec.problem.selection import VarianceFactors, aligned_at, reweighted
 from gtsam_rwhec.solver.answers import PairPoses, given_answer, parts_about
 from gtsam_rwhec.solver.part_form import PartForm
 
@@ -312,3 +312,15 @@ def test_what_slides_in_all_views_is_one_motion(thing: str) -> None:
         variances, along = np.linalg.eigh(covariance)
         assert same_span(along[:, variances > SLIDES], slides)
         assert np.allclose(variances[variances < SLIDES], 1e-10, rtol=0.2)
+
+
+@pytest.mark.parametrize("thing", ["sphere", "cylinder", "plane"])
+def test_factors_of_the_noise_leave_what_slides_alone(thing: str) -> None:
+    slides = np.linalg.qr(SLIDING[thing])[0]
+    covariance = 1e-10 * np.eye(6) + 4.0 * SLIDES * slides @ slides.T
+    problem = rw.Problem()
+    problem.add("thing", "camera", np.eye(4)[None], np.eye(4)[None], covariances=covariance[None], directional=True)
+    (scaled,) = reweighted(problem, {}, VarianceFactors(0.01, 0.01)).measurements("thing", "camera").covariances
+    variances, along = np.linalg.eigh(scaled)
+    assert same_span(along[:, variances > SLIDES], slides)
+    assert variances[variances < SLIDES] == pytest.approx(1e-12, rel=1e-2)
