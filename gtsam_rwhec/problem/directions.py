@@ -273,17 +273,21 @@ def slides_of(raw: Measurements) -> Array | None:
         mine = raw.is_of(kind)
         slides[mine] = np.where(UNSEEN[kind], np.einsum("nii->ni", raw.covariances[mine]), 0.0)[:, :, None] * np.eye(6)
     other = raw.is_of(Kind.DIRECTIONAL)
-    variances, along = np.linalg.eigh(raw.covariances[other])
+    slides[other] = sliding_part(raw.covariances[other])
+    return slides
+
+
+def sliding_part(covariances: Array) -> Array:
+    """The part of covariances (N, 6, 6) that is of directions with a variance of at least ``SLIDES``."""
+    variances, along = np.linalg.eigh(covariances)
     # A difference: what is left of an axis along which all slides is then zero, and not rounding.
     measured = (along * np.where(variances >= SLIDES, 0.0, variances)[:, None, :]) @ along.transpose(0, 2, 1)
-    has = (variances[:, -1] >= SLIDES)[:, None, None]
-    of_other = np.where(has, raw.covariances[other] - measured, 0.0)
+    slides = np.where((variances[:, -1] >= SLIDES)[:, None, None], covariances - measured, 0.0)
     # Where every turn slides, no rounding of it is left to be taken for a measured turn.
-    turns = np.linalg.eigvalsh(of_other[:, :3, :3])[:, 0] > 0.5 * SLIDES
+    turns = np.linalg.eigvalsh(slides[:, :3, :3])[:, 0] > 0.5 * SLIDES
     for rows, columns in ((slice(0, 3), slice(0, 6)), (slice(0, 6), slice(0, 3))):
-        of_other[turns, rows, columns] = raw.covariances[other][turns, rows, columns]
-    slides[other] = of_other
-    return slides
+        slides[turns, rows, columns] = covariances[turns, rows, columns]
+    return np.asarray(slides)
 
 
 def scaled(covariances: Array, slides: Array | None, deviation: Array) -> Array:

@@ -22,7 +22,7 @@ from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import PairNoise
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.directions import SLIDES, scaled
+from gtsam_rwhec.problem.directions import SLIDES, scaled, sliding_part
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 
@@ -153,8 +153,7 @@ def _noise_of_B(of: MeasuredRows, typical: PairNoise) -> Array:
         return np.tile(np.diag(np.repeat([typical.rotation_rad**2, typical.translation_m**2], 3)), (len(of.A), 1, 1))
     slides = np.zeros_like(of.covariance)
     if np.einsum("nii->n", of.covariance).max(initial=0.0) >= SLIDES:
-        variances, along = np.linalg.eigh(of.covariance)
-        slides = (along * np.where(variances >= SLIDES, variances, 0.0)[:, None, :]) @ along.transpose(0, 2, 1)
+        slides = sliding_part(of.covariance)
     mean = np.einsum("nii->ni", of.covariance - slides).reshape(-1, 2, 3).mean(axis=2)
     usual = np.median(mean[of.used] if of.used.any() else mean, axis=0)
     found = np.array([typical.rotation_rad, typical.translation_m])
