@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, SensorView
@@ -22,8 +21,6 @@ from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.free_directions import all_slide
 
-#: What clouds say is doubted from this share of the distance of their points on.
-FINER = 0.25
 #: Of standard deviations, the largest about and along any axis that a pose may have; the second one, metres, is the
 #: median distance of what was seen where that is known.
 MOST_RAD, MOST_M = float(np.radians(30.0)), 1.0
@@ -53,30 +50,6 @@ def of_knowledge(
         ground = Ground.KNOWN_TO_NOTHING if findings else Ground.NOT_UNIQUE
         findings += known_all_the_same(refined, views, ground)
     return [*findings, *_heights(problem, inliers, refined, carriers)]
-
-
-def finer_than_points(problem: Problem, refined: Refined, views: Mapping[str, SensorView]) -> list[Finding]:
-    """The findings: sensors that clouds alone would tell to a small share of the distance of their points.
-
-    Thinned points round where faces meet, and edges lie inside, in all views to one side. No residual shows it: a box
-    was 0.5 mm off with 0.1 to 0.25 mm claimed, by points 2.7 mm apart.
-    """
-    found = []
-    for name, view in views.items():
-        spacings = [problem.spacings.get(pair.target, 0.0) for pair in problem.pairs if pair.sensor == name]
-        if not min(spacings, default=0.0) or name not in refined.Y:
-            continue
-        J = np.hstack([-se3.hat(np.array(view.point_m)), np.eye(3)])
-        covariance = J @ refined.covariance(name) @ J.T
-        deviation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])) if np.isfinite(covariance).all() else np.inf
-        if 2.0 * deviation < FINER * min(spacings):
-            words = (
-                f"{name} would be known to {rounded(2e3 * deviation)} mm where it sees the object, by clouds whose "
-                f"points are {rounded(1e3 * min(spacings))} mm apart, and what all views are off by together is in no "
-                "residual"
-            )
-            found.append(Finding(Ground.COVARIANCE_DOUBTED, words))
-    return found
 
 
 def known_all_the_same(refined: Refined, views: Mapping[str, SensorView], ground: Ground) -> list[Finding]:

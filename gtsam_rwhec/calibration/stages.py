@@ -23,7 +23,7 @@ from gtsam_rwhec.calibration.from_corners import (
     check_observations,
     with_better_poses,
 )
-from gtsam_rwhec.calibration.known_frames import finer_than_points, of_knowledge
+from gtsam_rwhec.calibration.known_frames import of_knowledge
 from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, misread_as_recorded, reading_of
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
@@ -276,7 +276,6 @@ def _calibrated(run: Run) -> Calibration:
     carriers = Carriers(problem.sensor_carrier, problem.target_carrier)
     if refined is not None and reading.finding is None:
         record.findings += of_knowledge(problem, inliers, refined, views, carriers)
-        record.findings += finer_than_points(problem, refined, views)
     return Calibration(
         X={} if best is None else best.X,
         Y={} if best is None else best.Y,

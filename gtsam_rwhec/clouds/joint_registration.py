@@ -9,15 +9,22 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_VIEWS, joined, known, matches, sigmas, units
+from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_GROUPS, SHARED_BY_VIEWS, joined, known, matches, sigmas, units
 from gtsam_rwhec.clouds.registration import Registrations
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.directions import SEEN
 
 #: Times that points are matched anew.
 ROUNDS = 4
 #: Poses that move less than this (share of the spacing, at the thing) have settled.
 SETTLED = 1e-3
+#: Views are loose together where so many times the variance of each among the others is not known.
+LOOSE = 3.0
+#: Rounding, in shares of what each view among the others knows.
+NOTHING = 1e-9
+#: Variances of predicted poses, in those of A: a prior that leaves residuals of A as they are.
+WEAK = 9.0
 #: Huber's constant for six dimensions.
 HUBER = 1.869
 
@@ -41,11 +48,11 @@ def _square_root(information: Array) -> Array:
 
 
 def _solved(
-    start: Array, i: np.ndarray, j: np.ndarray, T_i_j: Array, roots: Array, weak: Array, *, robust: bool
+    predicted: Array, i: np.ndarray, j: np.ndarray, T_i_j: Array, roots: Array, weak: Array, *, robust: bool
 ) -> Array:
-    """Poses of a graph of relative poses, about weak priors at the start."""
+    """Poses of a graph of relative poses and weak priors."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for k, (pose, covariance) in enumerate(zip(start, weak, strict=True)):
+    for k, (pose, covariance) in enumerate(zip(predicted, weak, strict=True)):
         values.insert(k, gtsam.Pose3(pose))
         graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(pose), noise.Gaussian.Covariance(covariance)))
     for a, b, T, root in zip(i, j, T_i_j, roots, strict=True):
@@ -54,18 +61,20 @@ def _solved(
         model = noise.Robust.Create(loss, gaussian) if robust else gaussian
         graph.add(gtsam.BetweenFactorPose3(int(a), int(b), gtsam.Pose3(T), model))
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    return np.array([solved.atPose3(k).matrix() for k in range(len(start))])
+    return np.array([solved.atPose3(k).matrix() for k in range(len(predicted))])
 
 
-def joint_poses(surfaces: Sequence[Surface], predicted: Array, pairs: Registrations, gate_m: float) -> JointPoses:
+def joint_poses(
+    surfaces: Sequence[Surface], predicted: Array, of_A: Array, pairs: Registrations, gate_m: float
+) -> JointPoses:
     """Poses of all views at once.
 
     First a graph of the registrations, in which a wrong one does not count (Huber); then points are matched at the
     poses of the whole, and each pair gives a quadratic of its relative pose (Gauss-Newton), until poses have settled.
-    Directions in which nothing is known stay as predicted (N, 4, 4).
+    Directions in which little is known stay as predicted (N, 4, 4), by A with variances (6,): edges may match wrongly.
     """
     unit = [units(each.faces.points) for each in surfaces]
-    weak = np.array([size**2 * U @ U.T for U, size in unit])
+    weak = np.array([gate_m**2 * U @ U.T for U, _ in unit]) + WEAK * np.diag(of_A)
     roots = np.array([_square_root(each) for each in pairs.information])
     poses = _solved(predicted, pairs.i, pairs.j, pairs.B, roots, weak, robust=True)
     i, j = pairs.i, pairs.j
@@ -77,11 +86,55 @@ def joint_poses(surfaces: Sequence[Surface], predicted: Array, pairs: Registrati
         tell = [known(several[k], sigma_m) for k in at]
         measured = T[at] @ se3.expmap(np.array([each.step for each in tell]))
         roots = np.array([_square_root(each.information) for each in tell])
-        before, poses = poses, _solved(poses, i[at], j[at], measured, roots, weak, robust=False)
+        before, poses = poses, _solved(predicted, i[at], j[at], measured, roots, weak, robust=False)
         moved = np.linalg.solve(np.array([U for U, _ in unit]), se3.logmap(se3.inverse(before) @ poses)[..., None])
         if np.abs(moved).max() < SETTLED * gate_m:
             break
-    return JointPoses(poses, _covariances(surfaces, poses, i, j, gate_m, sigma_m), sigma_m)
+    alone = _covariances(surfaces, poses, i, j, gate_m, sigma_m)
+    count = np.bincount(np.r_[i[at], j[at]], minlength=len(surfaces))
+    # The same points, and what they are off by together, are in many pairs.
+    many = (count[i[at]] + count[j[at]] + 2) / 4.0
+    of_pairs = [
+        known(several[k], sigma_m, n, (np.sqrt(n) * SHARED_BY_GROUPS[0], np.sqrt(n) * SHARED_BY_GROUPS[1])).information
+        for k, n in zip(at, many.tolist(), strict=True)
+    ]
+    together = of_groups(poses, i[at], j[at], np.array(of_pairs), np.array([U for U, _ in unit]))
+    return JointPoses(poses, alone + together, sigma_m)
+
+
+def of_groups(poses: Array, i: np.ndarray, j: np.ndarray, information: Array, unit: Array) -> Array:
+    """What groups of views are off by together, (N, 6, 6), beyond what each view tells beside the others.
+
+    The views of one side of a box know each other well, and those of the other side little: its width is told by edges
+    alone. With C the covariance of all poses and D that of each view among the others, D^-1/2 C D^-1/2 then has large
+    eigenvalues m. A problem takes views as independent. For any shares p_k that sum to one, m w w' is no more than the
+    block diagonal m w_k w_k' / p_k, so p_k ~ |w_k| gives covariances that claim no more than C.
+    """
+    N = len(unit)
+    T_i_j = se3.inverse(poses[i]) @ poses[j]
+    to = np.concatenate([-se3.adjoint(se3.inverse(T_i_j)) @ unit[i], unit[j]], axis=2)
+    parts = to.transpose(0, 2, 1) @ information @ to
+    whole = np.zeros((N, N, 6, 6))
+    for rows, a in ((slice(0, 6), i), (slice(6, 12), j)):
+        for columns, b in ((slice(0, 6), i), (slice(6, 12), j)):
+            np.add.at(whole, (a, b), parts[:, rows, columns])
+    values, along = np.linalg.eigh(whole[np.arange(N), np.arange(N)])
+    known_at_all = values > SEEN * values[:, -1:]
+    roots = along * np.where(known_at_all, np.abs(values), np.inf)[:, None, :] ** -0.5
+    white = np.einsum("aki,abkl,blj->aibj", roots, whole, roots).reshape(6 * N, 6 * N)
+    # All views together may be anywhere: the thing's own pose is free.
+    anywhere = np.sqrt(np.where(known_at_all, values, 0.0))[:, :, None] * (
+        along.transpose(0, 2, 1) @ np.linalg.solve(unit, se3.adjoint(se3.inverse(poses)))
+    )
+    free = np.linalg.svd(anywhere.reshape(6 * N, 6), full_matrices=False)[0]
+    told, modes = np.linalg.eigh(white + free @ free.T)
+    loose = (told > NOTHING) & (told < 1.0 / LOOSE)
+    w = modes[:, loose].reshape(N, 6, -1)
+    lengths = np.linalg.norm(w, axis=1)
+    shares = np.where(lengths > 0.0, lengths.sum(axis=0) / np.maximum(lengths, 1e-12), 0.0)
+    excess = np.einsum("aim,ajm,am,m->aij", w, w, shares, 1.0 / told[loose] - 1.0)
+    turned = unit @ roots
+    return np.asarray(turned @ excess @ turned.transpose(0, 2, 1))
 
 
 def _covariances(

@@ -21,6 +21,7 @@ from gtsam_rwhec.clouds.registered_views import (
     Views,
     certified_pose,
     check_agreement,
+    noise_of_A,
     prepared,
     registered_in_turn,
 )
@@ -87,7 +88,6 @@ class SeenObject:
             directional=True,
             source="clouds",
         )
-        problem.spacings[target] = self.spacing_m
 
 
 def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> SeenObject:
@@ -121,7 +121,8 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     if len(kept.at) < FEWEST_VIEWS:
         raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
     inside = registrations.selected(together[registrations.i] & together[registrations.j]).renamed(place)
-    joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, inside, GATE * views.spacing.faces_m)
+    of_A = noise_of_A(inside, Y)
+    joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, of_A, inside, GATE * views.spacing.faces_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
     stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
     check_agreement(kept, inside, Y)
@@ -181,7 +182,7 @@ def _where_it_was(
     for _ in views.at:
         still = ~np.isin(np.arange(len(views.at)), list(moved))
         chosen = pairs.selected(still[pairs.i] & still[pairs.j])
-        Y, is_certified = certified_pose(chosen, Y)
+        Y, is_certified = certified_pose(chosen)
         at = np.flatnonzero(still)
         predicted = se3.inverse(views.A[at]) @ Y
         move = move_of(

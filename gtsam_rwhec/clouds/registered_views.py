@@ -152,7 +152,7 @@ def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrati
             raise CloudError(_no_overlap(views, i, j))
         i, j, starts = pairs.i, pairs.j, pairs.B
         before = Y
-        Y, _ = certified_pose(pairs, Y)
+        Y, _ = certified_pose(pairs)
         moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
         if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
@@ -178,13 +178,24 @@ def _at_middle(views: Views, change: Array, at: np.ndarray) -> Array:
     return np.asarray(np.einsum("nij,nj->ni", change[:, :3, :3], middle) + change[:, :3, 3])
 
 
-def certified_pose(pairs: Registrations, Y: Array) -> tuple[Array, bool]:
-    """The sensor's pose (4, 4) on its carrier by motions, and whether it is certified; ``Y`` is the one before."""
+def certified_pose(pairs: Registrations) -> tuple[Array, bool]:
+    """The sensor's pose (4, 4) on its carrier by motions, and whether it is certified."""
+    return _by_motions(pairs, noise_of_A(pairs, _by_motions(pairs, np.zeros(6))[0]))
+
+
+def noise_of_A(pairs: Registrations, Y: Array) -> Array:
+    """The variances (6,) of A, the same along all axes: what motions are off where a pair knows most."""
     off = se3.logmap(se3.inverse(pairs.B) @ se3.inverse(Y) @ pairs.A @ Y)
-    # What A is off counts as well, and is the same in all directions.
-    floor = np.median(off**2, axis=0).reshape(2, 3).mean(axis=1).repeat(3)
+    result = np.zeros(6)
+    for part in (slice(0, 3), slice(3, 6)):
+        best = np.linalg.eigh(pairs.covariances[:, part, part])[1][:, :, 0]
+        result[part] = np.median(np.einsum("ni,ni->n", best, off[:, part]) ** 2)
+    return result
+
+
+def _by_motions(pairs: Registrations, of_A: Array) -> tuple[Array, bool]:
     problem = Problem()
-    covariances = pairs.covariances + np.diag(floor + TINY)
+    covariances = pairs.covariances + np.diag(of_A + TINY)
     problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=covariances, directional=True)
     with warnings.catch_warnings():
         # The caller's own problem is judged by `calibrate`, with A's noise.

@@ -253,8 +253,11 @@ class TruncatedLeastSquares:
         for each unknown: then it cannot pull.
         """
         count = len(everyone)
-        if noise_scale == "given":
-            return bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
+        # What registrations state is the least that they are off by: who agrees under it is no outlier.
+        if noise_scale == "given" or self.problem.is_of_registrations:
+            agree = bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
+            if agree or noise_scale == "given":
+                return agree
         unknowns = int(self.measured.told[1:].sum()) - self.spare_equations
         if unknowns > PULLED * float(self.measured.told.sum()):
             return False

@@ -174,17 +174,13 @@ class Weighing:
         than the two others together counts as well as these.
         """
         noise = raw.covariance_of_B()
-        of_rotation, crossed = noise[:, :3, :3], noise[:, 3:, :3]
-        # The c with the smallest E |v + omega x c|^2: (tr(S) - S) c = -E v x omega.
-        moment = np.stack([crossed[:, j, k] - crossed[:, k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
-        arm = np.einsum("nii->n", of_rotation)[:, None, None] * np.eye(3) - of_rotation
-        centre = -np.linalg.solve(arm, moment[:, :, None])[:, :, 0]
+        of_rotation, crossed, centre = noise[:, :3, :3], noise[:, 3:, :3], centres_of(noise)
         is_point, is_plane, z = raw.is_of(Kind.POINT), raw.is_of(Kind.PLANE), np.array([0.0, 0.0, 1.0])
         centre[is_point] = 0.0
         # Of a plane only (omega x c)_z counts: where it tells least of its tilt.
         tilt = np.linalg.solve(of_rotation[is_plane, :2, :2], crossed[is_plane, 2, :2, None])[:, :, 0]
         centre[is_plane] = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
-        moved = np.concatenate([-se3.hat(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
+        moved = _moved(centre)[:, 3:]
         there = moved @ noise @ moved.transpose(0, 2, 1)
         information, turns = np.linalg.eigh(np.linalg.inv(of_rotation))
         information[:, 2] = np.minimum(information[:, 2], information[:, 0] + information[:, 1])
@@ -291,10 +287,33 @@ def sliding_part(covariances: Array) -> Array:
 
 
 def scaled(covariances: Array, slides: Array | None, deviation: Array) -> Array:
-    """Covariances (N, 6, 6) whose deviations are multiplied by (6,); what slides (N, 6, 6) slides as before."""
+    """Covariances (N, 6, 6) whose deviations are multiplied by (6,); what slides (N, 6, 6) slides as before.
+
+    Where something slides or may slide, at the points where turns and shifts tell least of each other. Else these
+    points would move away as one grows beside the other, and with them the residuals.
+    """
     if slides is None:
         return np.asarray(covariances * deviation[:, None] * deviation)
-    return np.asarray((covariances - slides) * deviation[:, None] * deviation + slides)
+    measured = covariances - slides
+    there = _moved(centres_of(measured))
+    back = np.linalg.inv(there)
+    at_centre = there @ measured @ there.transpose(0, 2, 1) * deviation[:, None] * deviation
+    return np.asarray(back @ at_centre @ back.transpose(0, 2, 1) + slides)
+
+
+def centres_of(covariances: Array) -> Array:
+    """The c (N, 3) with the smallest E |v + omega x c|^2: (tr(S) - S) c = -E v x omega; zero where no turn counts."""
+    of_rotation, crossed = covariances[:, :3, :3], covariances[:, 3:, :3]
+    moment = np.stack([crossed[:, j, k] - crossed[:, k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
+    arm = np.einsum("nii->n", of_rotation)[:, None, None] * np.eye(3) - of_rotation
+    return np.asarray(-(np.linalg.pinv(arm, hermitian=True) @ moment[:, :, None])[:, :, 0])
+
+
+def _moved(centre: Array) -> Array:
+    """(N, 6, 6): a perturbation of a frame as one of the same frame with its origin in ``centre`` (N, 3)."""
+    moved = np.tile(np.eye(6), (len(centre), 1, 1))
+    moved[:, 3:, :3] = -se3.hat(centre)
+    return moved
 
 
 def common_slides(several: Sequence[Measurements]) -> Array:
@@ -306,7 +325,7 @@ def common_slides(several: Sequence[Measurements]) -> Array:
 #: Slides are one direction where this share of each is in it.
 ALIKE = 0.99
 #: The variance of what slides of one thing, and the least that is taken for it: axes of radians and metres mix.
-SLID, ROUGH = 4.0 * SLIDES, 1.0
+SLID, ROUGH = 4.0 * SLIDES, 0.1
 
 
 def _alike(slides: Array, count: int, least: float = 0.5 * SLIDES) -> Array:

@@ -99,8 +99,6 @@ class Knowledge:
         self.fixed_scales: dict[str, float] = {}
         self.cameras: dict[str, Camera] = {}
         self.boards: dict[str, Array] = {}
-        #: Distance of neighbouring points, m, by target that was seen in clouds.
-        self.spacings: dict[str, float] = {}
         self.corner_px: float | None = None
 
     def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
@@ -189,7 +187,6 @@ class Knowledge:
         for name, board in other.boards.items():
             if not same_board(self.boards.setdefault(name, board), board):
                 raise TargetError(f"{name} has other board_points in one problem than in the other; rename one of them")
-        self.spacings |= other.spacings
         if other.corner_px is not None:
             self.corner_px = check_corner_px(other.corner_px, self.corner_px, "a problem that is joined")
 
@@ -200,5 +197,4 @@ class Knowledge:
         self.fixed_scales = {name: scale for name, scale in other.fixed_scales.items() if name not in scales}
         self.cameras = {name: camera for name, camera in other.cameras.items() if name not in frames}
         self.boards = {name: board for name, board in other.boards.items() if name not in frames}
-        self.spacings = {name: spacing for name, spacing in other.spacings.items() if name not in frames}
         self.corner_px = other.corner_px

@@ -219,7 +219,6 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
     rig, offsets_s = log.rig, log.cleaning.time_offsets_s
     pairs, against = with_comparable_noise(log.pairs, rig, log.motion, offsets_s, progress or silent)
     problem = log.problem_of(pairs)
-    problem.spacings |= {each.target: 1e-3 * each.spacing_mm for each in log.metadata.detection.objects}
     try:
         problem = log.corners.in_problem(problem, pairs, log.cameras)
     except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt

@@ -20,7 +20,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate.simulated_noise import Noise, Seed, perturb
 
-Shape = Literal["bust", "cube", "relief", "sphere", "cylinder", "heap"]
+Shape = Literal["bust", "cube", "box", "relief", "sphere", "cylinder", "heap"]
 Distance = Callable[[Array], Array]
 
 #: The camera is about this far from the thing's centre, m, and varies by a tenth of it.
@@ -56,6 +56,8 @@ def thing(shape: Shape, seed: Seed) -> Distance:
     if shape == "cube":
         corner = Rotation.align_vectors([0.0, 0.0, 1.0], [1.0, 1.2, 1.4])[0].as_matrix()
         return lambda p: _box(p @ corner, np.full(3, 0.04)) - 0.001
+    if shape == "box":  # no view sees two opposite sides: edges alone tell how wide it is
+        return lambda p: _box(p, np.array([0.05, 0.07, 0.03]))
     if shape == "cylinder":
         return lambda p: np.asarray(np.maximum(np.hypot(p[:, 0], p[:, 1]) - 0.04, np.abs(p[:, 2]) - 0.3))
     if shape == "relief":
@@ -125,7 +127,7 @@ def clouds_of_thing(
 
     Parameters
     ----------
-    shape : "bust", "cube", "relief", "sphere", "cylinder" or "heap"
+    shape : "bust", "cube", "box", "relief", "sphere", "cylinder" or "heap"
     views, seed : int
     noise_m : float
         Standard deviation of each point along its ray.

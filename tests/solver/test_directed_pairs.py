@@ -8,6 +8,8 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mixed_sets import MOVE_M, TURN_RAD, mixed_set, pose
 from rwhec_factors import se3
 from scipy.optimize import least_squares
@@ -22,9 +24,11 @@ from gtsam_rwhec.errors import (
     PoseError,
     ScaleError,
 )
-from gtsam_rwhec.problem.directions import SLIDES, aligned, motions_of_slides, with_common_slides
+from gtsam_rwhec.fitting.robust_solution import robust_solution
+from gtsam_rwhec.problem.directions import SLIDES, aligned, centres_of, motions_of_slides, scaled, with_common_slides
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.selection import VarianceFactors, aligned_at, reweighted
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver.answers import PairPoses, given_answer, parts_about
 from gtsam_rwhec.solver.part_form import PartForm
 
@@ -312,6 +316,37 @@ def test_what_slides_in_all_views_is_one_motion(thing: str) -> None:
         variances, along = np.linalg.eigh(covariance)
         assert same_span(along[:, variances > SLIDES], slides)
         assert np.allclose(variances[variances < SLIDES], 1e-10, rtol=0.2)
+
+
+def test_a_slide_that_one_view_tells_to_a_metre_is_a_slide() -> None:
+    covariances = np.tile(1e-8 * np.eye(6) + 4.0 * SLIDES * ALONG_Z @ ALONG_Z.T, (12, 1, 1))
+    covariances[7] -= (4.0 * SLIDES - 0.9) * ALONG_Z @ ALONG_Z.T
+    assert with_common_slides(covariances)[:, 5, 5] == pytest.approx(4.0 * SLIDES)
+
+
+@given(seed=st.integers(0, 1000), turns=st.floats(0.01, 100.0), shifts=st.floats(0.01, 100.0))
+@settings(max_examples=20, deadline=None)
+def test_factors_leave_the_points_where_turns_and_shifts_tell_least_of_each_other(
+    seed: int, turns: float, shifts: float
+) -> None:
+    part = np.random.default_rng(seed).normal(size=(3, 6, 6))
+    covariances = part @ part.transpose(0, 2, 1)
+    factors = scaled(covariances, np.zeros_like(covariances), np.repeat([turns, shifts], 3))
+    assert centres_of(factors) == pytest.approx(centres_of(covariances), rel=1e-6, abs=1e-6)
+    assert factors[:, :3, :3] == pytest.approx(turns**2 * covariances[:, :3, :3], rel=1e-9)
+
+
+def test_who_agrees_as_registrations_state_is_no_outlier() -> None:
+    # Views of a box with an exact arm: what faces tell is off by little, what edges tell by half of what they state.
+    rng = np.random.default_rng(3)
+    A, Y = random_poses(9, 0.5, rng), random_poses(1, 0.2, rng)[0]
+    off = 1e-3 * rng.normal(size=(9, 6)) * np.r_[1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5]
+    off[4, 3] = 0.5e-3
+    problem = rw.Problem()
+    covariances = np.tile(np.diag(np.r_[1e-3, 1e-3, 1e-3, 1e-3, 5e-5, 5e-5] ** 2), (9, 1, 1))
+    problem.add("box", "camera", A, np.linalg.inv(Y) @ A @ se3.expmap(off), covariances=covariances, directional=True)
+    (kept,) = robust_solution(problem, noise_scale="estimate").inliers.values()
+    assert kept.all()
 
 
 @pytest.mark.parametrize("thing", ["sphere", "cylinder", "plane"])
