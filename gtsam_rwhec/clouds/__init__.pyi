@@ -1,4 +1,6 @@
 from .cloud import Cloud as Cloud
+from .cloud_odometry import CloudTrack as CloudTrack
+from .cloud_odometry import odometry as odometry
 from .cloud_files import read_cloud as read_cloud
 from .registered_views import ObjectOptions as ObjectOptions
 from .object_views import SeenObject as SeenObject

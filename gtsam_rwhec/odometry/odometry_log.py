@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import detected
 from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.odometry_cleaning import gates_of
-from gtsam_rwhec.runs.odometry_tracks import files_of, read_odometry, write_files
+from gtsam_rwhec.runs.odometry_tracks import files_of, read_odometry, records_of_files
 from gtsam_rwhec.runs.output_folder import (
     check_is_not_read,
     list_written,
@@ -274,7 +275,8 @@ def _calibrate_files(
         output.begin()
         try:
             with LogWriter(recorded) as log:
-                write_files(log, None, rig)
+                for pose in chain.from_iterable(records_of_files(rig).values()):
+                    log.pose(pose.topic, pose.stamp_ns, pose.parent, pose.T)
             return _stages(
                 [recorded], rig, output.path, is_raw=True, is_cleaned=False, anyway=anyway, progress=progress
             )

@@ -9,7 +9,7 @@ from pathlib import Path
 from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.logs import IntrinsicsRecord, Log
+from gtsam_rwhec.logs import IntrinsicsRecord, Log, Topic
 from gtsam_rwhec.rig.carrier_roles import Origin, Role, evidence_of_log, first_time_offset
 from gtsam_rwhec.rig.guessed_boards import STATED
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
@@ -63,7 +63,8 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     notes: list[str] = []
     cameras = _cameras(contents, notes)
     if not cameras:
-        proposed = propose_odometries(contents.poses.values(), log.files[0].path.name)
+        sweeps = [topic for topic in contents.topics if is_of_sweeps(topic)]
+        proposed = propose_odometries(contents.poses.values(), log.files[0].path.name, sweeps)
         proposed = proposed or _of_clouds(log, contents)
         if proposed is not None:
             parse_rig(proposed[0], str(path))
@@ -276,7 +277,7 @@ def _topics(contents: LogContents) -> str:
 
 
 #: Words in topic names that describe the kind of data, and not the sensor.
-OF_KIND = ("odom", "odometry", "pose", "poses", "odometry_pose", "pose_stamped", "local", "filtered")
+OF_KIND = ("odom", "odometry", "pose", "poses", "odometry_pose", "pose_stamped", "local", "filtered", "points", "cloud")
 #: Words that indicate visual odometry of one camera, whose lengths are not in metres.
 OF_ONE_CAMERA = {"mono", "vo", "cam", "camera", "orb", "dso", "svo"}
 _SCALE = (
@@ -285,12 +286,28 @@ _SCALE = (
 )
 
 
-def propose_odometries(poses: Iterable[PoseTopic], where: str) -> tuple[str, tuple[str, ...]] | None:
-    """The text of a rig file, and what was seen; None with fewer than two topics of poses that move.
+#: So many clouds, at least so many a second, are the sweeps of a LiDAR that may move; few clouds are views of a thing.
+MANY_SWEEPS, SWEEPS_PER_S = 50, 2.0
 
-    `where` is the log's name, for the head of the file. Poses in tf are of the robot's own tree, and are not proposed.
+
+def is_of_sweeps(topic: Topic) -> bool:
+    """Whether a topic has clouds, as many and as often as a LiDAR that may move on has sweeps."""
+    is_read = topic.has_clouds and not topic.unreadable and is_text(topic.name)
+    seconds = 1e-9 * ((topic.last_ns or 0) - (topic.first_ns or 0))
+    return is_read and topic.count >= MANY_SWEEPS and topic.count - 1 >= SWEEPS_PER_S * seconds
+
+
+def propose_odometries(
+    poses: Iterable[PoseTopic], where: str, sweeps: Sequence[Topic] = ()
+) -> tuple[str, tuple[str, ...]] | None:
+    """The text of a rig file, and what was seen; None with fewer than two sensors that know how they moved.
+
+    That are topics of poses that move, and two or more of a LiDAR's ``sweeps``. `where` is the log's name, for the head
+    of the file. Poses in tf are of the robot's own tree, and are not proposed.
     """
     taken: set[str] = set()
+    if len(sweeps) > 1:
+        return _of_sweeps(sweeps, where)
     found = {free_name(_name(s.topic), taken): s for s in moving_topics(poses) if is_text(s.topic)}
     if len(found) < 2:
         return None
@@ -317,6 +334,27 @@ def propose_odometries(poses: Iterable[PoseTopic], where: str) -> tuple[str, tup
     )
     text = first_rig_text("log", where, Rig(sensors={**sensors}, reference=reference), remarks, more)
     return text, (*notes, f"reference: {reference} (of those with metres, most poses)")
+
+
+def _of_sweeps(sweeps: Sequence[Topic], where: str) -> tuple[str, tuple[str, ...]]:
+    """LiDARs that know their motion by their own sweeps; poses in the log are no other sensor's, as a rule."""
+    taken: set[str] = set()
+    found = {free_name(_name(topic.name), taken): topic for topic in sweeps}
+    reference = max(found, key=lambda name: found[name].count)
+    sensors = {
+        name: OdometrySensor(
+            odometry=OdometrySource(clouds=topic.name), time_offset=0.0 if name == reference else "estimate"
+        )
+        for name, topic in found.items()
+    }
+    more = (
+        "# Each LiDAR's motion is found by registering its sweeps. A vehicle that moves in a plane does not tell\n"
+        "# heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of poses may be a sensor too: {topic: /odom}.\n"
+    )
+    remarks: dict[KeyPath, str] = {("reference",): "TODO a guess: the sensor in whose frame you want the others"}
+    notes = tuple(f"sweeps: {name}, topic {topic.name}, {topic.count} clouds" for name, topic in found.items())
+    rig = Rig(sensors={**sensors}, reference=reference)
+    return first_rig_text("log", where, rig, remarks, more), (*notes, f"reference: {reference} (most clouds)")
 
 
 def _name(topic: str) -> str:

@@ -47,7 +47,7 @@ class OdometryNoiseSection(Section):
 class OdometrySource(Section):
     """Where an odometry's poses (in the frame in which it began) are, and what is known of the poses."""
 
-    model_config = one_of("topic", "tf", "file")
+    model_config = one_of("topic", "tf", "file", "clouds")
 
     topic: Text | None = optional("a topic of Odometry, PoseStamped or PoseInFrame", "/lidar_front/odom")
     tf: FramePair | None = optional("two frames of tf, [start, sensor]", ["lidar_odom", "lidar_link"])
@@ -55,6 +55,11 @@ class OdometrySource(Section):
         "a file of poses (TUM: t x y z qx qy qz qw; CSV), in the folder that is given as the log, or beside the "
         "rig file",
         "lidar_front.tum",
+    )
+    clouds: Text | None = optional(
+        "a topic of a LiDAR's clouds (PointCloud2, PointCloud): its motion is found by registering its sweeps one "
+        "after another; points with times let the motion during a sweep be taken off",
+        "/lidar_front/points",
     )
     scale: Literal["known", "estimate"] = optional(
         "known: lengths are metres. estimate: they are metres times one unknown factor, as those of visual "
@@ -84,8 +89,8 @@ class OdometrySource(Section):
 
     @model_validator(mode="after")
     def _is_one(self) -> OdometrySource:
-        given = self._given("topic", "tf", "file")
-        self._need_one(given, "topic (of Odometry or PoseStamped), tf: [start, sensor] and file (TUM)")
+        given = self._given("topic", "tf", "file", "clouds")
+        self._need_one(given, "topic (of Odometry or PoseStamped), tf: [start, sensor], file (TUM), clouds (a topic)")
         return self
 
     @property
@@ -93,6 +98,8 @@ class OdometrySource(Section):
         """Where the poses are, for messages."""
         if self.tf is not None:
             return f"tf {self.tf[0]} to {self.tf[1]}"
+        if self.clouds is not None:
+            return f"clouds of topic {self.clouds}"
         return f"topic {self.topic}" if self.topic is not None else f"file {self.file}"
 
 
@@ -100,7 +107,7 @@ class OdometrySensor(Section):
     """A sensor that knows only its own motion, as a LiDAR, a camera with visual odometry, wheels, an INS."""
 
     odometry: OdometrySource = needed(
-        "{topic: ...}, {tf: [start, sensor]} or {file: ...}, and what is known of these poses",
+        "{topic: ...}, {tf: [start, sensor]}, {file: ...} or {clouds: ...}, and what is known of these poses",
         {"topic": "/lidar_front/odom"},
     )
     time_offset: TimeOffset = optional(
@@ -187,7 +194,7 @@ START = "_start"
 
 
 def odometry_topic(sensor: str) -> str:
-    """Topic of a stage's log with an odometry that came from a file: poses of the sensor in its starting frame."""
+    """Topic of a stage's log with an odometry from a file or from clouds: poses of the sensor in its starting frame."""
     return f"/calibration/{sensor}/odometry"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -63,10 +64,11 @@ class CarrierMotion:
         return SmoothPath.of(self.trajectory)
 
 
-def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
+def read_carrier_motion(log: Log, rig: Rig, found: Mapping[str, Sequence[PoseRecord]] | None = None) -> CarrierMotion:
     """Read the carriers' motion from the tf frames or the topic that the rig file names.
 
-    Frames of poses in files (``frames``) are in tf of the log that was made of the files.
+    Frames of poses in files (``frames``) are in tf of the log that was made of the files. ``found`` are poses that the
+    log does not have yet, by topic.
 
     Raises `LogError` if the topic is missing or has no poses of these frames, or if the log has no transforms;
     `TransformError` if no chain of transforms joins the frames, or if they never move relative to each other;
@@ -75,6 +77,7 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     """
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.parent_and_child
+    here = None
     if source.topic is None:
         try:
             parent, child, stamps, T = poses_of_tf(log, parent, child, rig.carriers.sensors)
@@ -83,8 +86,9 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
         where = f"tf {parent} to {child}"
     else:
         where = f"topic {source.topic}"
-        stamps, T = poses_of_topic(log, source.topic)
-    if len(log.files) > 1:
+        here = (found or {}).get(source.topic)
+        stamps, T = poses_of_topic(log, source.topic) if here is None else series_of(here)
+    if here is None and len(log.files) > 1:
         _check_one_pose_a_stamp(log, source.topic)
     # The pose of a child frame is noisy about and along the child's own axes.
     about: About = "targetcarrier"
@@ -147,6 +151,12 @@ def poses_of_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
     # If several poses have the same stamp, the last one counts, as in tf.
     last = np.append(np.diff(series.stamps_ns) != 0, True)
     return series.stamps_ns[last], series.T[last]
+
+
+def series_of(records: Sequence[PoseRecord]) -> tuple[np.ndarray, Array]:
+    """Stamps (N,) and poses (N, 4, 4)."""
+    stamps = np.array([each.stamp_ns for each in records], dtype=np.int64)
+    return stamps, np.array([each.T for each in records])
 
 
 def _check_one_pose_a_stamp(log: Log, topic: str | None) -> None:

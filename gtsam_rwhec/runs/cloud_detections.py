@@ -13,14 +13,16 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud_odometry import odometry
 from gtsam_rwhec.clouds.named_fields import METRE, cloud_of_depth, cloud_of_record, record_of_cloud
 from gtsam_rwhec.clouds.object_views import SeenObject, seen_object
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import CloudError, LogError, LogWarning
 from gtsam_rwhec.files.progress import Counted, Progress, Remark
-from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, Log, Record
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, Log, PoseRecord, Record
 from gtsam_rwhec.results.log_history import ObjectReport, RegisteredPair
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.odometry_sections import START, odometry_topic
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.runs.kept_detections import KeptDetections
 from gtsam_rwhec.runs.run_log import clouds_topic, detections_topic, image_name, image_names
@@ -140,6 +142,46 @@ def detect_in_clouds(
     ]
     of_sensor = SensorDetections([*records, *nowhere], total, Counter(), tuple(faults), remarks=report.remarks)
     return CloudDetections(of_sensor, report, list(drawn.values()))
+
+
+def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> list[PoseRecord]:
+    """The poses of a LiDAR that knows its motion by its own sweeps, on its `odometry_topic`.
+
+    Raises
+    ------
+    CloudError
+        As `odometry`: too few sweeps can be registered.
+    StampError
+        As `check_order`.
+    """
+    source = rig.odometries[sensor].odometry
+    assert source.clouds is not None
+    sweeps = _Source(log, source.clouds, None, None, {})
+    unread: list[CloudError] = []
+
+    def each() -> Iterator[Cloud]:
+        for stamp, cloud in sweeps.each():
+            if isinstance(cloud, Cloud):
+                yield replace(cloud, stamp_ns=stamp)
+            else:
+                unread.append(cloud)
+
+    track = odometry(each(), progress=progress)
+    where = f"{sensor}, topic {source.clouds}"
+    for words, reasons in (("cannot be read", unread), ("are left out of its motion", track.left_out)):
+        if reasons:
+            total = len(unread) + len(track.left_out) + len(track.stamps_ns)
+            said = f"{where}: {len(reasons)} of {total} sweeps {words}; the first: {reasons[0]}"
+            warnings.warn(said, LogWarning, stacklevel=3)
+    if not track.has_times:
+        said = (
+            f"{where}: its points have no times, so the motion during each sweep stays in them, and the sensor's place "
+            "is centimetres off where the vehicle is fast; let the driver write the field time, t or timestamp"
+        )
+        warnings.warn(said, LogWarning, stacklevel=3)
+    topic, frame = odometry_topic(sensor), f"{rig.frame_of(sensor)}{START}"
+    poses = zip(track.stamps_ns.tolist(), track.T_start_sensor, strict=True)
+    return [PoseRecord(stamp, stamp, topic, frame, "", T) for stamp, T in poses]
 
 
 def _once(source: _Source, wanted: dict[int, None]) -> Iterator[Cloud]:

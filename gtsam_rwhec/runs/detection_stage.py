@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,13 +11,15 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError, OptionError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.logs import CloudRecord, Log, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.odometry_sections import odometry_topic
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections, KeptOfLog
+from gtsam_rwhec.runs.odometry_tracks import records_of_files
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
@@ -129,7 +131,8 @@ def detected(
     check_topics(log, rig)
     cameras = read_intrinsics(log, rig)
     tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
-    motion = read_carrier_motion(log, rig)
+    moving = _motions_made(log, rig, tell)
+    motion = read_carrier_motion(log, rig, moving)
     estimated, failed = estimate_intrinsics(log, rig, workers=workers, progress=tell)
     if failed:
         refuse_not_estimated(log, rig, failed, motion, sheet)
@@ -166,8 +169,22 @@ def detected(
         shown = f" {sheet} shows some of the images." if has_sheet else ""
         raise LogError(f"{no_detections(log, report)}{shown}")
     stages = LogMetadata(rig, cameras, report, image_names=image_names(log))
-    clouds = [of_clouds.clouds for of_clouds in registered.values()]
-    return RunLog.with_detections(log, stages, {sensor: of.records for sensor, of in found.items()}, clouds)
+    records = {sensor: of.records for sensor, of in found.items()}
+    others: list[Sequence[CloudRecord] | Sequence[PoseRecord]] = [of_clouds.clouds for of_clouds in registered.values()]
+    others += moving.values()
+    return RunLog.with_detections(log, stages, records, others)
+
+
+def _motions_made(log: Log, rig: Rig, tell: Progress) -> dict[str, list[PoseRecord]]:
+    """The poses of sensors whose odometry is in a file or in their clouds, by topic; what the log has is there."""
+    there = {topic.name for topic in log.topics()}
+    made = {topic: records for topic, records in records_of_files(rig).items() if topic not in there}
+    for sensor in (name for name, each in rig.odometries.items() if each.odometry.clouds is not None):
+        if odometry_topic(sensor) not in there:
+            from gtsam_rwhec.runs.cloud_detections import motion_by_clouds
+
+            made[odometry_topic(sensor)] = motion_by_clouds(log, rig, sensor, tell)
+    return made
 
 
 def sheet_beside(out_path: str | Path) -> Path:

@@ -11,11 +11,11 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import Log, LogWriter
+from gtsam_rwhec.logs import Log, PoseRecord
 from gtsam_rwhec.logs.image_folder import as_ns, read_poses
 from gtsam_rwhec.logs.pose_tables import PoseStatement
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig.odometry_sections import odometry_topic
+from gtsam_rwhec.rig.odometry_sections import START, odometry_topic
 from gtsam_rwhec.runs.carrier_motion import poses_of_tf, poses_of_topic
 
 #: A track of fewer poses has no motion to compare.
@@ -37,10 +37,12 @@ def read_odometry(log: Log, rig: Rig, sensor: str) -> OdometryTrack:
         T = T if upper == start else se3.inverse(T)
     elif source.topic is not None:
         stamps, T = poses_of_topic(log, source.topic)
-    elif any(topic.name == of_log for topic in log.topics()):  # a stage before this one copied the file
+    elif any(topic.name == of_log for topic in log.topics()):  # an earlier stage wrote it
         stamps, T = poses_of_topic(log, of_log)
     else:
-        stamps, T = read_file(rig, sensor)
+        raise LogError(
+            f"{log.files[0].path} has no motion of {sensor} yet, which {place} has; gtsam-rwhec detect adds it"
+        )
     if len(stamps) < FEWEST:
         raise LogError(f"{place}: {source.place} has {len(stamps)} poses; motions need at least {FEWEST}")
     noise = source.noise
@@ -83,14 +85,11 @@ def files_of(rig: Rig) -> Iterator[tuple[str, Path]]:
             yield name, rig.folder / sensor.odometry.file
 
 
-def write_files(out: LogWriter, log: Log | None, rig: Rig) -> None:
-    """Write the odometries that are in files into a log, each on its `odometry_topic`, so that it needs no file."""
-    there = set() if log is None else {topic.name for topic in log.topics()}
+def records_of_files(rig: Rig) -> dict[str, list[PoseRecord]]:
+    """The odometries that are in files, each on its `odometry_topic`, so that a log with them needs no file."""
+    found = {}
     for sensor, _ in files_of(rig):
-        topic = odometry_topic(sensor)
-        if topic in there:
-            continue
-        stamps, T = read_file(rig, sensor)
-        frame = rig.frame_of(sensor)
-        for stamp, pose in zip(stamps.tolist(), T, strict=True):
-            out.pose(topic, stamp, f"{frame}_start", pose)
+        topic, start = odometry_topic(sensor), f"{rig.frame_of(sensor)}{START}"
+        poses = zip(*read_file(rig, sensor), strict=True)
+        found[topic] = [PoseRecord(int(stamp), int(stamp), topic, start, "", T) for stamp, T in poses]
+    return found

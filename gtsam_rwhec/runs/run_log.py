@@ -23,12 +23,11 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import CloudRecord, DetectionRecord, Log, LogWriter, PairRecord, Record
+from gtsam_rwhec.logs import CloudRecord, DetectionRecord, Log, LogWriter, PairRecord, PoseRecord, Record
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.logs.records import MEASURED_PAIR, TAG_DETECTIONS, Topic, transforms
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig, parse_rig, rig_text
-from gtsam_rwhec.runs.odometry_tracks import write_files
 
 Kind = TypeVar("Kind", bound=Record)
 Report = TypeVar("Report", bound=BaseModel)
@@ -207,10 +206,10 @@ class RunLog(Log):
         log: Log,
         stages: LogMetadata,
         records: Mapping[str, Sequence[DetectionRecord]],
-        clouds: Iterable[Sequence[CloudRecord]] = (),
+        others: Iterable[Sequence[CloudRecord] | Sequence[PoseRecord]] = (),
     ) -> RunLog:
-        """A recorded log with the detections of each sensor, and the thinned clouds of those that have clouds."""
-        found: dict[str, Sequence[Record]] = {of[0].topic: of for of in clouds if of}
+        """A recorded log with the detections of each sensor, thinned clouds, and motions from files or clouds."""
+        found: dict[str, Sequence[Record]] = {of[0].topic: of for of in others if of}
         for sensor, of_sensor in records.items():
             found[detections_topic(sensor)] = _as_read(detections_topic(sensor), of_sensor)
         return RunLog(log, raw_topics(log), stages, found, records)
@@ -230,7 +229,7 @@ class RunLog(Log):
         """Every topic, by name."""
         kinds = {
             DetectionRecord: (TAG_DETECTIONS, "json"), PairRecord: (MEASURED_PAIR, "json"),
-            CloudRecord: ("sensor_msgs/msg/PointCloud2", "cdr"),
+            CloudRecord: ("sensor_msgs/msg/PointCloud2", "cdr"), PoseRecord: ("foxglove.PoseInFrame", "json"),
         }  # fmt: skip
         found = [
             Topic(name, *kinds[type(of[0])], len(of), of[0].logged_ns, of[-1].logged_ns, "")
@@ -265,14 +264,15 @@ class RunLog(Log):
 
 
 def write_up_to_detection(log: Log, out: LogWriter, images: Images) -> None:
-    """Write what was recorded, with odometries that are in files, and what was detected in it."""
-    write_files(out, log, read_embedded_rig(log))
+    """Write what was recorded, and what was found in it."""
     if not isinstance(log, RunLog):
         out.copy(log, topics_up_to_detection(log), images, of_stages=_OF_DETECTION)
         return
     out.copy(log.recorded, log.kept, images, of_stages=_OF_DETECTION)
     for cloud in records_of(log, log.found, CloudRecord):
         out.point_cloud(cloud)
+    for pose in records_of(log, log.found, PoseRecord):
+        out.pose(pose.topic, pose.stamp_ns, pose.parent, pose.T)
     for sensor, records in log.detections.items():
         of_image: dict[int, list[DetectionRecord]] = defaultdict(list)
         for record in records:

@@ -78,7 +78,7 @@ def _check_types(log: Log, rig: Rig) -> None:
         if topic is not None and topic.unreadable:
             what = (
                 "poses"
-                if path[0] == "carriers" or path[-2] == "odometry"
+                if path[0] == "carriers" or path[-2:] == ("odometry", "topic")
                 else "intrinsics"
                 if path[-1] == "topic"
                 else str(path[-1])
@@ -99,8 +99,9 @@ def named_topics(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
         if sensor.intrinsics is not None and sensor.intrinsics.topic is not None:
             yield ("sensors", name, "intrinsics", "topic"), sensor.intrinsics.topic
     for name, moving in rig.odometries.items():
-        if moving.odometry.topic is not None:
-            yield ("sensors", name, "odometry", "topic"), moving.odometry.topic
+        for key, topic in (("topic", moving.odometry.topic), ("clouds", moving.odometry.clouds)):
+            if topic is not None:
+                yield ("sensors", name, "odometry", key), topic
 
 
 def _frame_of(log: Log, topic: str) -> str:

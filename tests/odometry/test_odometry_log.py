@@ -181,6 +181,23 @@ def test_files_that_are_not_there_and_rigs_of_another_road_are_refused(tmp_path:
         rw.odometry.calibrate_odometry_log(tmp_path, of_log, tmp_path / "out")
 
 
+def test_the_reference_may_be_a_file_beside_the_log(tmp_path: Path) -> None:
+    driven = drive(sensors("lidar_front", "lidar_rear"), "3d", seconds=12.0, rate_hz=5.0, seed=5)
+    log = write_log(tmp_path / "raw.mcap", driven)
+    track = driven.tracks["lidar_front"]
+    rows = np.c_[
+        (made.BEGIN_NS + track[0]) * 1e-9, track[1][:, :3, 3], Rotation.from_matrix(track[1][:, :3, :3]).as_quat()
+    ]
+    np.savetxt(tmp_path / "front.tum", rows, fmt="%.9f")
+    rig = "reference: lidar_front\nsensors:\n  lidar_front: {odometry: {file: front.tum}}\n"
+    rig += "  lidar_rear: {odometry: {topic: /lidar_rear/odom}}\n"
+    (tmp_path / "rig.yaml").write_text(rig, encoding="utf-8")
+    done = run("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert done.returncode == ExitStatus.CERTIFIED, done.stdout + done.stderr
+    result = read_odometry_result(tmp_path / "out" / "result.json")
+    assert np.linalg.norm(result.pose("lidar_rear")[:3, 3] - driven.T("lidar_front", "lidar_rear")[:3, 3]) < 0.1
+
+
 def test_a_first_rig_file_names_the_odometries_of_a_log(
     six: tuple[Drive, Path, subprocess.CompletedProcess[str]],
 ) -> None:

@@ -83,7 +83,7 @@ def test_cameras_and_odometries_are_told_apart_in_a_mixed_rig() -> None:
         ("scale: estimate", "scal: estimate", 7, r"odometry.scal: unknown key; did you mean scale\?"),
         ("/rear/odom", "/front/odom", 5, "topic /front/odom is also the odometry of sensor lidar_front"),
         ("topic: /rear/odom, ", "topic: /r, file: x, ", 5, "odometry: topic and file given; give one of topic"),
-        ("{file: wheels.tum}", "3", 8, "sensors.wheels.odometry: 3; give a section with topic, tf, file, scale"),
+        ("{file: wheels.tum}", "3", 8, "sensors.wheels.odometry: 3; give a section with topic, tf, file, clouds"),
         ("    time_offset", "    images: /i\n    time_offset", 6, "lidar_rear.images: unknown key; known keys are"),
         ("/front/odom}}", "/front/odom}, time_offset: 0.1}", 3, "time_offset: 0.1, and its clock is the one"),
         ("lidar_rear: 0.71", "lidar_rare: 0.71", 10, "lidar_rare: there is no sensor lidar_rare .* mean lidar_rear"),

@@ -1,0 +1,121 @@
+"""The motion of LiDARs by their own sweeps, and what it tells of where they are on a vehicle."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import lidar_drive
+import numpy as np
+import pytest
+from given_commands import command
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.clouds import Cloud, odometry
+from gtsam_rwhec.clouds.named_fields import record_of_cloud
+from gtsam_rwhec.errors import CloudError
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.runs.detection_stage import detect_log
+from gtsam_rwhec.simulate import Drive
+
+RIG = """
+reference: front
+sensors:
+  front: {odometry: {clouds: /front/points}}
+  rear: {odometry: {clouds: /rear/points}}
+given: {heights_m: {front: 1.8, rear: 2.0}, height_sigma_mm: 5}
+"""
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return lidar_drive.driven(8.0, seed=1)
+
+
+@pytest.fixture(scope="module")
+def recorded(drive: Drive) -> dict[str, list[Cloud]]:
+    boxes = lidar_drive.yard(drive, 1)
+    return {name: list(lidar_drive.sweeps(drive, boxes, name, k)) for k, name in enumerate(lidar_drive.MOUNTS)}
+
+
+def test_the_motion_is_that_between_the_middles_of_the_sweeps(drive: Drive, recorded: dict[str, list[Cloud]]) -> None:
+    track = odometry(recorded["front"])
+    assert track.has_times
+    assert track.left_out == ()
+    assert track.stamps_ns == pytest.approx(drive.stamps_ns[:-1] + 5e7, abs=1e6)
+    poses = drive.T_world_vehicle @ lidar_drive.MOUNTS["front"]
+    half = se3.expmap(0.5 * se3.logmap(se3.inverse(poses[:-1]) @ poses[1:]))
+    true, found = poses[:-1] @ half, track.T_start_sensor
+    off = se3.logmap(se3.inverse(se3.inverse(true[:-10]) @ true[10:]) @ se3.inverse(found[:-10]) @ found[10:])
+    assert np.degrees(np.sqrt((off[:, :3] ** 2).mean(axis=0))).max() < 0.08  # over 1 s, of 23 degrees
+    assert np.sqrt((off[:, 3:] ** 2).mean(axis=0)).max() < 0.02  # of 4 m
+
+
+def test_two_lidars_of_a_vehicle_are_calibrated_by_their_sweeps(
+    drive: Drive, recorded: dict[str, list[Cloud]], tmp_path: Path
+) -> None:
+    log, rig = tmp_path / "drive.mcap", tmp_path / "rig.yaml"
+    rig.write_text(RIG)
+    with LogWriter(log) as out:
+        for name, clouds in recorded.items():
+            for cloud in clouds:
+                assert cloud.stamp_ns is not None
+                out.point_cloud(record_of_cloud(cloud, f"/{name}/points", cloud.stamp_ns, name))
+    status, printed = command("init", log, "-o", tmp_path / "first.yaml")
+    assert status == 0, printed
+    first = (tmp_path / "first.yaml").read_text()
+    assert "front: {odometry: {clouds: /front/points}" in first or "clouds: /front/points" in first
+    assert "reference:" in first
+    status, printed = command("calibrate", log, "--rig", rig, "-o", tmp_path / "out")
+    assert status == 0, printed
+    result = rw.odometry.read_odometry_result(tmp_path / "out" / "result.json")
+    error = se3.logmap((se3.inverse(drive.T("front", "rear")[None])[0] @ result.pose("rear"))[None])[0]
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.3
+    assert np.linalg.norm(error[3:]) < 0.05
+    with open_log(tmp_path / "out" / "calibration.mcap") as kept:
+        assert len(kept.poses("/calibration/rear/odometry").stamps_ns) == len(recorded["rear"])
+
+
+def test_what_the_surroundings_do_not_tell_is_left_out() -> None:
+    walls = lidar_drive.Boxes(np.array([[0.0, 3.0], [0.0, -3.0]]), np.tile([300.0, 0.2, 5.0], (2, 1)), np.zeros(2))
+    rng = np.random.default_rng(0)
+    clouds = []
+    for k in range(6):
+        T, twist = se3.pose(np.eye(3), np.array([0.4 * k, 0.0, 1.8])), np.r_[0.0, 0.0, 0.0, 4.0, 0.0, 0.0]
+        points, times = lidar_drive.sweep(walls, T, twist, rng)
+        clouds.append(Cloud.of(points, times_s=times, stamp_ns=k * 10**8, source=f"sweep {k}"))
+    with pytest.raises(CloudError, match=r"of 6 sweeps 1 can be .*sweep 1: .* do not tell its motion along x"):
+        odometry(clouds)
+
+
+def test_a_sweep_of_elsewhere_costs_itself_alone(recorded: dict[str, list[Cloud]]) -> None:
+    clouds = list(recorded["front"][:20])
+    clouds[9] = Cloud.of(np.random.default_rng(0).uniform(-20.0, 20.0, (4000, 3)), times_s=np.linspace(0.0, 0.1, 4000))
+    clouds[9] = replace(clouds[9], stamp_ns=recorded["front"][9].stamp_ns, source="wrong")
+    track = odometry(clouds)
+    assert len(track.stamps_ns) == 19
+    assert [words.split(":")[0] for words in track.left_out] == ["wrong"]
+
+
+def test_sweeps_without_times_or_out_of_order_are_said(recorded: dict[str, list[Cloud]], tmp_path: Path) -> None:
+    few = recorded["front"][:12]
+    assert not odometry([replace(each, times_s=None) for each in few]).has_times
+    with pytest.raises(CloudError, match="no later than the sweep before it"):
+        odometry([few[1], few[0]])
+    with pytest.raises(CloudError, match="sweep 0 has no stamp"):
+        odometry([replace(few[0], stamp_ns=None)])
+    log = tmp_path / "drive.mcap"
+    with LogWriter(log) as out:
+        for name in ("front", "rear"):
+            for cloud in few:
+                assert cloud.stamp_ns is not None
+                plain = replace(cloud, times_s=None)
+                out.point_cloud(record_of_cloud(plain, f"/{name}/points", cloud.stamp_ns, name))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        rig = parse_rig(RIG, "rig.yaml")
+        detect_log(log, rig, tmp_path / "detected.mcap")
+    assert any("its points have no times" in str(each.message) for each in said)
