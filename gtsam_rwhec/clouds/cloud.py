@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CloudError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import real_array
 
@@ -89,6 +91,14 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @staticmethod
+    def each(given: Iterable[Cloud | ArrayLike]) -> Iterator[Cloud]:
+        """The clouds that a caller gave; arrays of points (N, 3) are clouds too. A CloudError names what is none."""
+        if isinstance(given, Cloud | str) or not isinstance(given, Iterable):
+            raise CloudError(f"clouds are {brief(given)}; give a list of Cloud, one for each view")
+        for number, one in enumerate(given):
+            yield one if isinstance(one, Cloud) else Cloud.of(one, source=f"clouds[{number}]")
 
     def selected(self, mask: np.ndarray) -> Cloud:
         """The points where ``mask`` (N,) is true, or those at an array of places."""

@@ -109,7 +109,7 @@ def _thinned(clouds: Iterable[Cloud]) -> tuple[list[_Sweep], float, bool]:
     """All sweeps with one point for each cube of the spacing, the spacing, and whether all points have times."""
     sweeps: list[_Sweep] = []
     spacing_m, has_times = 0.0, True
-    for number, cloud in enumerate(clouds):
+    for number, cloud in enumerate(Cloud.each(clouds)):
         name = cloud.source or f"sweep {number}"
         if cloud.stamp_ns is None:
             raise CloudError(f"{name} has no stamp; give Cloud.of(..., stamp_ns=...)")

@@ -122,6 +122,7 @@ def seen_boards(
         There are as many clouds as poses in ``near``.
     """
     options = options or LidarBoardOptions()
+    clouds = list(Cloud.each(clouds))
     starts = [None] * len(clouds) if near is None else list(as_transforms(near, None, "near (T_sensor_board)"))
     if len(starts) != len(clouds):
         raise CountError(f"{len(clouds)} clouds and {len(starts)} poses in near; give one for each cloud")
@@ -219,13 +220,13 @@ def lidar_and_camera(
     A, B = as_transforms(T_camera_board, None, "T_camera_board"), as_transforms(T_lidar_board, None, "T_lidar_board")
     C = real_array(covariances)
     camera = np.zeros_like(C) if camera_covariances is None else real_array(camera_covariances)
+    if C.shape[1:] != (6, 6) or camera.shape[1:] != (6, 6):
+        raise NoiseError(f"covariances have shapes {C.shape} and {camera.shape}; give (N, 6, 6), rotation first")
     if not len(A) == len(B) == len(C) == len(camera):
         raise CountError(
             f"{len(A)} poses of the camera, {len(B)} of the LiDAR, {len(C)} covariances of the LiDAR and {len(camera)} "
             "of the camera; give one of each for a place"
         )
-    if C.shape[1:] != (6, 6) or camera.shape[1:] != (6, 6):
-        raise NoiseError(f"covariances have shapes {C.shape} and {camera.shape}; give (N, 6, 6), rotation first")
     X = np.eye(4) if T_board_target is None else one_transform(T_board_target, "T_board_target")
     A = A @ se3.inverse(X[None])
     to_board = se3.adjoint(X[None])[0]

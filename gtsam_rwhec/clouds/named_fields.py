@@ -80,8 +80,8 @@ def _seconds(times: np.ndarray, stamp_ns: int | None) -> Array:
     return np.asarray(after if stamp_ns is None else after + (float(first) * unit - stamp_ns * 1e-9))
 
 
-def cloud_of_record(record: CloudRecord, unit_m: float = METRE, *, source: str = "") -> Cloud:
-    """The cloud of a log's message. Raises `CloudError` as `cloud_of_fields`."""
+def cloud_of_record(record: CloudRecord, unit_m: float = METRE, *, source: str = "", most: int | None = None) -> Cloud:
+    """The cloud of a log's message; of more points than ``most``, each so-manieth one. Raises as `cloud_of_fields`."""
     dtype = np.dtype({
         "names": [name for name, _, _ in record.fields],
         "offsets": [offset for _, offset, _ in record.fields],
@@ -94,9 +94,10 @@ def cloud_of_record(record: CloudRecord, unit_m: float = METRE, *, source: str =
     else:
         rows = np.frombuffer(record.data, np.uint8, record.height * record.row_step).reshape(record.height, -1)
         table = np.ascontiguousarray(rows[:, : record.width * record.step]).reshape(-1).view(dtype)
+    every = 1 if most is None else max(1, count // most)
     return cloud_of_fields(
-        {name: table[name] for name in dtype.names or ()},
-        shape=(record.height, record.width) if record.height > 1 else None,
+        {name: table[name][::every] for name in dtype.names or ()},
+        shape=(record.height, record.width) if record.height > 1 and every == 1 else None,
         unit_m=unit_m,
         T_frame_points=record.T_frame_points,
         stamp_ns=record.stamp_ns,

@@ -112,7 +112,7 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
     transforms = as_transforms(A, None, "A")
     if len(transforms):
         transforms = rows_to_transforms(checked_rows(transforms, 0, "A").rows)
-    given = iter(clouds)
+    given = Cloud.each(clouds)
     first = list(islice(given, SPACED))
     spacing = spacing_of([each.points for each in first], len(transforms)) if len(transforms) else Spacing(0.0, 0.0)
     if options.spacing_m is not None:

@@ -38,6 +38,7 @@ from gtsam_rwhec.rig.folder_contents import (
     FolderPoses,
     poses_read,
     readable_cloud,
+    why_not_read,
 )
 from gtsam_rwhec.rig.log_contents import camera_name, free_name
 from gtsam_rwhec.rig.rig import Rig
@@ -112,8 +113,10 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
         if clouds.unit_m != 1.0:
             notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
     if chosen is None:
+        whys = [words for clouds in found for words in _why_none(folder, clouds)][:3]
         raise RigError(
-            f"{folder}: clouds in {', '.join(each.path for each in found[:5])}, and no file of poses that fits them. "
+            f"{folder}: clouds in {', '.join(each.path for each in found[:5])}, and no file of poses that fits them"
+            f"{''.join(f'; {each}' for each in whys)}. "
             "Put the robot's pose at each cloud beside them, as poses.csv with a line a cloud: name, x, y, z, qx, qy, "
             "qz, qw (metres)"
         )
@@ -139,17 +142,30 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
     return first_rig_text("folder", folder.resolve().name, rig, remarks, head), tuple(notes)
 
 
-def _tables(folder: Path, clouds: CloudFolder) -> Iterator[str]:
-    """Files, or folders of files, of poses that fit the clouds, as paths from the folder; the nearest first."""
+def _near(folder: Path, clouds: CloudFolder) -> Iterator[Path]:
+    """Files, or folders of files, that may have poses of the clouds; the nearest first."""
     places = [clouds.files[0].parent]
     while places[-1] != folder:
         places.append(places[-1].parent)
     for place in places:
-        near = sorted(place.iterdir(), key=lambda path: natural_key(path.name))
-        for path in near:
-            is_table = path.suffix.lower() in (*TREES, *TABLES) or (path.is_dir() and "pose" in path.name.lower())
-            if is_table and next(_statements(folder, clouds, path), None) is not None:
-                yield path.relative_to(folder).as_posix()
+        for path in sorted(place.iterdir(), key=lambda path: natural_key(path.name)):
+            if path.suffix.lower() in (*TREES, *TABLES) or (path.is_dir() and "pose" in path.name.lower()):
+                yield path
+
+
+def _tables(folder: Path, clouds: CloudFolder) -> Iterator[str]:
+    """Those whose poses fit the clouds, as paths from the folder."""
+    for path in _near(folder, clouds):
+        if next(_statements(folder, clouds, path), None) is not None:
+            yield path.relative_to(folder).as_posix()
+
+
+def _why_none(folder: Path, clouds: CloudFolder) -> Iterator[str]:
+    """Why files that have poses fit none of the clouds."""
+    stated = [PoseStatement(length="m"), *(PoseStatement(euler=axes, angles="degrees", length="mm") for axes in AXES)]
+    for path in _near(folder, clouds):
+        if why := why_not_read(folder, clouds.files, path, stated):
+            yield why
 
 
 def _statements(folder: Path, clouds: CloudFolder, path: Path) -> Iterator[FolderPoses]:

@@ -173,24 +173,43 @@ def _poses(folder: Path, place: Path, files: list[Path], image_folders: Iterable
 def poses_read(folder: Path, files: Sequence[Path], path: Path, stated: PoseStatement) -> FolderPoses | None:
     """The poses of a file or a folder for the images, read as stated; None if they cannot be, or fit no images."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what is left over: calibration says it
-            poses = read_poses(path, stated)
-            T = np.full((len(files), 4, 4), math.nan)
-            stamps, of_poses = image_stamps(files), pose_stamps(poses)
-            if stamps is not None and of_poses is not None:
-                order = np.argsort(of_poses)
-                at, wanted = np.array(of_poses)[order], np.array(stamps)
-                near = np.clip(np.searchsorted(at, wanted), 1, len(at) - 1)
-                near -= wanted - at[near - 1] < at[near] - wanted
-                inside = (wanted >= at[0]) & (wanted <= at[-1])
-                T[inside] = poses.T[order][near[inside]]
-                return FolderPoses(_inside(folder, path), stated, T, wanted, poses) if inside.any() else None
-            matched = match(files, poses, str(path))
-            T[list(matched.images)] = poses.T[list(matched.poses)]
-            return FolderPoses(_inside(folder, path), stated, T, None, poses)
+        return _poses_for(folder, files, path, read_poses(path, stated), stated)
     except (LogError, FileFormatError):
         return None  # no file of poses, or one that needs another statement
+
+
+def why_not_read(folder: Path, files: Sequence[Path], path: Path, statements: Iterable[PoseStatement]) -> str:
+    """Why a file that has poses fits no images; empty if it has none under any statement."""
+    for stated in statements:
+        try:
+            poses = read_poses(path, stated)
+        except (LogError, FileFormatError):
+            continue
+        try:
+            _poses_for(folder, files, path, poses, stated)
+        except (LogError, FileFormatError) as error:
+            return str(error)
+    return ""
+
+
+def _poses_for(
+    folder: Path, files: Sequence[Path], path: Path, poses: NamedPoses, stated: PoseStatement
+) -> FolderPoses | None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what is left over: calibration says it
+        T = np.full((len(files), 4, 4), math.nan)
+        stamps, of_poses = image_stamps(files), pose_stamps(poses)
+        if stamps is not None and of_poses is not None:
+            order = np.argsort(of_poses)
+            at, wanted = np.array(of_poses)[order], np.array(stamps)
+            near = np.clip(np.searchsorted(at, wanted), 1, len(at) - 1)
+            near -= wanted - at[near - 1] < at[near] - wanted
+            inside = (wanted >= at[0]) & (wanted <= at[-1])
+            T[inside] = poses.T[order][near[inside]]
+            return FolderPoses(_inside(folder, path), stated, T, wanted, poses) if inside.any() else None
+        matched = match(files, poses, str(path))
+        T[list(matched.images)] = poses.T[list(matched.poses)]
+        return FolderPoses(_inside(folder, path), stated, T, None, poses)
 
 
 def _intrinsics(

@@ -16,6 +16,7 @@ from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.cloud_odometry import odometry
 from gtsam_rwhec.clouds.named_fields import METRE, cloud_of_depth, cloud_of_record, record_of_cloud
 from gtsam_rwhec.clouds.object_views import SeenObject, seen_object
+from gtsam_rwhec.clouds.surfaces import DENSE
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.errors import CloudError, LogError, LogWarning
 from gtsam_rwhec.files.progress import Counted, Progress, Remark
@@ -69,7 +70,8 @@ class _Source:
 
     def _cloud(self, record: Record) -> Cloud:
         if isinstance(record, CloudRecord):
-            return cloud_of_record(record, self.unit_m or METRE, source=self.name(record.stamp_ns))
+            # Registration thins clouds. Those of half a million points cost time and memory as they are.
+            return cloud_of_record(record, self.unit_m or METRE, source=self.name(record.stamp_ns), most=2 * DENSE)
         if not isinstance(record, ImageRecord):
             raise LogError(f"topic {self.topic} has no clouds but {type(record).__name__}s")
         if self.camera is None:

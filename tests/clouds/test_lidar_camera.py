@@ -154,6 +154,10 @@ def test_what_cannot_be_used_is_said(places: LidarPlaces, seen: rw.clouds.SeenBo
         rw.clouds.lidar_and_camera(places.T_camera_board, few, size, seen.covariances)
     with pytest.raises(NoiseError, match="rotation first"):
         rw.clouds.lidar_and_camera(places.T_camera_board, seen.T_sensor_board, size, np.ones((12, 3, 3)))
+    with pytest.raises(NoiseError, match=r"covariances have shapes \(\) and \(\)"):
+        rw.clouds.lidar_and_camera(places.T_camera_board, seen.T_sensor_board, size, 3.0)
+    with pytest.raises(CloudError, match="clouds are 'folder'; give a list of Cloud"):
+        rw.clouds.seen_boards("folder", size)  # type: ignore[arg-type]
 
 
 def test_real_places_give_one_answer(shared_data: Path) -> None:

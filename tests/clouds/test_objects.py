@@ -81,6 +81,15 @@ def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: Shape, 
     assert error @ np.linalg.solve(covariance, error) < 22.5  # 99.9 %
 
 
+def test_arrays_of_points_are_clouds_and_other_things_are_named(bust: SimulatedClouds) -> None:
+    plain = seen_object([each.points for each in bust.clouds[:4]], bust.A[:4])
+    assert np.array_equal(plain.T_sensor_object, seen_object(bust.clouds[:4], bust.A[:4]).T_sensor_object)
+    with pytest.raises(CloudError, match=r"clouds\[1\]: points cannot be read as numbers"):
+        seen_object([bust.clouds[0], "two.pcd"], bust.A[:2])  # type: ignore[list-item]
+    with pytest.raises(CloudError, match="clouds are 'folder'; give a list of Cloud"):
+        seen_object("folder", bust.A)  # type: ignore[arg-type]
+
+
 def test_groups_of_views_that_little_links_claim_no_more_than_all_views_together() -> None:
     rng = np.random.default_rng(4)
     poses = random_poses(6, 0.3, rng)

@@ -175,6 +175,8 @@ def test_foxglove_s_cloud_in_protobuf(tmp_path: Path, times: int) -> None:
     (record,) = read(tmp_path / "a.mcap")
     assert record.T_frame_points is None
     np.testing.assert_array_equal(cloud_of_record(record).points, np.tile(POINTS, (times, 1)))
+    every = max(1, times * len(POINTS) // 4)
+    np.testing.assert_array_equal(cloud_of_record(record, most=4).points, np.tile(POINTS, (times, 1))[::every])
 
 
 def test_a_message_of_many_lists_is_refused_however_its_bytes_stand(tmp_path: Path) -> None:

@@ -240,3 +240,14 @@ def test_logs_are_no_folders_of_images(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
     assert not is_folder_without_logs(tmp_path)
     assert not is_folder_without_logs(tmp_path / "run.mcap")
+
+
+def test_poses_that_are_more_than_the_clouds_are_said(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0.1, 1.0, (200, 3))
+    for number in range(3):
+        np.save(tmp_path / f"view{number}.npy", points)
+    rows = ("0.1, 0.2, 0.3, 0.4, 0.5, 0.6\n" * 4, "0.1 0.2 0.3 0 0 0 1\n" * 4)
+    for text in rows:
+        (tmp_path / "poses.txt").write_text(text, encoding="utf-8")
+        with pytest.raises(RigError, match=r"no file of poses that fits them; .*poses.txt: 3 clouds and 4 poses"):
+            propose_folder_rig(tmp_path)
