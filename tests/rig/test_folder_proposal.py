@@ -250,4 +250,4 @@ def test_poses_that_are_more_than_the_clouds_are_said(tmp_path: Path) -> None:
     for text in rows:
         (tmp_path / "poses.txt").write_text(text, encoding="utf-8")
         with pytest.raises(RigError, match=r"no file of poses that fits them; .*poses.txt: 3 clouds and 4 poses"):
-            propose_folder_rig(tmp_path)
+            propose_folder_rig(tmp_path, tmp_path / "rig.yaml")
