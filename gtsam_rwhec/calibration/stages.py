@@ -271,6 +271,8 @@ def _calibrated(run: Run) -> Calibration:
     if reading.finding is None and solution is not None:
         free = solution.identifiability.free_directions if refined is None else refined.free_directions
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
+    if refined is not None and problem.shifts_m:
+        refined = refined.with_shifts(problem.shifts_m, problem.pairs)
     best = solution if refined is None else refined
     views = {} if best is None else views_of(problem, inliers, best.scale)
     carriers = Carriers(problem.sensor_carrier, problem.target_carrier)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import gtsam
 import numpy as np
@@ -132,6 +132,17 @@ class RefinedPoses:
                 if unknown in self.joint.slots:
                     covariance += J @ self.joint.turned(unknown) @ J.T
         return covariance
+
+    def with_shifts(self, of_targets: Mapping[str, float], pairs: Sequence[Pair]) -> Self:
+        """The same, where all that a sensor saw of targets is shifted alike in its axes (deviations, m)."""
+        finite = self.joint.finite.copy()
+        for name in self.Y:
+            shifts = [of_targets.get(pair.target, 0.0) for pair in pairs if pair.sensor == name]
+            rows = self.joint.slots.get(Unknown.of(name))
+            if rows is not None:
+                at = np.arange(rows.stop - 3, rows.stop)
+                finite[at, at] += min(shifts, default=0.0) ** 2
+        return replace(self, joint=replace(self.joint, finite=finite))
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

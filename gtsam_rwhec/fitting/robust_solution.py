@@ -208,10 +208,13 @@ class TruncatedLeastSquares:
         #: Whether there are measurements enough to tell an outlier.
         self.searches = True
         self.measured = Measured.of(self.problem)
-        self.smallest_factors = VarianceFactors(
-            2.0 * float(np.median(self.measured.kappa)) * QUIETEST**2,
-            QUIETEST**2 / float(np.median(self.measured.sigma)) ** 2,
-        )
+        # What registrations state is the least that they are off by.
+        self.smallest_factors = AS_STATED
+        if not self.problem.is_of_registrations:
+            self.smallest_factors = VarianceFactors(
+                2.0 * float(np.median(self.measured.kappa)) * QUIETEST**2,
+                QUIETEST**2 / float(np.median(self.measured.sigma)) ** 2,
+            )
 
     def run(self, noise_scale: NoiseScale) -> Steps[tuple[WeightedFit, np.ndarray]]:
         """The best answer and its inliers (N,)."""
@@ -253,7 +256,7 @@ class TruncatedLeastSquares:
         for each unknown: then it cannot pull.
         """
         count = len(everyone)
-        # What registrations state is the least that they are off by: who agrees under it is no outlier.
+        # Who agrees as registrations state is no outlier.
         if noise_scale == "given" or self.problem.is_of_registrations:
             agree = bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
             if agree or noise_scale == "given":

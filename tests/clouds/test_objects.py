@@ -70,7 +70,7 @@ def test_one_answer_by_whichever_thing(shared_data: Path) -> None:
     assert to_David @ np.linalg.solve(of_Sphere + of_David, to_David) < CHI2_95
 
 
-@pytest.mark.parametrize(("shape", "seed"), [("bust", 1), ("cube", 1), ("box", 0)])
+@pytest.mark.parametrize(("shape", "seed"), [("cube", 1), ("box", 0), ("heap", 203)])
 def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: Shape, seed: int) -> None:
     views = clouds_of_thing(shape, 9, seed)
     calibration, Y, covariance = answer(views.clouds, views.A)
