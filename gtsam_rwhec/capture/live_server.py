@@ -164,6 +164,9 @@ class PageServer:
             said = json.loads(text)
             if isinstance(said, dict) and isinstance(said.get("drawn"), str):
                 return str(said["drawn"])
+            if isinstance(said, dict) and isinstance(said.get("take_at"), str):
+                await self._session.take_at(said["take_at"])
+                return None
             if not isinstance(said, dict) or said.get("do") not in (*COMMANDS,):
                 raise RwhecError(f"the page sent {brief(text)} in place of one of {', '.join(COMMANDS)}")
             await self._session.command(said["do"])

@@ -161,6 +161,11 @@ class Session:
             raise RwhecError(f"there is no command {name[:40]!r}; there are {', '.join(COMMANDS)}")
         self.touch()
 
+    async def take_at(self, pose: str) -> None:
+        """Take the next images as seen from a pose that somebody typed. A RwhecError says why it cannot be done."""
+        self.source.give_pose(pose)
+        await self.command("take")
+
     def say(self, words: str, kind: str = "") -> None:
         """Add to what is shown of what happened; `kind` is empty, ``good`` or ``bad``."""
         self.said_count += 1
@@ -178,7 +183,12 @@ class Session:
         """Everything that is shown, but for the pictures."""
         streams, takes = self.streams, self.takes.all
         return {
-            "source": {"name": self.source.name, "is_connected": self.source.is_connected, "state": self.source.state},
+            "source": {
+                "name": self.source.name,
+                "is_connected": self.source.is_connected,
+                "state": self.source.state,
+                "takes_poses": self.source.takes_poses,
+            },
             "cameras": [self._camera(stream) for stream in streams.sensors.values()],
             "still": {"is_still": self._still.is_still, "words": str(self._still)},
             "takes": {
@@ -338,7 +348,7 @@ class Session:
 
     async def _write_take(self, seen: list[Seen]) -> None:
         stamp = max(self.streams.carriers_stamp(each) for each in seen)
-        is_still = self._is_still_at(seen)
+        is_still = self.source.takes_poses or self._is_still_at(seen)  # who types a pose says that it stands there
         messages = self.streams.of_take(seen)
         records = {each.sensor: each.records for each in seen}
         self._busy = "writing the take"

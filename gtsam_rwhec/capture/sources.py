@@ -65,6 +65,8 @@ class Source(ABC):
     is_finite = False
     #: Whether keys that are pressed at the terminal are commands; else standard input is the source's.
     reads_keys = True
+    #: Whether somebody says where the robot stands: `give_pose`.
+    takes_poses = False
 
     def __init__(self, name: str, rig: Rig) -> None:
         self.name, self.rig = name, rig
@@ -94,6 +96,16 @@ class Source(ABC):
             The source takes no messages; the message says why.
         """
         raise LogError(f"{self.name} takes no messages: a pose is published to a Foxglove WebSocket (ws://...) only")
+
+    def give_pose(self, line: str) -> None:
+        """Say where the robot stands now: x y z qx qy qz qw of T_parent_child in metres, or the 16 numbers of a matrix.
+
+        Raises
+        ------
+        LogError, FileFormatError
+            The source has poses of its own; or the line is none.
+        """
+        raise LogError(f"{self.name} has poses of its own; they are typed beside a camera of this machine only")
 
     def wants(self, topic: str, schema: str) -> bool:
         """Whether the rig file needs a topic."""

@@ -71,6 +71,14 @@ class CameraSource(Source):
         self._until_s = 0.0
         Thread(target=self._read_lines, args=(poses,), daemon=True).start()
 
+    takes_poses = True
+
+    def give_pose(self, line: str) -> None:
+        """As `Source.give_pose`; the pose holds for some seconds."""
+        self._T = poses_of(read_pose_table("a pose", line, stated=PoseStatement()), PoseStatement()).T[-1]
+        self._until_s = time.monotonic() + HOLDS_S
+        self.state = f"at {self._T[:3, 3].round(4).tolist()} m"
+
     async def messages(self) -> AsyncIterator[Message]:
         """Images, and before each the pose that holds; ends with a video."""
         self.is_connected, self.state = True, "waiting for a pose: x y z qx qy qz qw, in metres"
@@ -98,12 +106,9 @@ class CameraSource(Source):
         if not line.strip():
             return
         try:
-            self._T = poses_of(read_pose_table("a pose", line, stated=PoseStatement()), PoseStatement()).T[-1]
+            self.give_pose(line)
         except FileFormatError as error:
             self.say("lines that are no pose", f"{brief(line)}: {error}")
-            return
-        self._until_s = time.monotonic() + HOLDS_S
-        self.state = f"at {self._T[:3, 3].round(4).tolist()} m"
 
     def _messages_of(self, image: cv2.typing.MatLike, stamp_ns: int) -> list[Message]:
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

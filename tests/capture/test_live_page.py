@@ -102,6 +102,8 @@ def test_nonsense_is_answered_and_two_pages_are_shown_the_same(
         assert "the page sent bytes" in heard(one, "error")["error"]
         one.send_text('{"do": "undo"}')
         assert "there is no take to undo" in heard(one, "error")["error"]
+        one.send_text('{"take_at": "0 0 0 0 0 0 1"}')
+        assert "has poses of its own" in heard(one, "error")["error"]
         with client.websocket_connect(where, headers=origin(server)) as other:
             assert heard(other, "takes")["takes"]["when_still"] is False
             one.send_text('{"do": "when_still"}')

@@ -14,7 +14,7 @@ from rendered import pose, printed, render
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.capture.live_session import LiveOptions, Session, source_of
 from gtsam_rwhec.capture.sources_camera import CameraSource
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.rig import parse_rig
 
@@ -69,6 +69,11 @@ def test_a_camera_beside_poses_that_are_written_is_taken_from_and_calibrated(tmp
             while source.received["/cam"] < EACH * i + 3:
                 assert not running.done()
                 await asyncio.sleep(0.02)
+            if i % 2:  # typed on the page
+                with pytest.raises(FileFormatError, match="a pose, line 1"):
+                    await session.take_at("1 2 3")
+                await session.take_at(line_of(T).strip())
+                continue
             with lines.open("a") as out:
                 out.write("this is no pose\n" if i == 0 else "")
                 out.write(line_of(T)[:20])  # a line comes in pieces
@@ -80,6 +85,7 @@ def test_a_camera_beside_poses_that_are_written_is_taken_from_and_calibrated(tmp
     session = asyncio.run(run())
     assert len(session.takes.all) == 5, session.state()["said"]
     assert session.judgement is not None
+    assert not any("the robot moved" in words for _, _, words in session.state()["said"])
     assert "lines that are no pose: 1; the first: " in str(source.troubles["lines that are no pose"])
     found = read_result(tmp_path / "out" / "calibration" / "result.json").refined.Y["cam"].matrix()
     assert np.linalg.norm(found[:3, 3] - Y[:3, 3]) < 1e-3

@@ -173,6 +173,7 @@ function show(now) {
   fill($("#happened .counted"), now.counted.map((words) => made("li", words)));
   $("#happened .folder").textContent = `Everything is in ${now.folder}`;
   for (const button of document.querySelectorAll("button")) button.disabled = now.ended;
+  $("#pose").hidden = !now.source.takes_poses;
   $("[data-do=take]").setAttribute("aria-busy", now.takes.pending);
   $("[data-do=when_still]").setAttribute("aria-pressed", now.takes.when_still);
   $("[data-do=undo]").disabled ||= !now.takes.count;
@@ -183,6 +184,12 @@ function banner(words) {
   $("#banner").hidden = !words;
   if ($("#banner").textContent !== words) $("#banner").textContent = words;
 }
+
+$("#pose").addEventListener("submit", (event) => {
+  event.preventDefault();
+  if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ take_at: $("#typed").value }));
+  $("#typed").select();
+});
 
 function ask(name) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ do: name }));
@@ -205,10 +212,10 @@ function connect() {
 
 document.addEventListener("click", ({ target }) => {
   const button = target.closest("button");
-  if (button) ask(button.dataset.do);
+  if (button?.dataset.do) ask(button.dataset.do);
 });
 document.addEventListener("keydown", (event) => {
-  if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.target.matches("input") || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
   const name = keys[event.key.toLowerCase()];
   if (name && !hasEnded) ask(name);
 });
