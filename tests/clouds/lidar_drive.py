@@ -17,7 +17,7 @@ MOUNTS = {
     "front": se3.pose(np.eye(3), np.array([1.5, 0.0, 1.8])),
     "rear": se3.pose(Rotation.from_euler("zyx", [170, 5, -8], degrees=True).as_matrix(), np.array([-1.8, 0.3, 2.0])),
 }
-BEAMS, STEPS, TURN_S, NOISE_M, REACH_M = 16, 300, 0.1, 0.015, 40.0
+BEAMS, STEPS, TURN_S, NOISE_M, REACH_M = 16, 240, 0.1, 0.015, 40.0
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ given: {heights_m: {front: 1.8, rear: 2.0}, height_sigma_mm: 5}
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    return lidar_drive.driven(8.0, seed=1)
+    return lidar_drive.driven(6.0, seed=1)
 
 
 @pytest.fixture(scope="module")
