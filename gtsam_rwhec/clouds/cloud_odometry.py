@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain, islice
 
 import numpy as np
 from rwhec_factors import se3
@@ -33,8 +34,12 @@ FOUND, JUMP = 0.5, 0.3
 LOST_S = 1.0
 #: What surroundings do not tell (along a corridor, over an open field) has less than this share of the information.
 TOLD = 0.02
-#: Fewer sweeps have no motion to compare.
-FEWEST = 3
+#: Fewer sweeps have no motion to compare, and fewer points of one no pose.
+FEWEST, FEWEST_POINTS = 3, 100
+#: The spacing is found on so many sweeps. A point that is farther than this, m, is none.
+SPACED, FARTHEST_M = 9, 1e4
+#: The points of a sweep are taken over at least and at most these shares of the time between two sweeps.
+SHORTEST, LONGEST = 0.1, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,24 +55,29 @@ class CloudTrack:
         and nothing tells the motion between: a gap of stamps.
     left_out : tuple of str
         Sweeps that are not used, and why.
-    has_times : bool
-        Whether points have times, so that the motion during each sweep is taken off.
+    why_no_times : str
+        Why the motion during a sweep is not taken off: points have no times, or none that can be; empty if it is.
     """
 
     stamps_ns: np.ndarray
     T_start_sensor: Array
     left_out: tuple[str, ...]
-    has_times: bool
+    why_no_times: str
 
 
 @dataclass(frozen=True)
 class _Sweep:
-    """Points (n, 3) of a sweep with the seconds (n,) from its middle, and the stamp of that."""
+    """Points (n, 3) of a sweep with the seconds (n,) from a stamp: the sweep's, or in the end that of its middle."""
 
     name: str
     points: Array
     times_s: Array
     stamp_ns: int
+
+    def about_its_middle(self, times: float) -> _Sweep:
+        """The same with the stamp of its middle, and times from that; times count so many times as much."""
+        middle = times * 0.5 * float(self.times_s.min() + self.times_s.max())
+        return replace(self, times_s=times * self.times_s - middle, stamp_ns=self.stamp_ns + round(1e9 * middle))
 
 
 def odometry(clouds: Iterable[Cloud], *, progress: Progress | None = None) -> CloudTrack:
@@ -83,7 +93,7 @@ def odometry(clouds: Iterable[Cloud], *, progress: Progress | None = None) -> Cl
     Raises
     ------
     CloudError
-        A sweep has no stamp, or is older than the one before it; or fewer than 3 can be registered.
+        A sweep has no stamp, or fewer than 3 can be registered.
 
     Notes
     -----
@@ -91,40 +101,68 @@ def odometry(clouds: Iterable[Cloud], *, progress: Progress | None = None) -> Cl
     that the first one found. A sweep from which the surroundings do not tell every motion is left out.
     """
     tell = progress or silent
-    sweeps, spacing_m, has_times = _thinned(clouds)
+    sweeps, spacing_m, left_out, why_no_times = _thinned(clouds)
     steps: Array = np.zeros((len(sweeps), 6))
-    found: dict[int, Array] = {}
-    for number, gate in enumerate(GATES if has_times else GATES[:1], start=1):
+    found, why = dict[int, Array](), dict[int, str]()
+    for number, gate in enumerate(GATES[:1] if why_no_times else GATES, start=1):
         found, why = _registered(sweeps, steps, found, spacing_m, gate, f"registering sweeps, round {number}:", tell)
         steps = _velocities(sweeps, found)
+    left_out += [why[k] for k in sorted(why)]
     if len(found) < FEWEST:
-        reasons = "; ".join(list(why.values())[:3])
-        raise CloudError(f"of {len(sweeps)} sweeps {len(found)} can be registered; motions need {FEWEST}. {reasons}")
+        total = len(sweeps) + len(left_out) - len(why)
+        reasons = "; the first: " + "; ".join(left_out[:3]) if left_out else ""
+        raise CloudError(f"of {total} sweeps {len(found)} can be registered, and motions need {FEWEST}{reasons}")
     at = np.array(sorted(found))
     stamps = np.array([sweeps[k].stamp_ns for k in at], dtype=np.int64)
-    return CloudTrack(stamps, np.array([found[k] for k in at]), tuple(why[k] for k in sorted(why)), has_times)
+    return CloudTrack(stamps, np.array([found[k] for k in at]), tuple(left_out), why_no_times)
 
 
-def _thinned(clouds: Iterable[Cloud]) -> tuple[list[_Sweep], float, bool]:
-    """All sweeps with one point for each cube of the spacing, the spacing, and whether all points have times."""
+def _thinned(clouds: Iterable[Cloud]) -> tuple[list[_Sweep], float, list[str], str]:
+    """Sweeps with one point for each cube of the spacing, the spacing, who is left out, and why times are not used."""
+    given = enumerate(Cloud.each(clouds))
+    first = list(islice(given, SPACED))
+    spacing_m = SPACING * float(np.median([np.median(np.linalg.norm(c.points, axis=1)) for _, c in first] or [0.0]))
     sweeps: list[_Sweep] = []
-    spacing_m, has_times = 0.0, True
-    for number, cloud in enumerate(Cloud.each(clouds)):
+    left_out, has_times, last_ns = [], True, None
+    for number, cloud in chain(first, given):
         name = cloud.source or f"sweep {number}"
         if cloud.stamp_ns is None:
             raise CloudError(f"{name} has no stamp; give Cloud.of(..., stamp_ns=...)")
-        if not spacing_m:
-            spacing_m = SPACING * float(np.median(np.linalg.norm(cloud.points, axis=1)))
-        has_times = has_times and cloud.times_s is not None
+        if last_ns is not None and cloud.stamp_ns <= last_ns:
+            left_out.append(f"{name}: its stamp {cloud.stamp_ns} ns is no later than that of the sweep before it")
+            continue
         times = np.zeros(len(cloud)) if cloud.times_s is None else cloud.times_s
-        middle = 0.5 * float(times.min() + times.max())
-        stamp = cloud.stamp_ns + round(1e9 * middle)
-        if sweeps and stamp <= sweeps[-1].stamp_ns:
-            raise CloudError(f"{name} is at {stamp} ns, no later than the sweep before it; give sweeps in their order")
-        first = np.unique(np.floor(cloud.points / spacing_m).astype(np.int64), axis=0, return_index=True)[1]
-        points, times = (each[first].astype(np.float32) for each in (cloud.points, times - middle))
-        sweeps.append(_Sweep(name, points, times, stamp))
-    return sweeps, spacing_m, has_times and bool(sweeps)
+        kept = np.isfinite(times) & (np.abs(cloud.points).max(axis=1) < FARTHEST_M)
+        points, times = cloud.points[kept], times[kept]
+        at = np.unique(np.floor(points / spacing_m).astype(np.int64), axis=0, return_index=True)[1]
+        if len(at) < FEWEST_POINTS:
+            left_out.append(f"{name}: {len(at)} points are left after thinning to {spacing_m:.2g} m")
+            continue
+        has_times, last_ns = has_times and cloud.times_s is not None, cloud.stamp_ns
+        sweeps.append(_Sweep(name, points[at].astype(np.float32), times[at], cloud.stamp_ns))
+    if not has_times:
+        return (
+            [replace(each, times_s=0.0 * each.times_s) for each in sweeps],
+            spacing_m,
+            left_out,
+            "points have no times",
+        )
+    why = _implausible(sweeps)
+    return [each.about_its_middle(0.0 if why else 1.0) for each in sweeps], spacing_m, left_out, why
+
+
+def _implausible(sweeps: Sequence[_Sweep]) -> str:
+    """Why times of points cannot be those of sweeps that follow each other; empty if they can."""
+    if len(sweeps) < 2:
+        return ""
+    lasts = float(np.median([np.ptp(each.times_s) for each in sweeps]))
+    apart = 1e-9 * float(np.median(np.diff([each.stamp_ns for each in sweeps])))
+    if SHORTEST * apart <= lasts <= LONGEST * apart:
+        return ""
+    return (
+        f"times of points of one sweep span {lasts:.3g} s where sweeps are {apart:.3g} s apart: another unit than "
+        "seconds (float) or nanoseconds (whole), or not filled in"
+    )
 
 
 def _registered(

@@ -158,6 +158,12 @@ def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> lis
     """
     source = rig.odometries[sensor].odometry
     assert source.clouds is not None
+    topics = {each.name: each for each in log.topics()}
+    if not topics[source.clouds].has_clouds:
+        place = rig.source.place(("sensors", sensor, "odometry", "clouds"))
+        raise LogError(
+            f"{place}: topic {source.clouds} has {topics[source.clouds].schema}; give one of PointCloud2 or PointCloud"
+        )
     sweeps = _Source(log, source.clouds, None, None, {})
     unread: list[CloudError] = []
 
@@ -175,10 +181,10 @@ def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> lis
             total = len(unread) + len(track.left_out) + len(track.stamps_ns)
             said = f"{where}: {len(reasons)} of {total} sweeps {words}; the first: {reasons[0]}"
             warnings.warn(said, LogWarning, stacklevel=3)
-    if not track.has_times:
+    if track.why_no_times:
         said = (
-            f"{where}: its points have no times, so the motion during each sweep stays in them, and the sensor's place "
-            "is centimetres off where the vehicle is fast; let the driver write the field time, t or timestamp"
+            f"{where}: {track.why_no_times}. So the motion during each sweep stays in them, and the sensor's place is "
+            "centimetres off where the vehicle is fast; let the driver write the field time, t or timestamp"
         )
         warnings.warn(said, LogWarning, stacklevel=3)
     topic, frame = odometry_topic(sensor), f"{rig.frame_of(sensor)}{START}"

@@ -15,7 +15,7 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, odometry
 from gtsam_rwhec.clouds.named_fields import record_of_cloud
-from gtsam_rwhec.errors import CloudError
+from gtsam_rwhec.errors import CloudError, LogError
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.detection_stage import detect_log
@@ -43,7 +43,7 @@ def recorded(drive: Drive) -> dict[str, list[Cloud]]:
 
 def test_the_motion_is_that_between_the_middles_of_the_sweeps(drive: Drive, recorded: dict[str, list[Cloud]]) -> None:
     track = odometry(recorded["front"])
-    assert track.has_times
+    assert not track.why_no_times
     assert track.left_out == ()
     assert track.stamps_ns == pytest.approx(drive.stamps_ns[:-1] + 5e7, abs=1e6)
     poses = drive.T_world_vehicle @ lidar_drive.MOUNTS["front"]
@@ -102,9 +102,29 @@ def test_a_sweep_of_elsewhere_costs_itself_alone(recorded: dict[str, list[Cloud]
 
 def test_sweeps_without_times_or_out_of_order_are_said(recorded: dict[str, list[Cloud]], tmp_path: Path) -> None:
     few = recorded["front"][:12]
-    assert not odometry([replace(each, times_s=None) for each in few]).has_times
-    with pytest.raises(CloudError, match="no later than the sweep before it"):
+    assert odometry([replace(each, times_s=None) for each in few]).why_no_times == "points have no times"
+    for factor in (0.0, 1e-3, 1e3):  # not filled in, microseconds taken for nanoseconds, milliseconds for seconds
+        track = odometry([replace(each, times_s=factor * each.times_s) for each in few])  # type: ignore[operator]
+        assert "where sweeps are 0.1 s apart" in track.why_no_times
+        assert len(track.stamps_ns) == 12
+    holed = np.where(np.arange(len(few[3])) % 7, few[3].times_s, np.nan)
+    far = np.where(np.arange(len(few[4]))[:, None] == 5, 1e30, few[4].points)
+    spoiled = [
+        *few[:3],
+        replace(few[3], times_s=holed),
+        replace(few[4], points=far),
+        few[4],
+        few[5].selected(np.arange(3)),
+        *few[6:],
+    ]
+    track = odometry(spoiled)
+    assert len(track.stamps_ns) == 11
+    assert "no later than that of the sweep before" in track.left_out[0]
+    assert "points are left after thinning" in track.left_out[1]
+    with pytest.raises(CloudError, match="of 2 sweeps 1 can be registered, and motions need 3; the first: sweep 1"):
         odometry([few[1], few[0]])
+    with pytest.raises(CloudError, match=r"of 0 sweeps 0 can be registered, and motions need 3$"):
+        odometry([])
     with pytest.raises(CloudError, match="sweep 0 has no stamp"):
         odometry([replace(few[0], stamp_ns=None)])
     log = tmp_path / "drive.mcap"
@@ -118,4 +138,9 @@ def test_sweeps_without_times_or_out_of_order_are_said(recorded: dict[str, list[
         warnings.simplefilter("always")
         rig = parse_rig(RIG, "rig.yaml")
         detect_log(log, rig, tmp_path / "detected.mcap")
-    assert any("its points have no times" in str(each.message) for each in said)
+    assert any("points have no times. So" in str(each.message) for each in said)
+    with LogWriter(tmp_path / "poses.mcap") as out:
+        out.pose("/front/points", 1, "map", np.eye(4))
+        out.pose("/rear/points", 1, "map", np.eye(4))
+    with pytest.raises(LogError, match=r"rig\.yaml, line 4: .* has foxglove.PoseInFrame; give one of PointCloud2"):
+        detect_log(tmp_path / "poses.mcap", rig, tmp_path / "detected.mcap")
