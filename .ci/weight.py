@@ -28,7 +28,8 @@ BUDGET = {
     # issue 29: points and planes in the certified problem 1,300; objects 1,600; formats and the road 1,600; LiDARs,
     # boards and shapes in clouds 1,300; simulated clouds and scans 500. The Stream's shared errors and cameras: 300
     # what slides as one motion of a thing 100; init for clouds of a log 130; groups of views of one thing 90
-    # LiDARs by their sweeps 330; why poses fit no clouds 40; shifts of all views 25; poses typed on the page 30; sweeps that cannot be used 45
+    # LiDARs by their sweeps 330; why poses fit no clouds 40; shifts of all views 25; poses typed on the page 30; sweeps
+    # that cannot be used 45
     "lines": 100_025,
     "code": 62_410,
     # capture has 25 files, and is a package of its own
