@@ -118,6 +118,7 @@ def boards_at_once(seed: int, takes: int) -> tuple[list[One], np.ndarray]:
     return every, Y
 
 
+@pytest.mark.slow
 def test_measurements_of_one_stamp_share_the_arms_error() -> None:
     squares, alones = [], []
     for seed in range(24):

@@ -52,6 +52,7 @@ def test_only_our_errors_leave_a_reader(reader: str, part: int, tmp_path: Path) 
     assert outcome.peak_mb <= run.LIMIT_MB
 
 
+@pytest.mark.slow
 def test_errors_loops_and_memory_of_a_planted_reader_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "planted.py").write_text(PLANTED)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(run.HERE)}", prepend=":")

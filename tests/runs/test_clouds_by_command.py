@@ -264,6 +264,7 @@ def test_a_real_thing_by_one_command(thing: str, off_m: float, status: str, shar
     assert ("The sensors' poses do not need them" in " ".join(said.split())) == (thing == "Sphere")
 
 
+@pytest.mark.slow
 def test_depth_images_are_clouds(made: SimulatedClouds, tmp_path: Path) -> None:
     """Images of 16 bits, in tenths of a millimetre."""
     (tmp_path / "depth").mkdir()

@@ -187,6 +187,7 @@ def test_nominal_intrinsics_of_other_people(circles_log: Path) -> None:
     assert held_out_errors(found.refined)["camera"].rms_mm < 0.7 * 4.6
 
 
+@pytest.mark.slow
 def test_the_log_road_chooses_what_predicts_left_out_images_of_other_people(circles_log: Path) -> None:
     """Freeing the errors of A predicts them to 10 mm, A as exact to 2; and the arm's errors are named."""
     solved = solve_log(circles_log)
