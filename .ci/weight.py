@@ -30,8 +30,8 @@ BUDGET = {
     # what slides as one motion of a thing 100; init for clouds of a log 130; groups of views of one thing 90
     # LiDARs by their sweeps 330; why poses fit no clouds 40; shifts of all views 25; poses typed on the page 30; sweeps
     # that cannot be used 45
-    "lines": 100_025,
-    "code": 62_410,
+    "lines": 100_045,
+    "code": 62_425,
     # capture has 25 files, and is a package of its own
     "files": 439,
     "packages": 20,

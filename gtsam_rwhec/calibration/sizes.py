@@ -75,6 +75,8 @@ class TargetSize:
     sigma: float | None  #: Standard deviation of the scale; None where the motion does not determine it
     #: Whether no test of it could run: it looked wrong and hangs on single blocks of rows, or no answer has it
     is_untested: bool = False
+    #: Whether it has no stated size, but lengths in clouds
+    is_of_clouds: bool = False
 
     @property
     def is_doubted(self) -> bool:
@@ -89,6 +91,11 @@ class TargetSize:
     def __str__(self) -> str:
         if self.sigma is None:
             return f"the motion does not tell the size of {self.target}"
+        if self.is_of_clouds:
+            return (
+                f"lengths in the clouds of {self.target} are {_off(self.scale)} than the motion says (standard "
+                f"deviation {rounded(100.0 * self.sigma)} %): the 3D camera measures so, or the robot's poses have other lengths"
+            )
         return (
             f"the stated size of {self.target} is {_off(self.scale)} than the motion says "
             f"(standard deviation {rounded(100.0 * self.sigma)} %)"
@@ -152,7 +159,9 @@ def sizes(
         return ()
     (progress or silent)("looking at the targets' sizes")
     free = summed_again(problem)
-    free.scale, free.fixed, free.priors = "per_target", dict(problem.fixed), dict(problem.priors)
+    # What weighs by direction has one factor for all.
+    free.scale = "shared" if problem.directed else "per_target"
+    free.fixed, free.priors = dict(problem.fixed), dict(problem.priors)
     # Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are.
     for name in {pair.target for pair in free.pairs} & set(free.fixed):
         T = free.fixed.pop(name)
@@ -162,8 +171,8 @@ def sizes(
         warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
         try:
             start = solve(free)
-            assert isinstance(start.scale, dict)
-            if not all(1.0 / LARGEST < scale < LARGEST for scale in start.scale.values()):
+            scales = start.scale.values() if isinstance(start.scale, dict) else [start.scale]
+            if not all(1.0 / LARGEST < scale < LARGEST for scale in scales):
                 return ()  # the lengths of B tell nothing, or they are those of another unit: that is a misreading
             refined = refined_by(free, start, options or RefineOptions(noise="estimate"))
         except ScaleError:
@@ -175,7 +184,7 @@ def sizes(
         found = sizes_in(refined)
         if any(size.is_doubted or size.is_uncertain for size in found):
             found = _under_all_noise(free, start, options, like, progress or silent) or _with_jackknife(free, found)
-    return tuple(found)
+    return tuple(replace(size, is_of_clouds=size.target in problem.shifts_m) for size in found)
 
 
 def refined_by(
@@ -211,8 +220,11 @@ def _under_all_noise(
 
 
 def sizes_in(refined: Refined) -> list[TargetSize]:
-    """The sizes of an answer with a scale of each target."""
-    assert isinstance(refined.scale, Mapping)
+    """The sizes of an answer with a scale of each target, or one of all."""
+    if not isinstance(refined.scale, Mapping):
+        variance = float(refined.covariance("scale")[0, 0])
+        sigma = math.sqrt(variance) if math.isfinite(variance) else None
+        return [TargetSize(name, refined.scale, sigma) for name in refined.X]
     variances = {name: float(refined.covariance(Unknown(UnknownKind.SCALE, name))[0, 0]) for name in refined.scale}
     sigmas = {name: math.sqrt(of) if math.isfinite(of) else None for name, of in variances.items()}
     return [TargetSize(name, scale, sigmas[name]) for name, scale in refined.scale.items()]
@@ -233,9 +245,9 @@ def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:
             return [  # the sizes hang on single blocks
                 replace(size, sigma=None, is_untested=size.is_doubted or size.is_uncertain) for size in found
             ]
-        assert isinstance(scale, dict)
-        for name in scales.keys() & scale.keys():
-            scales[name].append(scale[name])
+        of_block = scale if isinstance(scale, dict) else dict.fromkeys(scales, scale)
+        for name in scales.keys() & of_block.keys():
+            scales[name].append(of_block[name])
     sigmas = {
         name: STUDENT * math.sqrt((BLOCKS - 1) * float(np.var(of))) for name, of in scales.items() if len(of) == BLOCKS
     }

@@ -90,6 +90,13 @@ def test_arrays_of_points_are_clouds_and_other_things_are_named(bust: SimulatedC
         seen_object("folder", bust.A)  # type: ignore[arg-type]
 
 
+def test_clouds_of_another_scale_than_the_poses_are_named(bust: SimulatedClouds) -> None:
+    longer = [replace(each, points=1.005 * each.points) for each in bust.clouds]
+    calibration, _, _ = answer(longer, bust.A)
+    assert rw.Ground.SIZE_DOUBTED in calibration.judgement.grounds
+    assert "lengths in the clouds of thing are 0.5 % larger than the motion says" in str(calibration.judgement)
+
+
 def test_groups_of_views_that_little_links_claim_no_more_than_all_views_together() -> None:
     rng = np.random.default_rng(4)
     poses = random_poses(6, 0.3, rng)
