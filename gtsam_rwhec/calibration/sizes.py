@@ -94,7 +94,8 @@ class TargetSize:
         if self.is_of_clouds:
             return (
                 f"lengths in the clouds of {self.target} are {_off(self.scale)} than the motion says (standard "
-                f"deviation {rounded(100.0 * self.sigma)} %): the 3D camera measures so, or the robot's poses have other lengths"
+                f"deviation {rounded(100.0 * self.sigma)} %): the 3D camera measures so, or lengths of the robot's poses "
+                "are wrong"
             )
         return (
             f"the stated size of {self.target} is {_off(self.scale)} than the motion says "
