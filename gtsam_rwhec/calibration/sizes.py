@@ -94,8 +94,7 @@ class TargetSize:
         if self.is_of_clouds:
             return (
                 f"lengths in the clouds of {self.target} are {_off(self.scale)} than the motion says (standard "
-                f"deviation {rounded(100.0 * self.sigma)} %): the 3D camera measures so, or lengths of the robot's poses "
-                "are wrong"
+                f"deviation {rounded(100.0 * self.sigma)} %): those of the camera, or of the robot's poses, are wrong"
             )
         return (
             f"the stated size of {self.target} is {_off(self.scale)} than the motion says "
