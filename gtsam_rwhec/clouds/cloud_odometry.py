@@ -97,8 +97,8 @@ def odometry(clouds: Iterable[Cloud], *, progress: Progress | None = None) -> Cl
 
     Notes
     -----
-    Sweeps are registered twice (Segal et al. 2009, "Generalized-ICP"; small_gicp): the second time without the motion
-    that the first one found. A sweep from which the surroundings do not tell every motion is left out.
+    Sweeps are registered (Segal et al. 2009, "Generalized-ICP"; small_gicp), and where points have times a second time,
+    without the motion that the first one found. A sweep is left out where the surroundings do not tell every motion.
     """
     tell = progress or silent
     sweeps, spacing_m, left_out, why_no_times = _thinned(clouds)
@@ -140,14 +140,7 @@ def _thinned(clouds: Iterable[Cloud]) -> tuple[list[_Sweep], float, list[str], s
             continue
         has_times, last_ns = has_times and cloud.times_s is not None, cloud.stamp_ns
         sweeps.append(_Sweep(name, points[at].astype(np.float32), times[at], cloud.stamp_ns))
-    if not has_times:
-        return (
-            [replace(each, times_s=0.0 * each.times_s) for each in sweeps],
-            spacing_m,
-            left_out,
-            "points have no times",
-        )
-    why = _implausible(sweeps)
+    why = _implausible(sweeps) if has_times else "points have no times"
     return [each.about_its_middle(0.0 if why else 1.0) for each in sweeps], spacing_m, left_out, why
 
 

@@ -108,7 +108,8 @@ def of_groups(poses: Array, i: np.ndarray, j: np.ndarray, information: Array, un
     The views of one side of a box know each other well, and those of the other side little: its width is told by edges
     alone. With C the covariance of all poses and D that of each view among the others, D^-1/2 C D^-1/2 then has large
     eigenvalues m. A problem takes views as independent. For any shares p_k that sum to one, m w w' is no more than the
-    block diagonal m w_k w_k' / p_k, so p_k ~ |w_k| gives covariances that claim no more than C.
+    block diagonal m w_k w_k' / p_k, so p_k ~ |w_k| gives covariances that claim no more than
+    C. Where m is at most ``LOOSE``, nothing is added.
     """
     N = len(unit)
     T_i_j = se3.inverse(poses[i]) @ poses[j]

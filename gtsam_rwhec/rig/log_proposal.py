@@ -29,7 +29,7 @@ from gtsam_rwhec.rig.log_contents import (
 from gtsam_rwhec.rig.odometry_sections import OdometrySensor, OdometrySource
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import first_rig_text, parse_rig
-from gtsam_rwhec.rig.section_types import is_name, is_text
+from gtsam_rwhec.rig.section_types import TimeOffset, is_name, is_text
 from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
 from gtsam_rwhec.rig.target_sections import ObjectTarget
 
@@ -318,12 +318,7 @@ def propose_odometries(
         ("reference",): "TODO a guess: the sensor in whose frame you want the others; its lengths must be metres"
     }
     remarks |= {("sensors", name, "odometry"): f"TODO {_SCALE}" for name in may_lack_scale}
-    sensors = {
-        name: OdometrySensor(
-            odometry=OdometrySource(topic=series.topic), time_offset=0.0 if name == reference else "estimate"
-        )
-        for name, series in found.items()
-    }
+    sources = {name: OdometrySource(topic=series.topic) for name, series in found.items()}
     more = (
         "# It has no images and no detections, and several topics of poses, each taken as what one sensor says of its\n"
         "# own motion. A vehicle that moves in a plane does not tell heights: add given: {heights_m: {SENSOR: 0.5}}.\n"
@@ -332,7 +327,7 @@ def propose_odometries(
         f"moves: {name}, topic {series.topic}, {series.count} poses, up to {series.motion()[0]:.2g} m from the first"
         for name, series in found.items()
     )
-    text = first_rig_text("log", where, Rig(sensors={**sensors}, reference=reference), remarks, more)
+    text = first_rig_text("log", where, _of_odometries(sources, reference), remarks, more)
     return text, (*notes, f"reference: {reference} (of those with metres, most poses)")
 
 
@@ -341,20 +336,21 @@ def _of_sweeps(sweeps: Sequence[Topic], where: str) -> tuple[str, tuple[str, ...
     taken: set[str] = set()
     found = {free_name(_name(topic.name), taken): topic for topic in sweeps}
     reference = max(found, key=lambda name: found[name].count)
-    sensors = {
-        name: OdometrySensor(
-            odometry=OdometrySource(clouds=topic.name), time_offset=0.0 if name == reference else "estimate"
-        )
-        for name, topic in found.items()
-    }
     more = (
         "# Each LiDAR's motion is found by registering its sweeps. A vehicle that moves in a plane does not tell\n"
         "# heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of poses may be a sensor too: {topic: /odom}.\n"
     )
     remarks: dict[KeyPath, str] = {("reference",): "TODO a guess: the sensor in whose frame you want the others"}
     notes = tuple(f"sweeps: {name}, topic {topic.name}, {topic.count} clouds" for name, topic in found.items())
-    rig = Rig(sensors={**sensors}, reference=reference)
+    rig = _of_odometries({name: OdometrySource(clouds=topic.name) for name, topic in found.items()}, reference)
     return first_rig_text("log", where, rig, remarks, more), (*notes, f"reference: {reference} (most clouds)")
+
+
+def _of_odometries(sources: Mapping[str, OdometrySource], reference: str) -> Rig:
+    """Sensors with odometry, whose clocks are compared with the reference's."""
+    offsets: dict[str, TimeOffset] = {name: 0.0 if name == reference else "estimate" for name in sources}
+    sensors = {name: OdometrySensor(odometry=of, time_offset=offsets[name]) for name, of in sources.items()}
+    return Rig(sensors={**sensors}, reference=reference)
 
 
 def _name(topic: str) -> str:
