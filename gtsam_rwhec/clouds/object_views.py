@@ -29,7 +29,7 @@ from gtsam_rwhec.clouds.registration import Registrations, largest_group
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms
-from gtsam_rwhec.problem.directions import SHIFTED, centre_of_slides, with_common_slides
+from gtsam_rwhec.problem.directions import centre_of_slides, shift_of_clouds, with_common_slides
 from gtsam_rwhec.problem.problem import Problem
 
 #: If the thing was elsewhere in a larger share of the views, nobody knows where it was.
@@ -88,7 +88,7 @@ class SeenObject:
             directional=True,
             source="clouds",
         )
-        problem.shifts_m[target] = SHIFTED * float(self.sigma_m[0])
+        problem.shifts_m[target] = shift_of_clouds(float(self.sigma_m[0]), self.spacing_m)
 
 
 def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> SeenObject:

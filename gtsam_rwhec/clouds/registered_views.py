@@ -114,9 +114,11 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
         transforms = rows_to_transforms(checked_rows(transforms, 0, "A").rows)
     given = Cloud.each(clouds)
     first = list(islice(given, SPACED))
-    spacing = spacing_of([each.points for each in first], len(transforms)) if len(transforms) else Spacing(0.0, 0.0)
+    spacing = Spacing(0.0, 0.0, 0.0)
+    if len(transforms):
+        spacing = spacing_of([each.points for each in first], len(transforms))
     if options.spacing_m is not None:
-        spacing = Spacing(options.spacing_m, spacing.edges_m and options.spacing_m / FINER)
+        spacing = Spacing(options.spacing_m, spacing.edges_m and options.spacing_m / FINER, spacing.noise_m)
     surfaces, few = [], []
     for view, cloud in enumerate(chain(first, given)):
         surface = surface_of(cloud, f"view {view}" + (f" ({cloud.source})" if cloud.source else ""), spacing)
