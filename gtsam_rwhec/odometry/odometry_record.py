@@ -14,8 +14,8 @@ from gtsam_rwhec.results.log_history import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
 
-#: The data contradict a given number that is more than this many standard deviations away.
-CONTRADICTED = 4.0
+#: The data contradict a given number that is more than this many standard deviations away: by chance one of 2,000.
+CONTRADICTED = 3.5
 #: The most contradicted numbers that a message names.
 NAMED = 4
 #: A sensor takes part in a free direction if it moves by more than this share of the largest shift or turn.
