@@ -76,6 +76,18 @@ class SeenObject:
     sigma_m: Array
     spacing_m: float
 
+    def __str__(self) -> str:
+        certified = "certified" if self.is_certified else "not certified"
+        faces, edges = 1e3 * self.sigma_m
+        lines = [
+            f"A thing in {self.used.sum()} of {len(self.used)} views, by {len(self.registrations)} registrations; the "
+            f"sensor's pose by them is {certified}",
+            f"  points of two views are {faces:.2g} mm apart across faces and {edges:.2g} mm across edges (one "
+            f"standard deviation), thinned to {1e3 * self.spacing_m:.2g} mm",
+            *(f"  left out: {finding}" for finding in self.left_out.values()),
+        ]
+        return "\n".join(lines)
+
     def add_to(self, problem: Problem, target: str, sensor: str) -> None:
         """Add the views that are used to a problem, as measurements of a target."""
         used = self.used

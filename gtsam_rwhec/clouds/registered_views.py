@@ -41,6 +41,8 @@ STILL = 0.05
 TINY = 1e-12
 #: Registrations that differ from the poses by more than this share of the thing's size are none of this thing.
 CONTRADICTION = 0.15
+#: Poses are the same if they differ by less than this, rad and m.
+SAME = 1e-6
 #: The spacing is taken from this many views.
 SPACED = 9
 #: The name of the sensor in problems of motions.
@@ -127,6 +129,7 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
         surfaces.append(surface)
     if len(surfaces) != len(transforms):
         raise CloudError(f"{len(surfaces)} clouds and {len(transforms)} poses in A; give one A for each cloud")
+    _check_different(surfaces, transforms)
     at = np.setdiff1d(np.arange(len(surfaces)), [each.view for each in few])
     if len(at) < FEWEST_VIEWS:
         raise CloudError(
@@ -135,6 +138,16 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
         )
     kept = without_border([surfaces[k] for k in at], GATE * spacing.faces_m)
     return Views(at, kept, transforms[at], spacing), few
+
+
+def _check_different(surfaces: Sequence[Surface], A: Array) -> None:
+    """Raise a CloudError if all poses are one, or all clouds."""
+    if len(A) > 1 and np.abs(se3.logmap(se3.inverse(A[:1]) @ A[1:])).max() < SAME:
+        raise CloudError(f"all {len(A)} poses are the same: nothing moved, so nothing tells where the sensor is")
+    if len(surfaces) > 1 and all(np.array_equal(each.faces.points, surfaces[0].faces.points) for each in surfaces[1:]):
+        raise CloudError(
+            f"all {len(surfaces)} clouds are the same, point by point; give each pose the cloud seen there"
+        )
 
 
 def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrations, Array]:

@@ -31,6 +31,8 @@ GATE = 4.0
 MIXED = 25.0
 #: Below this cosine of the angle to the normal, a beam grazes the surface.
 GRAZING = 0.3
+#: The largest plane is another shape if it bends by more than this share of its width, beyond so many deviations.
+BENT, CLEARLY = 0.03, 4.0
 #: Neighbours by which the noise of a cloud is told, and points at which it is.
 NEIGHBOURS = 16
 NOISE_AT = 400
@@ -174,7 +176,7 @@ def find_plane(cloud: Cloud, *, noise_m: float | None = None) -> SeenPlane:
     Raises
     ------
     CloudError
-        No plane, or the beams graze it.
+        No plane, or it is bent, or the beams graze it.
     OptionError
         The noise is not positive.
     """
@@ -197,6 +199,14 @@ def find_plane(cloud: Cloud, *, noise_m: float | None = None) -> SeenPlane:
     R = np.stack([axes[0], np.cross(normal, axes[0]), normal], axis=1)
     x, y = ((points[used] - middle) @ R[:, :2]).T
     J = np.stack([y, -x, np.ones(len(x))], axis=1)
+    squares = np.stack([x**2, x * y, y**2], axis=1)
+    squares -= J @ np.linalg.lstsq(J, squares, rcond=None)[0]
+    bend = squares @ np.linalg.lstsq(squares, off[used], rcond=None)[0]
+    if bend.std() > BENT * min(x.std(), y.std()) and bend.std() > CLEARLY * (off[used] - bend).std():
+        raise CloudError(
+            f"{where}: the largest plane is bent by {1e3 * np.ptp(bend):.2g} mm over {1e3 * np.ptp(x):.0f} mm: it is a "
+            "part of a sphere or of another round thing (find_sphere, seen_object)"
+        )
     sigma, covariance = _covariance(J, off[used], points[used], normal)
     mixed = (np.abs(off) < MIXED * noise) & ~used
     return SeenPlane(pose(R, middle), covariance, sigma, int(used.sum()), int(mixed.sum()))

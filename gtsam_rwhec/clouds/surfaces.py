@@ -21,6 +21,8 @@ with extra_named():
 POINTS, FEW_POINTS, ALL_POINTS = 3000, 1000, 60_000
 #: Of denser clouds every so-manieth point is taken, so that about this many are left to thin.
 DENSE = 60_000
+#: Points beyond so many times the median are left out.
+REACH = 100.0
 #: The spacing is found on about this many points of a view.
 SAMPLED = 20_000
 #: Thinning to less than so many times the spacing of the points themselves makes holes.
@@ -106,7 +108,8 @@ def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
     """
     own, faces, noise = [], [], []
     wanted = min(POINTS, max(FEW_POINTS, ALL_POINTS // views))
-    for points in clouds:
+    for every in clouds:
+        points = _reachable(every)
         few = points[:: max(1, len(points) // SAMPLED)]
         points = points[:: max(1, len(points) // DENSE)]
         own.append(float(np.median(np.asarray(cKDTree(points).query(few, 2)[0])[:, 1])))
@@ -125,7 +128,7 @@ def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
 
 def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
     """A view thinned to a spacing."""
-    given = cloud.points[:: max(1, len(cloud) // DENSE)]
+    given = _reachable(cloud.points[:: max(1, len(cloud) // DENSE)])
     if spacing.is_noisy:
         smooth, off_m = _along_rays(given, np.arange(len(given)))
         given = np.where((off_m < ON_A_PLANE * np.median(off_m))[:, None], smooth, given)
@@ -133,6 +136,13 @@ def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
     points = native.points()[:, :3]
     faces = Features(points, native.normals()[:, :3], cKDTree(points))
     return Surface(name, faces, _edges(given, spacing.edges_m, faces), native, tree)
+
+
+def _reachable(points: Array) -> Array:
+    """Without points that are far beyond all others: they are none of a thing, and no grid has room for them."""
+    away = np.abs(points).max(axis=1)
+    reachable: Array = points[away < REACH * np.median(away)]
+    return reachable
 
 
 def _along_rays(points: Array, at: np.ndarray) -> tuple[Array, Array]:

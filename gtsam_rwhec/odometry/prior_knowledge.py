@@ -73,7 +73,10 @@ class Given:
                 raise FrameError(
                     f"{where} is of {named!r}, and no track is of that sensor; the sensors are {', '.join(sensors)}"
                 )
-        for where, value, sigma in self._numbers():
+        for where, number in self._numbers():
+            if not isinstance(number, tuple | list) or len(number) != 2:
+                raise OptionError(f"{where} is {number!r}; give it with its standard deviation: (value, deviation)")
+            value, sigma = number
             if not np.isfinite(value):
                 raise OptionError(f"{where} is {value!r}; give a finite number")
             if not (np.isfinite(sigma) and sigma > 0.0):
@@ -114,13 +117,13 @@ class Given:
         yield from (("a direction", known.sensor) for known in self.directions)
         yield from (("a distance", name) for pair in self.distances_m for name in pair)
 
-    def _numbers(self) -> Iterator[tuple[str, float, float]]:
-        yield from ((f"the height of {name}", *number) for name, number in self.heights_m.items())
-        yield from ((f"the distance of {a} and {b}", *number) for (a, b), number in self.distances_m.items())
-        yield from ((f"the direction of {known.sensor}", 0.0, known.sigma_rad) for known in self.directions)
+    def _numbers(self) -> Iterator[tuple[str, tuple[float, float]]]:
+        yield from ((f"the height of {name}", number) for name, number in self.heights_m.items())
+        yield from ((f"the distance of {a} and {b}", number) for (a, b), number in self.distances_m.items())
+        yield from ((f"the direction of {known.sensor}", (0.0, known.sigma_rad)) for known in self.directions)
         if self.ground is not None:
-            yield "the ground's distance", self.ground.distance_m, self.ground.sigma_m
-            yield "the ground's normal", 0.0, self.ground.sigma_rad
+            yield "the ground's distance", (self.ground.distance_m, self.ground.sigma_m)
+            yield "the ground's normal", (0.0, self.ground.sigma_rad)
 
     def _vectors(self) -> Iterator[tuple[str, Vector]]:
         yield from ((f"the direction of {known.sensor}", known.direction) for known in self.directions)

@@ -67,8 +67,10 @@ def _not_determined(free: Sequence[FreeDirection]) -> list[str]:
 
 def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
     """What is odd about a log or its rig file, and what to do about it, without the sizes that a judgement names."""
+    of_clouds = {each.sensor for each in log.detection.objects}
     advice = [
-        f"{len(faults)} images of {sensor} could not be used. The first: {faults[0]}"
+        f"{len(faults)} {'clouds' if sensor in of_clouds else 'images'} of {sensor} could not be used. The first: "
+        f"{faults[0]}"
         for sensor, faults in log.detection.undecoded.items()
         if faults
     ]

@@ -83,7 +83,7 @@ def _refinement(shown: ShownResult) -> Iterator[Block]:
 def log_blocks(log: LogFields) -> Iterator[Block]:
     """Numbers of images, what every stage used of each pair, why others were removed, and sizes that were found."""
     images = ", ".join(f"{count} of {sensor}" for sensor, count in log.detection.images.items())
-    yield Paragraph(f"Images in {', '.join(log.detection.sources)}: {images}.")
+    yield Paragraph(f"Images or clouds in {', '.join(log.detection.sources)}: {images}.")
     cleaned = {track.pair: track.used for track in log.cleaning.tracks}
     used = {count.pair: count.used for count in log.outliers}
     rows: dict[str, tuple[Words, ...]] = {

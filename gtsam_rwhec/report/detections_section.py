@@ -96,9 +96,9 @@ def _counts(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
         yield Listing(tuple(said[:MOST_SENTENCES]))
     faults = [fault for of_sensor in detection.get("undecoded", {}).values() for fault in of_sensor]
     if faults:
-        yield Paragraph(f"{len(faults):,} images could not be used.", "care")
+        yield Paragraph(f"{len(faults):,} images or clouds could not be used.", "care")
         some = (*faults[:MOST_SENTENCES], *_and_more(len(faults) - MOST_SENTENCES, "result.json has them"))
-        yield Folded("Images that could not be used", (Listing(some),))
+        yield Folded("Those that could not be used", (Listing(some),))
 
 
 def _registered(shown: ShownResult) -> Iterator[Block]:
@@ -126,7 +126,7 @@ def _registered(shown: ShownResult) -> Iterator[Block]:
             ("cloud", "with", "overlap, %", "off, mm", "off°", "slides"),
             tuple(rows[:MOST_LISTED]),
             "Off: how far the registration is from where the carriers' poses put the two clouds, at their own origins; "
-            "the farthest first. Slides: directions, of six, along which their surfaces slide on each other.",
+            "the farthest first, without what slides. Slides: directions, of six, along which their surfaces slide.",
         )
         yield table if len(rows) <= MOST_ROWS else Folded(f"{len(rows)} registrations", (table,))
 

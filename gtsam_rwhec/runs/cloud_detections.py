@@ -227,8 +227,11 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
     T_target_sensor = se3.inverse(seen.A) @ seen.T_sensorcarrier_sensor
     predicted = se3.inverse(T_target_sensor[pairs.i]) @ T_target_sensor[pairs.j]
     off = se3.logmap(se3.inverse(predicted) @ pairs.B)
-    tells = np.linalg.eigvalsh(pairs.information)
-    slides = (tells <= NOTHING * tells[:, -1:]).sum(axis=1)
+    tells, along = np.linalg.eigh(pairs.information)
+    is_told = tells > NOTHING * tells[:, -1:]
+    slides = (~is_told).sum(axis=1)
+    # Where two clouds slide on each other, any motion is as good.
+    off = np.einsum("nij,nj,nkj,nk->ni", along, is_told, along, off)
     return ObjectReport(
         target=target,
         sensor=sensor,

@@ -237,6 +237,22 @@ def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
             seen_object(clouds, A)
 
 
+def test_poses_or_clouds_that_are_all_the_same_are_named(bust: SimulatedClouds) -> None:
+    with pytest.raises(CloudError, match="all 9 poses are the same"):
+        seen_object(bust.clouds, np.repeat(bust.A[:1], 9, axis=0))
+    with pytest.raises(CloudError, match="all 6 clouds are the same"):
+        seen_object([bust.clouds[0]] * 6, bust.A[:6])
+
+
+def test_points_far_beyond_all_others_change_nothing(bust: SimulatedClouds, capfd: pytest.CaptureFixture[str]) -> None:
+    far = np.vstack([bust.clouds[2].points, [[1e20, 0.0, 0.0], [3e7, 1.0, 1.0]]])
+    clouds = [*bust.clouds[:2], Cloud.of(far), *bust.clouds[3:]]
+    found, plain = seen_object(clouds, bust.A), seen_object(bust.clouds, bust.A)
+    np.testing.assert_allclose(found.T_sensor_object, plain.T_sensor_object, rtol=0.0, atol=1e-12)
+    assert capfd.readouterr().err == ""  # the library for registrations writes there
+    assert str(found).startswith("A thing in 9 of 9 views, by 36 registrations; the sensor's pose by them is certified")
+
+
 def test_what_is_too_little_is_said(bust: SimulatedClouds) -> None:
     with pytest.raises(CloudError, match="2 views have 50 points and more; at least 3"):
         seen_object(bust.clouds[:2], bust.A[:2])

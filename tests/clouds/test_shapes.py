@@ -59,6 +59,16 @@ def test_noise_of_a_cloud_is_that_of_its_surfaces() -> None:
     assert 0.5 * NOISE_M < surface_noise(cloud.points) < 3.0 * NOISE_M
 
 
+def test_a_ball_alone_is_no_plane_and_a_board_that_is_a_little_bent_is() -> None:
+    cloud, _ = scene(np.random.default_rng(0))
+    ball = cloud.selected(cloud.points[:, 2] < WALL_M - 0.05)
+    with pytest.raises(CloudError, match="is bent by"):
+        rw.clouds.find_plane(ball)
+    x, y = np.random.default_rng(0).uniform(-0.15, 0.15, (2, 4000))
+    board = np.column_stack([x, y, 0.8 + 0.1 * x**2])
+    assert rw.clouds.find_plane(rw.clouds.Cloud.of(board)).points > 1000
+
+
 def test_what_is_not_there_is_said() -> None:
     cloud, _ = scene(np.random.default_rng(0))
     with pytest.raises(CloudError, match="no such sphere"):

@@ -22,6 +22,7 @@ GROUND = Ground((0.0, 0.0, 1.0), 1.5, 0.01, 0.01)
         (Given(distances_m={("camera", "lidar"): (-1.0, 0.1)}), OptionError, "positive"),
         (Given(distances_m={("camera", "lidar"): (3315.0, 5.0)}), OptionError, "3315 mm would be 3.315"),
         (Given(heights_m={"camera": (900.0, 0.1)}, ground=GROUND), OptionError, "give metres"),
+        (Given(heights_m={"camera": 1.8}, ground=GROUND), OptionError, "with its standard deviation"),  # type: ignore[dict-item]
         (Given(directions=(KnownDirection("lidar", "x", (1.0, 0.0, 0.0), 0.1),)), FrameError, "is the reference"),
         (Given(directions=(KnownDirection("camera", "x", (0.0, 0.0, 0.0), 0.1),)), OptionError, "not all zero"),
         (Given(directions=(KnownDirection("camera", "w", (1.0, 0.0, 0.0), 0.1),)), OptionError, "choose one"),  # type: ignore[arg-type]
