@@ -37,6 +37,8 @@ UNCERTAIN_SIGMAS = 3.5
 SPEAKING_SIGMAS = 2.0
 #: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
+#: Lengths in clouds are uncertain from this share on: nobody states them, and 0.3 % was 1.1 mm with 0.04 mm claimed.
+CLOUDS_SHARE = 0.0005
 #: A size that is wrong by more than this factor is not determined by the motion.
 LARGEST = 1e4
 #: So many blocks of each pair's rows are left out in turn.
@@ -53,17 +55,17 @@ def is_size_doubted(scale: float, sigma: float | None) -> bool:
 
     ``scale`` is the stated over the true length; ``sigma`` its standard deviation, None where it is not determined.
     """
-    return _is_off(scale, sigma, SIZE_SIGMAS)
+    return _is_off(scale, sigma, SIZE_SIGMAS, SIZE_SHARE)
 
 
 def is_size_uncertain(scale: float, sigma: float | None) -> bool:
     """Whether measurements speak against a stated size, though not clearly."""
-    return _is_off(scale, sigma, UNCERTAIN_SIGMAS) and not is_size_doubted(scale, sigma)
+    return _is_off(scale, sigma, UNCERTAIN_SIGMAS, SIZE_SHARE) and not is_size_doubted(scale, sigma)
 
 
-def _is_off(scale: float, sigma: float | None, sigmas: float) -> bool:
+def _is_off(scale: float, sigma: float | None, sigmas: float, share: float) -> bool:
     off = abs(scale - 1.0)
-    return sigma is not None and off > SIZE_SHARE and off > sigmas * sigma
+    return sigma is not None and off > share and off > sigmas * sigma
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ class TargetSize:
     @property
     def is_uncertain(self) -> bool:
         """Whether the measurements speak against the stated size, though not clearly."""
-        return is_size_uncertain(self.scale, self.sigma)
+        share = CLOUDS_SHARE if self.is_of_clouds else SIZE_SHARE
+        return _is_off(self.scale, self.sigma, UNCERTAIN_SIGMAS, share) and not self.is_doubted
 
     def __str__(self) -> str:
         if self.sigma is None:
@@ -181,10 +184,14 @@ def sizes(
             return tuple(
                 TargetSize(name, 1.0, None, is_untested=True) for name in {pair.target: 0 for pair in free.pairs}
             )
-        found = sizes_in(refined)
+        found = _marked(sizes_in(refined), problem)
         if any(size.is_doubted or size.is_uncertain for size in found):
             found = _under_all_noise(free, start, options, like, progress or silent) or _with_jackknife(free, found)
-    return tuple(replace(size, is_of_clouds=size.target in problem.shifts_m) for size in found)
+    return tuple(_marked(found, problem))
+
+
+def _marked(found: Sequence[TargetSize], problem: Problem) -> list[TargetSize]:
+    return [replace(size, is_of_clouds=size.target in problem.shifts_m) for size in found]
 
 
 def refined_by(
