@@ -29,7 +29,7 @@ from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, views_of
 from gtsam_rwhec.calibration.settled_measurements import settled_measurements
-from gtsam_rwhec.calibration.sizes import TargetSize, doubted_lengths, undetectable
+from gtsam_rwhec.calibration.sizes import TargetSize, doubted_lengths, moves_of_sizes, undetectable
 from gtsam_rwhec.calibration.slipped_rows import with_rows_shifted
 from gtsam_rwhec.calibration.stated_knowledge import (
     doubt_one_pose,
@@ -273,6 +273,9 @@ def _calibrated(run: Run) -> Calibration:
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
     if refined is not None and problem.shifts_m:
         refined = refined.with_shifts(problem.shifts_m, problem.pairs)
+    if refined is not None and problem.scale == "known":
+        for moves in moves_of_sizes(found_sizes):
+            refined = refined.with_errors(moves)
     best = solution if refined is None else refined
     views = {} if best is None else views_of(problem, inliers, best.scale)
     carriers = Carriers(problem.sensor_carrier, problem.target_carrier)

@@ -213,6 +213,9 @@ def doubt_stated_sizes(
             record.find(Ground.SIZE_DOUBTED if size.is_doubted else Ground.SIZE_UNCERTAIN, str(size))
     if doubted or uncertain or together:
         record.choose(what, "as stated, and doubted", "the motion contradicts them")
+    elif off := [size for size in found if size.may_be_off]:
+        words = "; ".join(map(str, off))
+        record.choose(what, "as stated, and the poses' standard deviations hold that they may be wrong", words)
     elif any(size.sigma is not None for size in found):
         record.choose(what, "as stated", "the motion does not contradict them")
     else:

@@ -144,6 +144,15 @@ class RefinedPoses:
                 finite[at, at] += min(shifts, default=0.0) ** 2
         return replace(self, joint=replace(self.joint, finite=finite))
 
+    def with_errors(self, moves: Mapping[str, Array]) -> Self:
+        """The same, where frames are off together by so much (6,), one standard deviation, by one error."""
+        along = np.zeros(len(self.joint.unit))
+        for name, move in moves.items():
+            rows = self.joint.slots.get(Unknown.of(name))
+            if rows is not None:
+                along[rows] = move
+        return replace(self, joint=replace(self.joint, finite=self.joint.finite + np.outer(along, along)))
+
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
         """All unknowns."""

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rwhec_factors import se3
+from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.sizes import SIZE_SHARE, TargetSize, common_factor, is_size_doubted, sizes
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.results.log_history import SizeFields
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.simulate import Noise, general, perturb
+from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
 
@@ -49,6 +52,28 @@ def test_a_wrong_size_among_pairs_that_were_added_at_once_is_doubted() -> None:
 
 def test_right_sizes_are_not_doubted() -> None:
     assert [size.is_doubted for size in sizes(with_wrong_size(1.0))] == [False, False]
+
+
+def test_a_size_that_is_wrong_by_less_than_is_doubted_is_in_the_ellipsoid() -> None:
+    """A board at 0.8 m that was printed 0.3 % too large: 2.1 mm off where 0.7 mm were claimed, with 'use'."""
+    rng = np.random.default_rng(0)
+    Y, X = random_poses(2, 0.1, rng)
+    turns = Rotation.from_rotvec(rng.normal(0.0, 0.4, (30, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    B = se3.pose(turns, np.column_stack([rng.uniform(-0.15, 0.15, (30, 2)), rng.uniform(0.5, 0.9, 30)]))
+    A = perturb(Y @ B @ np.linalg.inv(X), Noise(2e-4, 0.5 / np.radians(0.03) ** 2), rng)
+    B = perturb(B, Noise(3e-4, 0.5 / np.radians(0.05) ** 2), rng)
+    B[:, :3, 3] *= 1.003
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B)
+    found = rw.calibrate(problem)
+    assert found.verdict is rw.Verdict.USE
+    (size,) = found.sizes
+    assert size.may_be_off
+    assert not size.is_doubted
+    off = se3.logmap((np.linalg.inv(Y) @ found.refined.Y["camera"].matrix())[None])[0]
+    assert off @ np.linalg.solve(found.refined.covariance("camera"), off) < 16.8  # chi-square, 99 %
+    assert 2.0 * np.sqrt(np.trace(found.refined.covariance("camera")[3:, 3:])) > np.linalg.norm(off[3:]) > 1.5e-3
+    assert "may be wrong" in next(choice for choice in found.choices if choice.what == "sizes of targets").chosen
 
 
 def test_the_log_road_has_the_same_rule() -> None:
