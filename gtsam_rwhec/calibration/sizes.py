@@ -199,7 +199,7 @@ def sizes(
 
 
 def _marked(found: Sequence[TargetSize], problem: Problem) -> list[TargetSize]:
-    return [replace(size, is_of_clouds=size.target in problem.shifts_m) for size in found]
+    return [replace(size, is_of_clouds=size.target in problem.alike) for size in found]
 
 
 def refined_by(

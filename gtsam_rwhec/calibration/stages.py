@@ -271,8 +271,8 @@ def _calibrated(run: Run) -> Calibration:
     if reading.finding is None and solution is not None:
         free = solution.identifiability.free_directions if refined is None else refined.free_directions
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
-    if refined is not None and problem.shifts_m:
-        refined = refined.with_shifts(problem.shifts_m, problem.pairs)
+    if refined is not None and problem.alike:
+        refined = refined.with_views_off_alike(problem.alike, problem.pairs)
     if refined is not None and problem.scale == "known":
         for moves in moves_of_sizes(found_sizes):
             refined = refined.with_errors(moves)

@@ -15,7 +15,7 @@ from rwhec_factors import se3
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.clouds.surfaces import Surface
+from gtsam_rwhec.clouds.surfaces import Surface, size_of
 from gtsam_rwhec.geometry.poses import Array
 
 #: Rotations of the sensor on its carrier that are tried: neighbours are 40 degrees apart.
@@ -89,7 +89,7 @@ class _Pairs:
 class _Search:
     def __init__(self, surfaces: Sequence[Surface], A: Array, spacing_m: float) -> None:
         self.surfaces, self.A = surfaces, A
-        self.size = float(np.median([each.size_m for each in surfaces]))
+        self.size = size_of(surfaces)
         self.spacing = spacing_m
         draw = np.random.default_rng(0)
         i, j = _different_motions(A)

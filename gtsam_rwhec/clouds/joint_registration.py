@@ -9,7 +9,16 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_GROUPS, SHARED_BY_VIEWS, joined, known, matches, sigmas, units
+from gtsam_rwhec.clouds.point_to_plane import (
+    SHARED_BY_GROUPS,
+    SHARED_BY_VIEWS,
+    alike,
+    joined,
+    known,
+    matches,
+    sigmas,
+    units,
+)
 from gtsam_rwhec.clouds.registration import Registrations
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
@@ -33,12 +42,13 @@ noise = gtsam.noiseModel
 
 @dataclass(frozen=True)
 class JointPoses:
-    """Poses T_common_sensor (N, 4, 4), their covariances (N, 6, 6; right perturbation, rotation first), and the
-    deviations (2,) of the residuals of faces and of edges, m."""
+    """Poses T_common_sensor (N, 4, 4), their covariances (N, 6, 6; right perturbation, rotation first), the deviations
+    (2,) of the residuals of faces and of edges, and of what neighbouring points are off by together, m."""
 
     T_common_sensor: Array
     covariances: Array
     sigma_m: Array
+    alike_m: float
 
 
 def _square_root(information: Array) -> Array:
@@ -65,13 +75,14 @@ def _solved(
 
 
 def joint_poses(
-    surfaces: Sequence[Surface], predicted: Array, of_A: Array, pairs: Registrations, gate_m: float
+    surfaces: Sequence[Surface], predicted: Array, of_A: Array, pairs: Registrations, gate_m: float, noise_m: float
 ) -> JointPoses:
     """Poses of all views at once.
 
     First a graph of the registrations, in which a wrong one does not count (Huber); then points are matched at the
     poses of the whole, and each pair gives a quadratic of its relative pose (Gauss-Newton), until poses have settled.
     Directions in which little is known stay as predicted (N, 4, 4), by A with variances (6,): edges may match wrongly.
+    ``noise_m`` is that of points along their rays.
     """
     unit = [units(each.faces.points) for each in surfaces]
     weak = np.array([gate_m**2 * U @ U.T for U, _ in unit]) + WEAK * np.diag(of_A)
@@ -90,16 +101,20 @@ def joint_poses(
         moved = np.linalg.solve(np.array([U for U, _ in unit]), se3.logmap(se3.inverse(before) @ poses)[..., None])
         if np.abs(moved).max() < SETTLED * gate_m:
             break
-    alone = _covariances(surfaces, poses, i, j, gate_m, sigma_m)
+    of_faces = alike(float(sigma_m[0]), noise_m)
+    by_views, by_groups = (
+        (float(np.hypot(faces, of_faces / sigma_m[0])), edges) for faces, edges in (SHARED_BY_VIEWS, SHARED_BY_GROUPS)
+    )
+    alone = _covariances(surfaces, poses, i, j, gate_m, sigma_m, by_views)
     count = np.bincount(np.r_[i[at], j[at]], minlength=len(surfaces))
     # The same points, and what they are off by together, are in many pairs.
     many = (count[i[at]] + count[j[at]] + 2) / 4.0
     of_pairs = [
-        known(several[k], sigma_m, n, (np.sqrt(n) * SHARED_BY_GROUPS[0], np.sqrt(n) * SHARED_BY_GROUPS[1])).information
+        known(several[k], sigma_m, n, (np.sqrt(n) * by_groups[0], np.sqrt(n) * by_groups[1])).information
         for k, n in zip(at, many.tolist(), strict=True)
     ]
     together = of_groups(poses, i[at], j[at], np.array(of_pairs), np.array([U for U, _ in unit]))
-    return JointPoses(poses, alone + together, sigma_m)
+    return JointPoses(poses, alone + together, sigma_m, of_faces)
 
 
 def of_groups(poses: Array, i: np.ndarray, j: np.ndarray, information: Array, unit: Array) -> Array:
@@ -139,7 +154,13 @@ def of_groups(poses: Array, i: np.ndarray, j: np.ndarray, information: Array, un
 
 
 def _covariances(
-    surfaces: Sequence[Surface], poses: Array, i: np.ndarray, j: np.ndarray, gate_m: float, sigma_m: Array
+    surfaces: Sequence[Surface],
+    poses: Array,
+    i: np.ndarray,
+    j: np.ndarray,
+    gate_m: float,
+    sigma_m: Array,
+    shared: tuple[float, float],
 ) -> Array:
     """Of each view among the others: each of its points counts once, however many views it is seen in."""
     result = []
@@ -150,5 +171,5 @@ def _covariances(
         counts = np.bincount(found.at)[found.at]
         # A residual has the noise of two points, the view's own and the other's; of the others there are many.
         share = (1.0 + 1.0 / len(others)) / 2.0
-        result.append(known(found, sigma_m, counts * share, SHARED_BY_VIEWS).covariance)
+        result.append(known(found, sigma_m, counts * share, shared).covariance)
     return np.array(result)

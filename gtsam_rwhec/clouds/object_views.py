@@ -26,10 +26,10 @@ from gtsam_rwhec.clouds.registered_views import (
     registered_in_turn,
 )
 from gtsam_rwhec.clouds.registration import Registrations, largest_group
-from gtsam_rwhec.clouds.surfaces import Surface
+from gtsam_rwhec.clouds.surfaces import Surface, size_of
 from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms
-from gtsam_rwhec.problem.directions import centre_of_slides, shift_of_clouds, with_common_slides
+from gtsam_rwhec.problem.directions import alike_in_clouds, centre_of_slides, shifted_and_turned, with_common_slides
 from gtsam_rwhec.problem.problem import Problem
 
 #: If the thing was elsewhere in a larger share of the views, nobody knows where it was.
@@ -63,6 +63,8 @@ class SeenObject:
         Deviations of points across faces and across edges, m; of residuals between two views.
     spacing_m : float
         Distance of neighbouring points after thinning.
+    alike_m, alike_rad : float
+        What all views are shifted by alike, and turned by about the thing (standard deviations): no residual shows it.
     """
 
     A: Array
@@ -75,6 +77,8 @@ class SeenObject:
     is_certified: bool
     sigma_m: Array
     spacing_m: float
+    alike_m: float
+    alike_rad: float
 
     def __str__(self) -> str:
         certified = "certified" if self.is_certified else "not certified"
@@ -100,7 +104,7 @@ class SeenObject:
             directional=True,
             source="clouds",
         )
-        problem.shifts_m[target] = shift_of_clouds(float(self.sigma_m[0]), self.spacing_m)
+        problem.alike[target] = shifted_and_turned(self.alike_m, self.alike_rad, self.T_sensor_object[used])
 
 
 def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> SeenObject:
@@ -135,7 +139,8 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
         raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
     inside = registrations.selected(together[registrations.i] & together[registrations.j]).renamed(place)
     of_A = noise_of_A(inside, Y)
-    joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, of_A, inside, GATE * views.spacing.faces_m)
+    spacing_m, noise_m = views.spacing.faces_m, views.spacing.noise_m
+    joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, of_A, inside, GATE * spacing_m, noise_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
     stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
     check_agreement(kept, inside, Y)
@@ -158,7 +163,8 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
         Y,
         is_certified,
         joint.sigma_m,
-        views.spacing.faces_m,
+        spacing_m,
+        *alike_in_clouds(float(joint.sigma_m[0]), spacing_m, joint.alike_m, size_of(kept.surfaces)),
     )
 
 
@@ -190,7 +196,7 @@ def _where_it_was(
     """
     to_middle = se3.inverse(origin)
     unit = np.array([units(each.faces.points)[0] for each in views.surfaces])
-    size = float(np.median([each.size_m for each in views.surfaces]))
+    size = size_of(views.surfaces)
     moved: dict[int, float] = {}
     for _ in views.at:
         still = ~np.isin(np.arange(len(views.at)), list(moved))

@@ -92,6 +92,14 @@ def sigmas(several: Sequence[Matches], spacing_m: float) -> Array:
     return np.maximum(result, 1e-4 * spacing_m)
 
 
+def alike(sigma_m: float, noise_m: float) -> float:
+    """What neighbouring points are off by together, m: residuals of two views beyond the noise along rays.
+
+    The pattern of a sensor, or noise that neighbours share: no average over a surface takes it away.
+    """
+    return float(np.sqrt(max(0.5 * sigma_m**2 - noise_m**2, 0.0)))
+
+
 def joined(several: Sequence[Matches]) -> Matches:
     """Matches of one surface with several others."""
     arrays = [(each.points, each.residuals, each.rows, each.own_rows, each.kind, each.at) for each in several]

@@ -14,7 +14,16 @@ from rwhec_factors import se3
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.first_registration import Start, first_poses
 from gtsam_rwhec.clouds.registration import Registrations, aligned, overlapping_pairs, registered
-from gtsam_rwhec.clouds.surfaces import FEWEST_POINTS, FINER, Spacing, Surface, spacing_of, surface_of, without_border
+from gtsam_rwhec.clouds.surfaces import (
+    FEWEST_POINTS,
+    FINER,
+    Spacing,
+    Surface,
+    size_of,
+    spacing_of,
+    surface_of,
+    without_border,
+)
 from gtsam_rwhec.errors import CloudError, RwhecWarning
 from gtsam_rwhec.geometry.poses import (
     Array,
@@ -178,7 +187,7 @@ def check_agreement(views: Views, pairs: Registrations, Y: Array) -> None:
     """Raise a CloudError if registrations are none of a thing that stood still at these poses."""
     poses = se3.inverse(views.A) @ Y
     off = np.linalg.norm(_at_middle(views, poses[pairs.i] @ pairs.B - poses[pairs.j], pairs.j), axis=1)
-    size = float(np.median([each.size_m for each in views.surfaces]))
+    size = size_of(views.surfaces)
     if np.median(off) > CONTRADICTION * size:
         raise CloudError(
             f"registrations of the clouds contradict the poses: they differ by {1e3 * np.median(off):.1f} mm (median "

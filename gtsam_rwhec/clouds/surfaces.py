@@ -84,6 +84,11 @@ class Surface:
         return float(np.sqrt(self.faces.points.var(axis=0).sum()))
 
 
+def size_of(surfaces: Iterable[Surface]) -> float:
+    """The size of a thing, m: the median over its views."""
+    return float(np.median([each.size_m for each in surfaces]))
+
+
 @dataclass(frozen=True)
 class Spacing:
     """Distances of neighbouring points to which views are thinned, m: for faces, and for edges (0: not thinned).

@@ -133,15 +133,14 @@ class RefinedPoses:
                     covariance += J @ self.joint.turned(unknown) @ J.T
         return covariance
 
-    def with_shifts(self, of_targets: Mapping[str, float], pairs: Sequence[Pair]) -> Self:
-        """The same, where all that a sensor saw of targets is shifted alike in its axes (deviations, m)."""
+    def with_views_off_alike(self, of_targets: Mapping[str, Array], pairs: Sequence[Pair]) -> Self:
+        """The same, where all that a sensor saw of targets is off alike in its axes: covariances (6, 6) by target."""
         finite = self.joint.finite.copy()
         for name in self.Y:
-            shifts = [of_targets.get(pair.target, 0.0) for pair in pairs if pair.sensor == name]
+            off = [of_targets.get(pair.target, np.zeros((6, 6))) for pair in pairs if pair.sensor == name]
             rows = self.joint.slots.get(Unknown.of(name))
-            if rows is not None:
-                at = np.arange(rows.stop - 3, rows.stop)
-                finite[at, at] += min(shifts, default=0.0) ** 2
+            if rows is not None and off:
+                finite[rows, rows] += min(off, key=np.trace)
         return replace(self, joint=replace(self.joint, finite=finite))
 
     def with_errors(self, moves: Mapping[str, Array]) -> Self:

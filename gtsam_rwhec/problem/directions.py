@@ -35,6 +35,8 @@ SHIFTED = 0.3
 #: And by this many squares of the deviation over the distance of points: noise that is large beside it bends normals,
 #: and chooses wrong neighbours. By simulations of 1 to 3 mm of noise on things of 12 cm.
 BENT = 2.0
+#: And turned about the thing by this share of the angle by which neighbours that are off together lift its rim.
+TURNED = 0.5
 #: Which directions [omega, v] of a target's own axes a kind of measurement does not see.
 UNSEEN = {
     Kind.POSE: np.zeros(6, dtype=bool),
@@ -307,9 +309,20 @@ def scaled(covariances: Array, slides: Array | None, deviation: Array) -> Array:
     return np.asarray(back @ at_centre @ back.transpose(0, 2, 1) + slides)
 
 
-def shift_of_clouds(sigma_m: float, spacing_m: float) -> float:
-    """The standard deviation, m, of what all clouds are shifted by alike: of points' deviation and their distance."""
-    return float(np.hypot(SHIFTED * sigma_m, BENT * sigma_m**2 / spacing_m))
+def alike_in_clouds(sigma_m: float, spacing_m: float, alike_m: float, size_m: float) -> tuple[float, float]:
+    """What all clouds of a thing are shifted (m) and turned (rad) by alike, standard deviations.
+
+    By the deviation of points, their distance, what neighbours among them are off by together, and the thing's size.
+    """
+    shift = np.sqrt((SHIFTED * sigma_m) ** 2 + (BENT * sigma_m**2 / spacing_m) ** 2 + alike_m**2)
+    return float(shift), TURNED * alike_m / size_m
+
+
+def shifted_and_turned(shift_m: float, turn_rad: float, B: Array) -> Array:
+    """The covariance (6, 6) of a sensor whose views B (N, 4, 4) of a thing are all shifted, and turned about it."""
+    turn = np.hstack([np.eye(3), se3.hat(B[:, :3, 3].mean(axis=0)).T])
+    covariance: Array = np.diag(np.repeat([0.0, shift_m**2], 3)) + turn_rad**2 * turn.T @ turn
+    return covariance
 
 
 def centres_of(covariances: Array) -> Array:

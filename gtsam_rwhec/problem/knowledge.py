@@ -99,8 +99,8 @@ class Knowledge:
         self.fixed_scales: dict[str, float] = {}
         self.cameras: dict[str, Camera] = {}
         self.boards: dict[str, Array] = {}
-        #: Of targets seen in clouds: what all of a sensor's views are shifted by alike (standard deviation, m).
-        self.shifts_m: dict[str, float] = {}
+        #: Of targets seen in clouds: the covariance (6, 6), in the sensor's axes, of what all of its views are off by.
+        self.alike: dict[str, Array] = {}
         self.corner_px: float | None = None
 
     def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
@@ -189,7 +189,7 @@ class Knowledge:
         for name, board in other.boards.items():
             if not same_board(self.boards.setdefault(name, board), board):
                 raise TargetError(f"{name} has other board_points in one problem than in the other; rename one of them")
-        self.shifts_m |= other.shifts_m
+        self.alike |= other.alike
         if other.corner_px is not None:
             self.corner_px = check_corner_px(other.corner_px, self.corner_px, "a problem that is joined")
 
@@ -200,5 +200,5 @@ class Knowledge:
         self.fixed_scales = {name: scale for name, scale in other.fixed_scales.items() if name not in scales}
         self.cameras = {name: camera for name, camera in other.cameras.items() if name not in frames}
         self.boards = {name: board for name, board in other.boards.items() if name not in frames}
-        self.shifts_m = {name: shift for name, shift in other.shifts_m.items() if name not in frames}
+        self.alike = {name: covariance for name, covariance in other.alike.items() if name not in frames}
         self.corner_px = other.corner_px

@@ -151,6 +151,8 @@ class ObjectReport(FileRecord):
     used: Count = Field(description="clouds that were registered with others")
     noise_mm: NotNegative = Field(description="standard deviation of points of two clouds across the surface, mm")
     spacing_mm: Positive = Field(description="distance of neighbouring points after thinning, mm")
+    alike_mm: NotNegative = Field(description="what all clouds are shifted by alike, one standard deviation, mm")
+    alike_deg: NotNegative = Field(description="what they are turned by alike, about the object, degrees")
     registrations: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
     remarks: tuple[str, ...] = Field(default=(), description="what is wrong with single clouds, in words")
 

@@ -239,6 +239,8 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
         used=int(seen.used.sum()),
         noise_mm=1e3 * float(seen.sigma_m[0]),
         spacing_mm=1e3 * seen.spacing_m,
+        alike_mm=1e3 * seen.alike_m,
+        alike_deg=float(np.degrees(seen.alike_rad)),
         registrations=tuple(
             RegisteredPair(
                 first=names[i],

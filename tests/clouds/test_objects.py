@@ -165,6 +165,21 @@ def test_points_with_noise_as_large_as_their_distance_are_smoothed_along_their_r
     assert not spacing_of([clouds_of_thing("bust", 1, 100).clouds[0].points], 12).is_noisy
 
 
+def test_the_pattern_of_a_sensor_that_all_views_share_is_in_the_ellipsoid() -> None:
+    """Half a millimetre that follows the image: 1.3 mm and 0.24 degrees off where 0.3 mm were claimed."""
+    seen = clouds_of_thing("heap", 12, 300)
+    draw = np.random.default_rng(1)
+    waves, phases = draw.normal(0.0, 40.0, (12, 2)), draw.uniform(0.0, 6.28, 12)
+    clouds = []
+    for cloud in seen.clouds:
+        off = 5e-4 * np.sin(cloud.points[:, :2] / cloud.points[:, 2:] @ waves.T + phases).sum(axis=1) / np.sqrt(6.0)
+        clouds.append(Cloud.of(cloud.points * (1.0 + off / np.linalg.norm(cloud.points, axis=1))[:, None]))
+    _, Y, covariance = answer(clouds, seen.A)
+    off = apart(seen.T_sensorcarrier_sensor, Y)
+    assert off @ np.linalg.solve(covariance, off) < CHI2_95
+    assert seen_object(seen.clouds, seen.A).alike_rad == 0.0  # without the pattern nothing is added
+
+
 def test_noise_of_the_arm_is_in_the_ellipsoid() -> None:
     noise = Noise(sigma_m=3e-4, kappa=0.5 / np.radians(0.1) ** 2)
     views = clouds_of_thing("heap", 9, 4, noise_in_A=noise)
