@@ -252,6 +252,13 @@ def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
             seen_object(clouds, A)
 
 
+def test_a_wall_that_does_not_move_before_the_sensor_is_named(bust: SimulatedClouds) -> None:
+    draw = np.random.default_rng(5)
+    wall = np.column_stack([draw.uniform(-0.25, 0.25, (3000, 2)), draw.normal(0.6, 1e-4, 3000)])
+    with pytest.raises(CloudError, match="does not move before the sensor"):
+        seen_object([Cloud.of(np.vstack([cloud.points, wall])) for cloud in bust.clouds], bust.A)
+
+
 def test_poses_or_clouds_that_are_all_the_same_are_named(bust: SimulatedClouds) -> None:
     with pytest.raises(CloudError, match="all 9 poses are the same"):
         seen_object(bust.clouds, np.repeat(bust.A[:1], 9, axis=0))
