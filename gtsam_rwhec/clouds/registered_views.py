@@ -262,8 +262,8 @@ def _unexplained(views: Views, misfit: float) -> str:
         unit.format("poses", "clouds", "0.001"): shorter,
         unit.format("clouds", "poses", "1000"): longer,
         "A is inverted: give T_sensorcarrier_targetcarrier, with which the clouds fit": se3.inverse(views.A),
-        "most of what the clouds show does not move before the sensor (a wall, a table, a stand): cut it away, and leave "
-        "the thing": np.repeat(views.A[:1], len(views.A), axis=0),
+        "most of what the clouds show does not move before the sensor (a wall, a table): cut it away, and leave the "
+        "thing": np.repeat(views.A[:1], len(views.A), axis=0),
     }
     for words, A in readings.items():
         best = first_poses(views.surfaces, A, views.spacing.faces_m)[0]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, ViewFault, seen_object
 from gtsam_rwhec.clouds.joint_registration import LOOSE, of_groups
-from gtsam_rwhec.clouds.point_to_plane import known, matches
+from gtsam_rwhec.clouds.point_to_plane import alike, known, matches
 from gtsam_rwhec.clouds.surfaces import Features, Surface, spacing_of
 from gtsam_rwhec.errors import CloudError, PoseError
 from gtsam_rwhec.problem.directions import Weighing
@@ -177,7 +177,7 @@ def test_the_pattern_of_a_sensor_that_all_views_share_is_in_the_ellipsoid() -> N
     _, Y, covariance = answer(clouds, seen.A)
     off = apart(seen.T_sensorcarrier_sensor, Y)
     assert off @ np.linalg.solve(covariance, off) < CHI2_95
-    assert seen_object(seen.clouds, seen.A).alike_rad == 0.0  # without the pattern nothing is added
+    assert alike(1.4e-4, 1e-4) == 0.0  # what noise along rays explains is no pattern
 
 
 def test_noise_of_the_arm_is_in_the_ellipsoid() -> None:
@@ -254,9 +254,10 @@ def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
 
 def test_a_wall_that_does_not_move_before_the_sensor_is_named(bust: SimulatedClouds) -> None:
     draw = np.random.default_rng(5)
-    wall = np.column_stack([draw.uniform(-0.25, 0.25, (3000, 2)), draw.normal(0.6, 1e-4, 3000)])
+    wall = np.column_stack([draw.uniform(-0.25, 0.25, (1000, 2)), draw.normal(0.6, 1e-4, 1000)])
+    clouds = [Cloud.of(np.vstack([cloud.points[::3], wall])) for cloud in bust.clouds[:5]]
     with pytest.raises(CloudError, match="does not move before the sensor"):
-        seen_object([Cloud.of(np.vstack([cloud.points, wall])) for cloud in bust.clouds], bust.A)
+        seen_object(clouds, bust.A[:5])
 
 
 def test_poses_or_clouds_that_are_all_the_same_are_named(bust: SimulatedClouds) -> None:
@@ -267,12 +268,13 @@ def test_poses_or_clouds_that_are_all_the_same_are_named(bust: SimulatedClouds) 
 
 
 def test_points_far_beyond_all_others_change_nothing(bust: SimulatedClouds, capfd: pytest.CaptureFixture[str]) -> None:
-    far = np.vstack([bust.clouds[2].points, [[1e20, 0.0, 0.0], [3e7, 1.0, 1.0]]])
-    clouds = [*bust.clouds[:2], Cloud.of(far), *bust.clouds[3:]]
-    found, plain = seen_object(clouds, bust.A), seen_object(bust.clouds, bust.A)
+    plain_clouds = [cloud.selected(np.arange(0, len(cloud), 2)) for cloud in bust.clouds[:6]]
+    far = np.vstack([plain_clouds[2].points, [[1e20, 0.0, 0.0], [3e7, 1.0, 1.0]]])
+    clouds = [*plain_clouds[:2], Cloud.of(far), *plain_clouds[3:]]
+    found, plain = seen_object(clouds, bust.A[:6]), seen_object(plain_clouds, bust.A[:6])
     np.testing.assert_allclose(found.T_sensor_object, plain.T_sensor_object, rtol=0.0, atol=1e-12)
     assert capfd.readouterr().err == ""  # the library for registrations writes there
-    assert str(found).startswith("A thing in 9 of 9 views, by 36 registrations; the sensor's pose by them is certified")
+    assert str(found).startswith("A thing in 6 of 6 views, by 15 registrations; the sensor's pose by them is certified")
 
 
 def test_what_is_too_little_is_said(bust: SimulatedClouds) -> None:
