@@ -37,7 +37,7 @@ def one(kind: str, seed: int) -> tuple[float, float, bool, bool, float, float]:
     seen = rw.clouds.seen_boards(places.clouds, places.size_m)
     problem = rw.clouds.lidar_and_camera(
         places.T_camera_board, seen.T_sensor_board, places.size_m, seen.covariances,
-        camera_covariances=places.covariances,
+        camera_covariances=places.covariances, common_m=seen.common_m,
     )  # fmt: skip
     found = rw.calibrate(problem, rw.CalibrateOptions(noise="given"))
     away = frame_distance(found.Y["lidar"].matrix(), places.T_camera_lidar)

@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 from rwhec_factors import se3
+from scipy.linalg import block_diag
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.lidar_boards import (
@@ -66,6 +67,13 @@ class SeenBoards:
     left_out: Mapping[int, str]
     boards: tuple[LidarBoard, ...]
     biases: BeamBiases
+
+    @property
+    def common_m(self) -> float:
+        """What all beams on a board measure too far together, by how far each does: the standard deviation, m."""
+        beams = float(np.median([len(board.moments.rings) for board in self.boards]))
+        squares = self.biases.bias_m**2 - np.diagonal(self.biases.covariance)
+        return float(np.sqrt(max(squares.mean(), 0.0) / beams))
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -181,6 +189,7 @@ def lidar_and_camera(
     T_board_target: PoseLike | None = None,
     placed_m: float = 0.0,
     placed_rad: float = 0.0,
+    common_m: float = 0.0,
     target: str = "board",
     sensor: str = "lidar",
 ) -> Problem:
@@ -205,8 +214,11 @@ def lidar_and_camera(
     T_board_target : pose, optional
         The camera's target on the board. Left out: the target is in the board's middle, x along the width.
     placed_m, placed_rad : float
-        Standard deviations of the target's place on the board, and of what the LiDAR measures too far everywhere, which
-        looks the same: 0.01 m and 0.01 rad are usual. 0: both are exact. Otherwise the result has the board's pose too.
+        Standard deviations of the target's place on the board: 0.01 m and 0.01 rad are usual. 0: it is exact. Otherwise
+        the result has the board's pose too.
+    common_m : float
+        The standard deviation of what the LiDAR measures too far everywhere, ``SeenBoards.common_m``: it moves all
+        boards alike along the line of sight, which no residual shows, and is in the sensor's covariance.
     target, sensor : str
         Names in the problem.
 
@@ -247,6 +259,9 @@ def lidar_and_camera(
     else:
         placed_rad, placed_m = max(placed_rad, NEXT_TO_NOTHING), max(placed_m, NEXT_TO_NOTHING)
         problem.add_prior(target, np.eye(4), placed_m, 0.5 / placed_rad**2)
+    sight = (B[:, :3, 3] / np.linalg.norm(B[:, :3, 3], axis=1)[:, None]).mean(axis=0)
+    if common_m > 0.0:
+        problem.alike[target] = block_diag(np.zeros((3, 3)), common_m**2 * np.outer(sight, sight))
     return problem
 
 

@@ -70,6 +70,21 @@ def test_beams_that_measure_too_far_are_named() -> None:
     assert "5: +" in str(rw.clouds.seen_boards(clouds, base.size_m))
 
 
+def test_what_all_beams_share_is_in_the_covariance() -> None:
+    """Biases of 5 mm a beam: 2.2 mm along the line of sight where 0.5 mm were claimed."""
+    places = lidar_places(10, 700, lidar=SimulatedLidar(bias_m=0.005))
+    seen = rw.clouds.seen_boards(places.clouds, places.size_m)
+    held = []
+    for common_m in (0.0, seen.common_m):
+        problem = rw.clouds.lidar_and_camera(
+            places.T_camera_board, seen.T_sensor_board, places.size_m, seen.covariances,
+            camera_covariances=places.covariances, common_m=common_m,
+        )  # fmt: skip
+        found = rw.calibrate(problem, rw.CalibrateOptions(noise="given"))
+        held.append(found.contains("lidar", places.T_camera_lidar, 0.95))
+    assert held == [False, True]
+
+
 def test_a_cloud_without_beam_numbers_has_the_same_board(places: LidarPlaces) -> None:
     cloud = places.clouds[0]
     with_rings, without = (
