@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 from scipy.linalg import block_diag
-from scipy.linalg.lapack import dpotri
 
 from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.fitting.block_elimination import SMALL, EliminationOrder
 from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables, rows_of, slots_of
 from gtsam_rwhec.geometry.poses import Array
@@ -181,62 +181,6 @@ def _orthonormal(basis: Array) -> Array:
     U, s, _ = np.linalg.svd(basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-300), full_matrices=False)
     span: Array = U[:, s > 1e-9 * max(s[0], 1e-300)]
     return span
-
-
-#: Smaller matrices are inverted as a whole.
-SMALL = 120
-
-
-@dataclass(frozen=True)
-class EliminationOrder:
-    """Which parameters are eliminated at once, before the rest."""
-
-    #: (n, w): n blocks of w parameters, which nothing ties to one another.
-    blocks: np.ndarray
-
-    @staticmethod
-    def of(matrix: Array) -> EliminationOrder:
-        """For matrices (d, d) that are zero where this one is; its parameters with the same ties are blocks."""
-        best = np.zeros((0, 1), dtype=np.int64)
-        if len(matrix) <= SMALL:
-            return EliminationOrder(best)
-        tied = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
-        _, first, member = np.unique(np.packbits(tied, axis=1), axis=0, return_index=True, return_inverse=True)
-        neighbours = tied[np.ix_(first, first)]
-        np.fill_diagonal(neighbours, val=False)
-        widths = np.bincount(member.ravel())
-        blocks = np.split(np.argsort(member.ravel(), kind="stable"), np.cumsum(widths)[:-1])
-        fewest_first = np.argsort(neighbours.sum(axis=1), kind="stable")
-        for width in np.unique(widths):
-            found, is_free = [], widths == width
-            for number in fewest_first:
-                if is_free[number]:
-                    found.append(blocks[number])
-                    is_free &= ~neighbours[number]
-            if len(found) > 1 and len(found) * width > best.size:
-                best = np.array(found)
-        return EliminationOrder(best)
-
-    def inverse(self, matrix: Array) -> tuple[Array, float]:
-        """The inverse of a matrix of this pattern, and log|matrix|; LinAlgError if it is not positive definite."""
-        own, flat = self.blocks, self.blocks.ravel()
-        rest = np.delete(np.arange(len(matrix)), flat)
-        ties, alone = matrix[flat[:, None], rest], matrix[own[:, :, None], own[:, None]]
-        L = np.linalg.cholesky(alone)
-        alone = np.linalg.inv(alone)
-        through = (alone @ ties.reshape(*own.shape, len(rest))).reshape(ties.shape)
-        L_rest = np.linalg.cholesky(matrix[rest[:, None], rest] - ties.T @ through)
-        lower = np.tril(dpotri(L_rest, lower=1)[0]) if len(rest) else L_rest
-        of_rest = lower + np.tril(lower, -1).T
-        mixed = through @ of_rest
-        result = np.empty_like(matrix)
-        result[rest[:, None], rest] = of_rest
-        result[flat[:, None], rest] = -mixed
-        result[rest[:, None], flat] = -mixed.T
-        result[flat[:, None], flat] = mixed @ through.T
-        result[own[:, :, None], own[:, None]] += alone
-        diagonal = np.r_[np.diagonal(L, axis1=1, axis2=2).ravel(), np.diagonal(L_rest)]
-        return result, 2.0 * float(np.log(diagonal).sum())
 
 
 #: A carrier stands still when its velocity's mean square is at most this many times the part that noise explains.
