@@ -305,7 +305,7 @@ class Sums:
 def _add(sums: Array, at: tuple[np.ndarray, ...], values: Array) -> None:
     """Add values to sums at indices that may be there twice."""
     flat = np.ravel_multi_index(np.broadcast_arrays(*at), sums.shape)
-    np.add.at(sums.reshape(-1), np.broadcast_to(flat, values.shape).ravel(), values.ravel())
+    sums += np.bincount(np.broadcast_to(flat, values.shape).ravel(), values.ravel(), sums.size).reshape(sums.shape)
 
 
 def _by_corner(rows: Array, n: int) -> Array:

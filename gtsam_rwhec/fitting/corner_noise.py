@@ -154,6 +154,10 @@ class Reduced:
     def _order(self) -> EliminationOrder:
         return EliminationOrder.of(self.G + self.prior)
 
+    @cached_property
+    def _of_prior(self) -> tuple[np.ndarray, ...]:
+        return np.nonzero(self.prior)
+
     def joint(self, noise: Noise) -> tuple[Reduced, ArrowInverse, float]:
         """The sums without common errors, the covariance of all, and log |F| + log |H|; LinAlgError if there is none.
 
@@ -195,9 +199,8 @@ class Reduced:
         found = -inverse.times(pull)
         theta, variances = found[:d], inverse.diagonal[places]
         value = sums.rr / s2 + float(self.prior_off @ self.prior @ self.prior_off) + float(pull @ found) + log_det
-        of_prior = np.nonzero(self.prior)
-        by_prior = inverse.at(*(each[:, None] for each in of_prior)).ravel()
-        free = d - float(self.prior[of_prior] @ by_prior) + float((1.0 - variances).sum())
+        by_prior = inverse.at(*(each[:, None] for each in self._of_prior)).ravel()
+        free = d - float(self.prior[self._of_prior] @ by_prior) + float((1.0 - variances).sum())
         squares = sums.rr + 2.0 * float(sums.g @ theta) + float(theta @ sums.G @ theta)
         gradient = np.zeros(4)
         if noise.carrier is not None:
