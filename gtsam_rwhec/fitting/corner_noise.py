@@ -36,6 +36,8 @@ NOTHING = 1e-6
 #: What an image's corners share is looked for from this share of a corner's deviation to so many pixels, since more is
 #: no detector's; it counts from twice that share.
 LEAST_COMMON, MOST_COMMON_PX = 0.02, 0.3
+#: Where it is there, about this share of a corner's deviation.
+TYPICAL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,23 +259,32 @@ class Reduced:
     def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
         """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""
         deviations, free = deviations_of(start), self.free(start, carrier=carrier)
-        begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free]
+        # steps of equal length are about as likely: by how many errors tell each deviation
+        t = TYPICAL * start.corner_px
+        K = np.concatenate(
+            [np.diagonal(each, axis1=1, axis2=2) for each in self.common.inverse(t, start.corner_px**2)[0]]
+        )
+        told = np.array([self.count, 3 * len(self.M), 3 * len(self.M), ((1.0 - K / t**2) ** 2).sum()])
+        unit = 1.0 / np.sqrt(np.maximum(told, 1.0))[free]
+        begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free] / unit
 
         def noise(x: Vector) -> Noise:
             found = deviations.copy()
-            found[free] = np.exp(x)
+            found[free] = np.exp(x * unit)
             return Noise(*found.tolist())
 
         def cost(x: Vector) -> tuple[float, Array]:
             value, gradient = self.minus_two_log_likelihood(noise(x))
-            return value, gradient[free]
+            return value, gradient[free] * unit
 
         shared = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
-        limits = [(CORNER_PX, CARRIER, CARRIER, shared)[i] for i in free]
-        bounds = [(float(np.log(low)), float(np.log(high))) for low, high in limits]
+        limits = np.log([(CORNER_PX, CARRIER, CARRIER, shared)[i] for i in free]) / unit[:, None]
         from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
 
-        found = noise(minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11}).x)
+        bounds: list[tuple[float, float]] = [(low, high) for low, high in limits.tolist()]
+        found = noise(
+            minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11, "gtol": 1e-4}).x
+        )
         return found if found.common_px > 2.0 * LEAST_COMMON * found.corner_px else replace(found, common_px=0.0)
 
     def free(self, noise: Noise, *, carrier: bool) -> list[int]:
