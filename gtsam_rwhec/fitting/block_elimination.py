@@ -33,11 +33,14 @@ class EliminationOrder:
         if len(matrix) <= SMALL:
             return EliminationOrder(best)
         tied = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
-        _, first, member = np.unique(np.packbits(tied, axis=1), axis=0, return_index=True, return_inverse=True)
+        alike: dict[bytes, list[int]] = {}
+        for i, ties in enumerate(np.packbits(tied, axis=1)):
+            alike.setdefault(ties.tobytes(), []).append(i)
+        blocks = list(alike.values())
+        first = [block[0] for block in blocks]
         neighbours = tied[np.ix_(first, first)]
         np.fill_diagonal(neighbours, val=False)
-        widths = np.bincount(member.ravel())
-        blocks = np.split(np.argsort(member.ravel(), kind="stable"), np.cumsum(widths)[:-1])
+        widths = np.array([len(block) for block in blocks])
         fewest_first = np.argsort(neighbours.sum(axis=1), kind="stable")
         for width in np.unique(widths):
             found, is_free = [], widths == width
@@ -57,6 +60,9 @@ class EliminationOrder:
 
     def inverse(self, matrix: Array) -> tuple[Array, float]:
         """The inverse of a matrix of this pattern, and log|matrix|; LinAlgError if it is not positive definite."""
+        if not self.blocks.size:
+            L = np.linalg.cholesky(matrix)
+            return _inverse_of(L), 2.0 * float(np.log(np.diagonal(L)).sum())
         inverse = self.split(matrix).inverse()
         own, across = self.blocks, inverse.across
         flat, others = own.ravel(), inverse.of.others
@@ -66,6 +72,14 @@ class EliminationOrder:
         result[flat[:, None], flat] = across[flat] @ inverse.through[flat].T
         result[own[:, :, None], own[:, None]] += inverse.alone
         return result, inverse.log_det
+
+
+def _inverse_of(L: Array) -> Array:
+    """(L L')^-1 of a Cholesky factor (m, m)."""
+    upper = dpotri(L.T, lower=0)[0] if len(L) else L  # its lower triangle is zero, as that of L'
+    found: Array = upper + upper.T
+    np.fill_diagonal(found, np.diagonal(upper))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +126,9 @@ class ArrowInverse:
     @cached_property
     def across(self) -> Array:
         """The columns (d, m) of the rest."""
-        blocks, others, m = self.of.blocks, self.of.others, len(self.L_rest)
-        lower = np.tril(dpotri(self.L_rest, lower=1)[0]) if m else self.L_rest
-        of_rest = lower + np.tril(lower, -1).T
+        flat, of_rest = self.of.blocks.ravel(), _inverse_of(self.L_rest)
         found = np.empty_like(self.through)
-        found[others] = of_rest
-        found[blocks.ravel()] = self.through[blocks.ravel()] @ of_rest
+        found[self.of.others], found[flat] = of_rest, self.through[flat] @ of_rest
         return found
 
     @cached_property

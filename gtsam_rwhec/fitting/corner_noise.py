@@ -220,7 +220,7 @@ class Reduced:
             gradient[0] -= gradient[3]
         return value, gradient
 
-    @property
+    @cached_property
     def common(self) -> CommonErrors:
         """Of what an image's corners share."""
         return self.patterns.first(OF_AN_IMAGE)
