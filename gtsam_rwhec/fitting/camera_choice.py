@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -326,7 +326,7 @@ class WithoutPoses:
     The poses (p,) are -through (p, m + 1) times the others and 1.
     """
 
-    own: Array  #: (p, p): H of the poses alone
+    variances: Array  #: (p,): Of the poses with all else known
     through: Array
     H: Array
     h: Array
@@ -336,15 +336,10 @@ class WithoutPoses:
         """Of sums (d, d) and (d,) with so many numbers of poses."""
         own, ties = H[:poses, :poses], np.c_[H[:poses, poses:], h[:poses]]
         size = np.sqrt(np.diagonal(own))
-        through = np.linalg.solve(own / size[:, None] / size, ties / size[:, None]) / size[:, None]
+        inverse = np.linalg.inv(own / size[:, None] / size) / size[:, None] / size
+        through = inverse @ ties
         rest = np.c_[H[poses:, poses:], h[poses:]] - H[poses:, :poses] @ through
-        return WithoutPoses(own, through, rest[:, :-1], rest[:, -1])
-
-    @cached_property
-    def variances(self) -> Array:
-        """Those of the poses (p,), with all else known."""
-        size = np.sqrt(np.diagonal(self.own))
-        return np.asarray(np.diagonal(np.linalg.inv(self.own / size[:, None] / size)) / size**2)
+        return WithoutPoses(np.diagonal(inverse), through, rest[:, :-1], rest[:, -1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from gtsam_rwhec.fitting.block_elimination import ArrowInverse
 from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, errors_of_A, turned_by_A
 from gtsam_rwhec.geometry.poses import Array
 
 #: A symbol's letter is in the bits of its key from this one on.
@@ -109,17 +111,39 @@ class CornerGraph:
         That is the length of one more Gauss-Newton step in deviations. Slots have ("x", target), ("y", sensor),
         ("k", camera), ("b", target), ("t", sensor) and ("p", target).
         """
-        linear = self.graph.linearize(values)
-        keys = [self.keys[at] for at in slots]
-        marginal = linear.marginal(keys)
-        ordering = gtsam.Ordering()
-        for key in keys:
-            ordering.push_back(key)
-        information, gradient = marginal.hessian(ordering)
-        size = np.sqrt(np.diagonal(information))
-        inverse = np.linalg.inv(information / size[:, None] / size) / size[:, None] / size
-        joint: Array = 0.5 * (inverse + inverse.T)
-        return joint, float(np.sqrt(gradient @ joint @ gradient))
+        inverse, found, _ = self._normal(values)
+        rows = np.concatenate([np.arange(self.slots[at].start, self.slots[at].stop) for at in slots])
+        joint = inverse.at(rows, rows)
+        size = np.sqrt(np.diagonal(joint))
+        step = found[rows] / size
+        return joint, float(np.sqrt(step @ np.linalg.solve(joint / size[:, None] / size, step)))
+
+    def step(self, values: gtsam.Values) -> gtsam.VectorValues:
+        """Gauss and Newton's; LinAlgError where there is none."""
+        _, found, change_of_A = self._normal(values)
+        step = gtsam.VectorValues()
+        for at, key in self.keys.items():
+            step.insert(key, found[self.slots[at]])
+        for i, change in enumerate(change_of_A):
+            step.insert(key_of("a", i), change)
+        return step
+
+    def _normal(self, values: gtsam.Values) -> tuple[ArrowInverse, Array, Array]:
+        """The covariance of all, the best change, and A's (I, 6) to the right.
+
+        Targets or carriers are eliminated first, which the factor of all rows does not allow.
+        """
+        point, S = self.point(values), self.model.A_noise
+        reduced, noise = (
+            Reduced.whitened(self.model, point),
+            Noise(1.0, *(0.0, 0.0) if S is None else S[[0, 3]].tolist()),
+        )
+        sums, inverse, _ = reduced.joint(noise)
+        _, found = reduced.estimate(noise, sums, inverse)
+        if S is None:
+            return inverse, found, np.zeros((0, 6))
+        change = found[len(reduced.G) :].reshape(-1, 6) * S - errors_of_A(self.model, point)
+        return inverse, found, (turned_by_A(self.model, point) @ change[..., None])[..., 0]
 
     def _add_priors(self) -> None:
         model = self.model

@@ -96,10 +96,9 @@ class Reduced:
 
         The errors of the point's A are taken off the residuals, to first order.
         """
-        vectors, slots = model.vectors(point), slots or model.slots(point)
+        slots = slots or model.slots(point)
         sums, number, common = Sums.zeros(len(model.A), slots), 0.0, []
-        to_right = model.to_right
-        off_A = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
+        to_right, off_A = model.to_right, errors_of_A(model, point)
         for stack, weights in zip(model.stacks, model.weights, strict=True):
             rows, where = model.linearised(stack, point), model.columns(stack, slots)
             root = np.repeat(np.sqrt(weights), 2, axis=1)
@@ -115,12 +114,29 @@ class Reduced:
             P = patterns(model, stack, point) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
             common.append(OfStack(stack, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
-        size = len(sums.squares) - 1
-        prior, off = np.zeros((size, size)), np.zeros(size)
-        for at, of in model.priors(point).items():
-            prior[slots[at], slots[at]] = of.precision
-            off[slots[at]] = vectors[at] - of.mean
-        return Reduced(slots, sums, number, prior, off, CommonErrors(tuple(common)))
+        return Reduced(
+            slots, sums, number, *_prior(model, point, slots, len(sums.squares) - 1), CommonErrors(tuple(common))
+        )
+
+    @staticmethod
+    def whitened(model: Model, point: Point) -> Reduced:
+        """The sums at a point of rows of unit noise, what images' corners share among it."""
+        slots, sums, R, off_A = (
+            model.slots(point),
+            model.sums(point),
+            turned_by_A(model, point),
+            errors_of_A(model, point),
+        )
+        of_A, M = R.transpose(0, 2, 1) @ sums.of_A, R.transpose(0, 2, 1) @ sums.M @ R
+        sums.squares[:, -1] -= np.einsum("nid,ni->d", of_A, off_A)
+        of_A[..., -1] -= (M @ off_A[..., None])[..., 0]
+        return Reduced(
+            slots,
+            Sums(sums.squares, of_A, M),
+            0.0,
+            *_prior(model, point, slots, len(sums.squares) - 1),
+            CommonErrors(()),
+        )
 
     @property
     def G(self) -> Array:
@@ -180,6 +196,13 @@ class Reduced:
         inverse = (arrow or self._order.split(whole)).inverse()
         return sums, inverse, log_det + self.count * float(np.log(s2)) + inverse.log_det
 
+    def estimate(self, noise: Noise, sums: Reduced, inverse: ArrowInverse) -> tuple[Array, Array]:
+        """The gradient of half the cost by all that is in `joint`, and its best change."""
+        pull = sums.g / noise.corner_px**2 + self.prior @ self.prior_off
+        if noise.carrier is not None:
+            pull = np.r_[pull, (sums.b * noise.carrier / noise.corner_px**2).ravel()]
+        return pull, -inverse.times(pull)
+
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
         """Restricted: theta integrated out; and its derivatives by the logarithms of the deviations.
 
@@ -195,10 +218,8 @@ class Reduced:
             sums, inverse, log_det = self.joint(noise)
         except np.linalg.LinAlgError:
             return np.inf, np.zeros(4)
-        pull, places = sums.g / s2 + self.prior @ self.prior_off, np.arange(d, len(inverse.through)).reshape(-1, 6)
-        if noise.carrier is not None:
-            pull = np.r_[pull, (sums.b * noise.carrier / s2).ravel()]
-        found = -inverse.times(pull)
+        pull, found = self.estimate(noise, sums, inverse)
+        places = np.arange(d, len(found)).reshape(-1, 6)
         theta, variances = found[:d], inverse.diagonal[places]
         value = sums.rr / s2 + float(self.prior_off @ self.prior @ self.prior_off) + float(pull @ found) + log_det
         by_prior = inverse.at(*(each[:, None] for each in self._of_prior)).ravel()
@@ -296,6 +317,29 @@ class Reduced:
         shares = noise.carrier is not None and not any(letter == "p" for letter, _ in self.slots)
         shares &= 2.0 * LEAST_COMMON * noise.corner_px < MOST_COMMON_PX
         return [0, *((1, 2) if carrier else ()), *((3,) if shares else ())]
+
+
+def errors_of_A(model: Model, point: Point) -> Array:
+    """A's perturbations (I, 6) from where it was measured."""
+    off: Array = np.linalg.solve(model.to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
+    return off
+
+
+def turned_by_A(model: Model, point: Point) -> Array:
+    """What changes (I, 6, 6) of A's perturbations turn the points' A by, to the right."""
+    turned: Array = np.linalg.solve(
+        se3.right_jacobian_inverse(se3.logmap(se3.inverse(model.A) @ point.A)), model.to_right
+    )
+    return turned
+
+
+def _prior(model: Model, point: Point, slots: Mapping[tuple[str, str], slice], size: int) -> tuple[Array, Array]:
+    """`Reduced.prior` and `Reduced.prior_off`."""
+    vectors, prior, off = model.vectors(point), np.zeros((size, size)), np.zeros(size)
+    for at, of in model.priors(point).items():
+        prior[slots[at], slots[at]] = of.precision
+        off[slots[at]] = vectors[at] - of.mean
+    return prior, off
 
 
 def deviations_of(noise: Noise) -> Array:
