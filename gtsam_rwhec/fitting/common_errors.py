@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.fitting.block_elimination import ArrowInverse
 from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
 

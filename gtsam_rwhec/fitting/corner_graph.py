@@ -24,9 +24,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from gtsam_rwhec.fitting.block_elimination import ArrowInverse
 from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, errors_of_A, turned_by_A
+from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
 #: A symbol's letter is in the bits of its key from this one on.

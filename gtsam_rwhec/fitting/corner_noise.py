@@ -20,10 +20,10 @@ import numpy as np
 from rwhec_factors import se3
 from scipy.linalg import block_diag
 
-from gtsam_rwhec.fitting.block_elimination import Arrow, ArrowInverse, EliminationOrder
 from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows, Sums
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
+from gtsam_rwhec.fitting.joint_covariance import Arrow, ArrowInverse, EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]

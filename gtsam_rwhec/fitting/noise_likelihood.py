@@ -16,10 +16,10 @@ from functools import cached_property
 
 import numpy as np
 
-from gtsam_rwhec.fitting.block_elimination import EliminationOrder
 from gtsam_rwhec.fitting.drift import TRACK, DriftPrior, EliminatedDrift, own_directions
 from gtsam_rwhec.fitting.fit_options import About, C
 from gtsam_rwhec.fitting.instant_products import Measurements, Reduced, carrier_of, white_terms
+from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.fitting.noise_rows import Rows
 from gtsam_rwhec.geometry.poses import Array
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gtsam_rwhec.fitting.block_elimination import EliminationOrder
+from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row
 from gtsam_rwhec.results.linear_model import OWN, LinearModel, equilibrated, inverse_of

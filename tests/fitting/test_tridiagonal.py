@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.fitting.block_elimination import SMALL, EliminationOrder
 from gtsam_rwhec.fitting.drift import ChainFactor
-from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.joint_covariance import SMALL, EliminationOrder, JointCovariance
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 
 
