@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.fitting.corner_model import Model, Point
-from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, errors_of_A, turned_by_A
+from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, errors_of_A
 from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
@@ -111,8 +111,16 @@ class CornerGraph:
         That is the length of one more Gauss-Newton step in deviations. Slots have ("x", target), ("y", sensor),
         ("k", camera), ("b", target), ("t", sensor) and ("p", target).
         """
-        inverse, found, _ = self._normal(values)
         rows = np.concatenate([np.arange(self.slots[at].start, self.slots[at].stop) for at in slots])
+        _, reduced, noise = self._reduced(values)
+        try:
+            inverse, found = self._changed(reduced, noise)
+        except np.linalg.LinAlgError:  # inverted all the same, to tell what is not determined
+            information = reduced.information(noise)
+            size = np.sqrt(np.diagonal(information))
+            return (np.linalg.inv(information / size[:, None] / size) / size[:, None] / size)[
+                np.ix_(rows, rows)
+            ], np.inf
         joint = inverse.at(rows, rows)
         size = np.sqrt(np.diagonal(joint))
         step = found[rows] / size
@@ -120,30 +128,28 @@ class CornerGraph:
 
     def step(self, values: gtsam.Values) -> gtsam.VectorValues:
         """Gauss and Newton's; LinAlgError where there is none."""
-        _, found, change_of_A = self._normal(values)
+        point, reduced, noise = self._reduced(values)
+        _, found = self._changed(reduced, noise)
         step = gtsam.VectorValues()
         for at, key in self.keys.items():
             step.insert(key, found[self.slots[at]])
-        for i, change in enumerate(change_of_A):
-            step.insert(key_of("a", i), change)
+        if self.model.A_noise is not None:
+            off_A, turned = errors_of_A(self.model, point)
+            change = found[len(reduced.G) :].reshape(-1, 6) * self.model.A_noise - off_A
+            for i, moved in enumerate((turned @ change[..., None])[..., 0]):
+                step.insert(key_of("a", i), moved)
         return step
 
-    def _normal(self, values: gtsam.Values) -> tuple[ArrowInverse, Array, Array]:
-        """The covariance of all, the best change, and A's (I, 6) to the right.
-
-        Targets or carriers are eliminated first, which the factor of all rows does not allow.
-        """
+    def _reduced(self, values: gtsam.Values) -> tuple[Point, Reduced, Noise]:
+        """The sums of unit noise at values, and A's noise."""
         point, S = self.point(values), self.model.A_noise
-        reduced, noise = (
-            Reduced.whitened(self.model, point),
-            Noise(1.0, *(0.0, 0.0) if S is None else S[[0, 3]].tolist()),
-        )
+        return point, Reduced.whitened(self.model, point), Noise(1.0, *(0.0, 0.0) if S is None else S[[0, 3]].tolist())
+
+    @staticmethod
+    def _changed(reduced: Reduced, noise: Noise) -> tuple[ArrowInverse, Array]:
+        """The covariance of all, and the best change: targets or carriers are eliminated first."""
         sums, inverse, _ = reduced.joint(noise)
-        _, found = reduced.estimate(noise, sums, inverse)
-        if S is None:
-            return inverse, found, np.zeros((0, 6))
-        change = found[len(reduced.G) :].reshape(-1, 6) * S - errors_of_A(self.model, point)
-        return inverse, found, (turned_by_A(self.model, point) @ change[..., None])[..., 0]
+        return inverse, reduced.estimate(noise, sums, inverse)[1]
 
     def _add_priors(self) -> None:
         model = self.model

@@ -98,7 +98,7 @@ class Reduced:
         """
         slots = slots or model.slots(point)
         sums, number, common = Sums.zeros(len(model.A), slots), 0.0, []
-        to_right, off_A = model.to_right, errors_of_A(model, point)
+        to_right, (off_A, _) = model.to_right, errors_of_A(model, point)
         for stack, weights in zip(model.stacks, model.weights, strict=True):
             rows, where = model.linearised(stack, point), model.columns(stack, slots)
             root = np.repeat(np.sqrt(weights), 2, axis=1)
@@ -114,29 +114,18 @@ class Reduced:
             P = patterns(model, stack, point) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
             common.append(OfStack(stack, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
-        return Reduced(
-            slots, sums, number, *_prior(model, point, slots, len(sums.squares) - 1), CommonErrors(tuple(common))
-        )
+        prior = _prior(model, point, slots, len(sums.squares) - 1)
+        return Reduced(slots, sums, number, *prior, CommonErrors(tuple(common)))
 
     @staticmethod
     def whitened(model: Model, point: Point) -> Reduced:
         """The sums at a point of rows of unit noise, what images' corners share among it."""
-        slots, sums, R, off_A = (
-            model.slots(point),
-            model.sums(point),
-            turned_by_A(model, point),
-            errors_of_A(model, point),
-        )
+        slots, sums, (off_A, R) = model.slots(point), model.sums(point), errors_of_A(model, point)
         of_A, M = R.transpose(0, 2, 1) @ sums.of_A, R.transpose(0, 2, 1) @ sums.M @ R
         sums.squares[:, -1] -= np.einsum("nid,ni->d", of_A, off_A)
         of_A[..., -1] -= (M @ off_A[..., None])[..., 0]
-        return Reduced(
-            slots,
-            Sums(sums.squares, of_A, M),
-            0.0,
-            *_prior(model, point, slots, len(sums.squares) - 1),
-            CommonErrors(()),
-        )
+        prior = _prior(model, point, slots, len(sums.squares) - 1)
+        return Reduced(slots, Sums(sums.squares, of_A, M), 0.0, *prior, CommonErrors(()))
 
     @property
     def G(self) -> Array:
@@ -282,11 +271,10 @@ class Reduced:
         deviations, free = deviations_of(start), self.free(start, carrier=carrier)
         # steps of equal length are about as likely: by how many errors tell each deviation
         t = TYPICAL * start.corner_px
-        K = np.concatenate(
-            [np.diagonal(each, axis1=1, axis2=2) for each in self.common.inverse(t, start.corner_px**2)[0]]
-        )
-        told = np.array([self.count, 3 * len(self.M), 3 * len(self.M), ((1.0 - K / t**2) ** 2).sum()])
-        unit = 1.0 / np.sqrt(np.maximum(told, 1.0))[free]
+        K = np.concatenate(self.common.inverse(t, start.corner_px**2)[0])
+        shared = float(((1.0 - np.einsum("vkk->vk", K) / t**2) ** 2).sum())
+        told = np.array([self.count, 3 * len(self.M), 3 * len(self.M), shared])[free]
+        unit = 1.0 / np.sqrt(np.maximum(told, 1.0))
         begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free] / unit
 
         def noise(x: Vector) -> Noise:
@@ -298,8 +286,8 @@ class Reduced:
             value, gradient = self.minus_two_log_likelihood(noise(x))
             return value, gradient[free] * unit
 
-        shared = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
-        limits = np.log([(CORNER_PX, CARRIER, CARRIER, shared)[i] for i in free]) / unit[:, None]
+        common = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
+        limits = np.log([(CORNER_PX, CARRIER, CARRIER, common)[i] for i in free]) / unit[:, None]
         from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
 
         bounds: list[tuple[float, float]] = [(low, high) for low, high in limits.tolist()]
@@ -319,18 +307,11 @@ class Reduced:
         return [0, *((1, 2) if carrier else ()), *((3,) if shares else ())]
 
 
-def errors_of_A(model: Model, point: Point) -> Array:
-    """A's perturbations (I, 6) from where it was measured."""
-    off: Array = np.linalg.solve(model.to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
-    return off
-
-
-def turned_by_A(model: Model, point: Point) -> Array:
-    """What changes (I, 6, 6) of A's perturbations turn the points' A by, to the right."""
-    turned: Array = np.linalg.solve(
-        se3.right_jacobian_inverse(se3.logmap(se3.inverse(model.A) @ point.A)), model.to_right
-    )
-    return turned
+def errors_of_A(model: Model, point: Point) -> tuple[Array, Array]:
+    """A's perturbations (I, 6) from where it was measured, and what turns changes of them to the right (I, 6, 6)."""
+    moved = se3.logmap(se3.inverse(model.A) @ point.A)
+    off_A = np.linalg.solve(model.to_right, moved[..., None])[..., 0]
+    return off_A, np.linalg.solve(se3.right_jacobian_inverse(moved), model.to_right)
 
 
 def _prior(model: Model, point: Point, slots: Mapping[tuple[str, str], slice], size: int) -> tuple[Array, Array]:
