@@ -22,11 +22,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.sparse import csr_array
 from scipy.special import chdtri
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -233,7 +233,7 @@ class Choosing:
         """The first that predicts as well as the best."""
         models = [LinearModel.of(self.blocks.refined, self.stated, options) for _, options in rivals]
         at, scores, weights = self.blocks.simplest(models)
-        answers = [model.theta(self.blocks.all_H, self.blocks.all_h) for model in models]
+        answers = [model.theta(self.blocks.all) for model in models]
         for weight, answer in zip(weights.tolist(), answers, strict=True):
             off = np.sqrt(weight) * (answer - answers[at])
             self.rivals.append({slot: off[rows] for slot, rows in self.blocks.refined.slots.items()})
@@ -253,10 +253,9 @@ def _levels(refined: CornersRefined, names: Sequence[str]) -> list[FreeLens]:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """theta = T phi + start, with the prior's precision P on phi, and how far phi = 0 is from the prior's mean."""
+    """All but poses are T phi + start, with the prior's precision P on phi, and how far phi = 0 is from its mean."""
 
-    #: Each number is one of phi's: it has one 1 in each row
-    T: csr_array
+    T: Array
     start: Array
     P: Array
     off: Array
@@ -265,7 +264,9 @@ class LinearModel:
     def of(refined: CornersRefined, stated: Mapping[str, Camera], options: CornerOptions) -> LinearModel:
         """The model of options about a refinement in which each camera has its own intrinsics."""
         model, point = refined.graph.model, refined.point
-        slots, size = refined.slots, len(refined.joint)
+        poses = poses_of(refined)
+        slots = {at: slice(rows.start - poses, rows.stop - poses) for at, rows in refined.slots.items()}
+        size = len(refined.joint) - poses
         T, start = np.eye(size), np.zeros(size)
         P, off = np.zeros((size, size)), np.zeros(size)
         vectors, gone = model.vectors(point), []
@@ -293,23 +294,52 @@ class LinearModel:
             P[rows, rows] = prior.precision
             off[rows] = vectors[at] - prior.mean
         kept = np.setdiff1d(np.arange(size), gone)
-        return LinearModel(csr_array(T[:, kept]), start, P[np.ix_(kept, kept)], off[kept])
+        return LinearModel(T[:, kept], start, P[np.ix_(kept, kept)], off[kept])
 
-    def theta(self, H: Array, h: Array) -> Array:
-        """The unknowns (d,) of least cost, for sums of rows."""
-        A, b = self.T.T @ H @ self.T + self.P, self.T.T @ (h + H @ self.start) + self.P @ self.off
+    def theta(self, sums: WithoutPoses) -> Array:
+        """The unknowns (d,) of least cost."""
+        A, b = self.T.T @ sums.H @ self.T + self.P, self.T.T @ (sums.h + sums.H @ self.start) + self.P @ self.off
         size = np.sqrt(np.diagonal(A))
-        phi = -np.linalg.solve(A / size[:, None] / size, b / size) / size
-        found: Array = self.T @ phi + self.start
+        rest: Array = self.T @ (-np.linalg.solve(A / size[:, None] / size, b / size) / size) + self.start
+        found: Array = np.r_[-sums.through @ np.r_[rest, 1.0], rest]
         return found
 
-    def covariance(self, H: Array) -> Array:
-        """That of the unknowns (d, d)."""
-        A = self.T.T @ H @ self.T + self.P
+    def variances(self, sums: WithoutPoses) -> Array:
+        """Those of the unknowns (d,)."""
+        A = self.T.T @ sums.H @ self.T + self.P
         size = np.sqrt(np.diagonal(A))
-        inverse = np.linalg.inv(A / size[:, None] / size) / size[:, None] / size
-        found: Array = self.T @ inverse @ self.T.T
+        rest: Array = self.T @ (np.linalg.inv(A / size[:, None] / size) / size[:, None] / size) @ self.T.T
+        by_rest = sums.through[:, :-1]
+        found: Array = np.r_[sums.variances + ((by_rest @ rest) * by_rest).sum(axis=1), np.diagonal(rest)]
         return found
+
+
+def poses_of(refined: CornersRefined) -> int:
+    """The number of the unknowns that are poses, which come first."""
+    return 6 * sum(letter in "xy" for letter, _ in refined.slots)
+
+
+@dataclass(frozen=True, eq=False)
+class WithoutPoses:
+    """H (m, m) and h (m,) of sums from which the poses are eliminated: no model has a prior of these.
+
+    The poses (p,) are -through (p, m + 1) times the others and 1.
+    """
+
+    variances: Array  #: (p,): Of the poses with all else known
+    through: Array
+    H: Array
+    h: Array
+
+    @staticmethod
+    def of(H: Array, h: Array, poses: int) -> WithoutPoses:
+        """Of sums (d, d) and (d,) with so many numbers of poses."""
+        own, ties = H[:poses, :poses], np.c_[H[:poses, poses:], h[:poses]]
+        size = np.sqrt(np.diagonal(own))
+        inverse = np.linalg.inv(own / size[:, None] / size) / size[:, None] / size
+        through = inverse @ ties
+        rest = np.c_[H[poses:, poses:], h[poses:]] - H[poses:, :poses] @ through
+        return WithoutPoses(np.diagonal(inverse), through, rest[:, :-1], rest[:, -1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,9 +353,9 @@ class Blocks:
     count: Array
     #: (b,): 0 by time, 1 by configuration, 2 by region.
     way: np.ndarray
-    #: Of all images.
-    all_H: Array
-    all_h: Array
+    #: Of all images, and of all but each block's.
+    all: WithoutPoses
+    rest: list[WithoutPoses]
 
     def __len__(self) -> int:
         """The number of blocks."""
@@ -347,13 +377,15 @@ class Blocks:
                     found.append((sums.H, sums.h, sums.rr, reduced.count))
                     ways.append(way)
         H, h, c, count = (np.array(each) for each in zip(*found, strict=True)) if found else (np.zeros(0),) * 4
-        return Blocks(refined, H, h, c, count, np.array(ways), whole.H, whole.h)
+        without = partial(WithoutPoses.of, poses=poses_of(refined))
+        rest = [without(whole.H - H[i], whole.h - h[i]) for i in range(len(c))]
+        return Blocks(refined, H, h, c, count, np.array(ways), without(whole.H, whole.h), rest)
 
     def errors(self, model: LinearModel) -> Array:
         """Squared errors (b,) of each block, predicted from the others."""
         found = np.zeros(len(self))
         for i in range(len(self)):
-            theta = model.theta(self.all_H - self.H[i], self.all_h - self.h[i])
+            theta = model.theta(self.rest[i])
             found[i] = self.c[i] + 2.0 * self.h[i] @ theta + theta @ self.H[i] @ theta
         return found
 
@@ -378,14 +410,13 @@ class Blocks:
         Without block j the answer differs by what has the covariance C_j - C: with C_j that of the rest, C that of all.
         """
         found = dict.fromkeys(self.refined.slots, 1.0)
-        theta, C = model.theta(self.all_H, self.all_h), np.diagonal(model.covariance(self.all_H))
+        theta, C = model.theta(self.all), model.variances(self.all)
         for way in (0, 1):
             at = np.flatnonzero(self.way == way)
             if not len(at):
                 continue
-            rest = [(self.all_H - self.H[i], self.all_h - self.h[i]) for i in at]
-            off = np.array([model.theta(H, h) for H, h in rest]) - theta
-            claimed = np.array([np.diagonal(model.covariance(H)) for H, _ in rest]) - C
+            off = np.array([model.theta(self.rest[i]) for i in at]) - theta
+            claimed = np.array([model.variances(self.rest[i]) for i in at]) - C
             told = claimed > TOLD * C
             squares = np.where(told, off**2, 0.0) / np.where(told, claimed, 1.0)
             for slot, rows in self.refined.slots.items():

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
 
@@ -52,23 +53,24 @@ class CommonErrors:
         K, ends = np.linalg.inv(inner) * common_px**2, np.cumsum([len(stack.P) for stack in self.stacks])[:-1]
         return np.split(K, ends), float(np.linalg.slogdet(inner)[1].sum())
 
-    def twice_by_log(self, common_px: float, s2: float, theta: Array, covariance: Array, carriers: Carriers) -> float:
+    def twice_by_log(self, common_px: float, s2: float, found: Array, inverse: ArrowInverse, of: Carriers) -> float:
         """The derivative of -2 log L by log t: twice their number less their squares, as estimated and as uncertain.
 
-        ``theta`` (d,) with its covariance (d, d). An image's errors are c = -(e + E theta + D a), a = -K b - KC theta.
+        ``found`` are the unknowns theta and the carriers' errors a, in deviations, with their covariance. An image's
+        errors are c = -(e + E theta + D a).
         """
         squares, number = 0.0, 0
-        of_a = carriers.K + carriers.KC_covariance @ carriers.KC.transpose(0, 2, 1)
+        of_a = inverse.at(of.places, of.places)
         for stack, K in zip(self.stacks, self.inverse(common_px, s2)[0], strict=True):
             at, own = stack.stack.instant, stack.columns
-            E, D = K @ stack.of_unknowns / s2, K @ stack.of_A / s2
+            E, D = K @ stack.of_unknowns / s2, K @ (stack.of_A * of.deviations) / s2
             e = (K @ stack.of_residual[..., None])[..., 0] / s2
-            of_theta = (E @ stack.stack.each(theta[own])[..., None])[..., 0]
-            c = -(e + of_theta + (D @ carriers.a[at][..., None])[..., 0])
-            with_a = carriers.KC_covariance.transpose(0, 2, 1)[at[:, None], stack.stack.each(own)]  # (V, m, 6)
+            of_theta = (E @ stack.stack.each(found[own])[..., None])[..., 0]
+            c = -(e + of_theta + (D @ found[of.places[at]][..., None])[..., 0])
+            with_a = inverse.between(stack.stack.each(own), of.places[at])  # (V, m, 6)
             variance = np.diagonal(K, axis1=1, axis2=2) + ((D @ of_a[at]) * D).sum(axis=2)
-            variance = variance + ((E @ stack.stack.each(covariance[own[:, :, None], own[:, None]])) * E).sum(axis=2)
-            variance = variance - 2.0 * ((E @ with_a) * D).sum(axis=2)
+            variance = variance + ((E @ stack.stack.each(inverse.at(own, own))) * E).sum(axis=2)
+            variance = variance + 2.0 * ((E @ with_a) * D).sum(axis=2)
             squares += float((c**2 + variance).sum())
             number += c.size
         return 2.0 * (number - squares / common_px**2)
@@ -76,15 +78,10 @@ class CommonErrors:
 
 @dataclass(frozen=True, eq=False)
 class Carriers:
-    """The carriers' errors a (I, 6) as they are estimated, a = -K b - KC theta, with K (I, 6, 6) and KC (I, 6, d).
+    """Where the carriers' errors (I, 6) are among all that is estimated, and their deviations (6,)."""
 
-    And KC times theta's covariance.
-    """
-
-    a: Array
-    K: Array
-    KC: Array
-    KC_covariance: Array
+    places: np.ndarray
+    deviations: Array
 
 
 def whitener(P: Array) -> Array:

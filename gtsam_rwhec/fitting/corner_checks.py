@@ -235,15 +235,15 @@ def grows_by_noise(
     if model.A_noise is None or not weakest:
         return {}
     rng = np.random.default_rng(0)
-    covariances = [_covariance(model, point, noise)]
+    points = [point]
     for _ in range(DRAWS):
         xi = (model.to_right @ (rng.normal(size=(len(model.A), 6)) * model.A_noise)[..., None])[..., 0]
-        covariances.append(_covariance(model, replace(point, A=point.A @ se3.expmap(xi)), noise))
-    result = {}
-    for name, (at, u) in weakest.items():
-        now, *more = (1.0 / float(u @ covariance[at, at] @ u) for covariance in covariances)
-        result[name] = float(np.mean(more)) / now
-    return result
+        points.append(replace(point, A=point.A @ se3.expmap(xi)))
+    rows = np.array([np.arange(at.start, at.stop) for at, _ in weakest.values()])
+    u = np.array([direction for _, direction in weakest.values()])
+    covariances = [Reduced.of(model, one).joint(noise)[1].at(rows, rows) for one in points]
+    now, *more = (1.0 / np.einsum("ni,nij,nj->n", u, covariance, u) for covariance in covariances)
+    return dict(zip(weakest, (np.mean(more, axis=0) / now).tolist(), strict=True))
 
 
 def check_motion(
@@ -259,11 +259,6 @@ def check_motion(
             f"from the noise of A ({np.degrees(noise.carrier_rad):.2g} degrees and {1e3 * noise.carrier_m:.2g} mm), "
             f"which passes for motion; {CURE}"
         )
-
-
-def _covariance(model: Model, point: Point, noise: Noise) -> Array:
-    covariance: Array = np.linalg.inv(Reduced.of(model, point).information(noise))
-    return covariance
 
 
 #: Corners without a ray that are left out count only above this share of all: a single one may be misread.

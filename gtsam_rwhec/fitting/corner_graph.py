@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, errors_of_A
+from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
 #: A symbol's letter is in the bits of its key from this one on.
@@ -109,17 +111,45 @@ class CornerGraph:
         That is the length of one more Gauss-Newton step in deviations. Slots have ("x", target), ("y", sensor),
         ("k", camera), ("b", target), ("t", sensor) and ("p", target).
         """
-        linear = self.graph.linearize(values)
-        keys = [self.keys[at] for at in slots]
-        marginal = linear.marginal(keys)
-        ordering = gtsam.Ordering()
-        for key in keys:
-            ordering.push_back(key)
-        information, gradient = marginal.hessian(ordering)
-        size = np.sqrt(np.diagonal(information))
-        inverse = np.linalg.inv(information / size[:, None] / size) / size[:, None] / size
-        joint: Array = 0.5 * (inverse + inverse.T)
-        return joint, float(np.sqrt(gradient @ joint @ gradient))
+        rows = np.concatenate([np.arange(self.slots[at].start, self.slots[at].stop) for at in slots])
+        _, reduced, noise = self._reduced(values)
+        try:
+            inverse, found = self._changed(reduced, noise)
+        except np.linalg.LinAlgError:  # inverted all the same, to tell what is not determined
+            information = reduced.information(noise)
+            size = np.sqrt(np.diagonal(information))
+            return (np.linalg.inv(information / size[:, None] / size) / size[:, None] / size)[
+                np.ix_(rows, rows)
+            ], np.inf
+        joint = inverse.at(rows, rows)
+        size = np.sqrt(np.diagonal(joint))
+        step = found[rows] / size
+        return joint, float(np.sqrt(step @ np.linalg.solve(joint / size[:, None] / size, step)))
+
+    def step(self, values: gtsam.Values) -> gtsam.VectorValues:
+        """Gauss and Newton's; LinAlgError where there is none."""
+        point, reduced, noise = self._reduced(values)
+        _, found = self._changed(reduced, noise)
+        step = gtsam.VectorValues()
+        for at, key in self.keys.items():
+            step.insert(key, found[self.slots[at]])
+        if self.model.A_noise is not None:
+            off_A, turned = errors_of_A(self.model, point)
+            change = found[len(reduced.G) :].reshape(-1, 6) * self.model.A_noise - off_A
+            for i, moved in enumerate((turned @ change[..., None])[..., 0]):
+                step.insert(key_of("a", i), moved)
+        return step
+
+    def _reduced(self, values: gtsam.Values) -> tuple[Point, Reduced, Noise]:
+        """The sums of unit noise at values, and A's noise."""
+        point, S = self.point(values), self.model.A_noise
+        return point, Reduced.whitened(self.model, point), Noise(1.0, *(0.0, 0.0) if S is None else S[[0, 3]].tolist())
+
+    @staticmethod
+    def _changed(reduced: Reduced, noise: Noise) -> tuple[ArrowInverse, Array]:
+        """The covariance of all, and the best change: targets or carriers are eliminated first."""
+        sums, inverse, _ = reduced.joint(noise)
+        return inverse, reduced.estimate(noise, sums, inverse)[1]
 
     def _add_priors(self) -> None:
         model = self.model

@@ -222,7 +222,8 @@ class Rows:
         """Sums (T, columns, columns) over the images of each target of [J, corners, r]' [J, corners, r]."""
         others = np.concatenate([self.J, self.r[..., None]], axis=2)
         if len(stack.targets) > 1:
-            return stack.sums(others.transpose(0, 2, 1) @ others)
+            of_targets = (rows.reshape(-1, others.shape[2]) for rows in np.split(others, stack.first[1:]))
+            return np.array([rows.T @ rows for rows in of_targets])
         flat = others.reshape(-1, others.shape[2])
         if self.B is None:
             return np.asarray(flat.T @ flat)[None]
@@ -305,7 +306,7 @@ class Sums:
 def _add(sums: Array, at: tuple[np.ndarray, ...], values: Array) -> None:
     """Add values to sums at indices that may be there twice."""
     flat = np.ravel_multi_index(np.broadcast_arrays(*at), sums.shape)
-    np.add.at(sums.reshape(-1), np.broadcast_to(flat, values.shape).ravel(), values.ravel())
+    sums += np.bincount(np.broadcast_to(flat, values.shape).ravel(), values.ravel(), sums.size).reshape(sums.shape)
 
 
 def _by_corner(rows: Array, n: int) -> Array:

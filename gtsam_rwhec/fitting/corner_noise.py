@@ -13,15 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.linalg import block_diag
 
 from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows, Sums
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
-from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
+from gtsam_rwhec.fitting.joint_covariance import Arrow, ArrowInverse, EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -34,6 +36,8 @@ NOTHING = 1e-6
 #: What an image's corners share is looked for from this share of a corner's deviation to so many pixels, since more is
 #: no detector's; it counts from twice that share.
 LEAST_COMMON, MOST_COMMON_PX = 0.02, 0.3
+#: Where it is there, about this share of a corner's deviation.
+TYPICAL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +67,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class WithoutCarriers:
-    """H, h, r'F^-1 r and log |F| of the measurements, without the carriers' errors; K (I, 6, 6), K C / s^2, K b / s^2.
-
-    The prior is not among them.
-    """
+    """H, h and r'F^-1 r of the measurements, without the carriers' errors; the prior is not among them."""
 
     H: Array
     h: Array
     rr: float
-    log_det: float
-    K: Array
-    KC: Array
-    Kb: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +96,9 @@ class Reduced:
 
         The errors of the point's A are taken off the residuals, to first order.
         """
-        vectors, slots = model.vectors(point), slots or model.slots(point)
+        slots = slots or model.slots(point)
         sums, number, common = Sums.zeros(len(model.A), slots), 0.0, []
-        to_right = model.to_right
-        off_A = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
+        to_right, (off_A, _) = model.to_right, errors_of_A(model, point)
         for stack, weights in zip(model.stacks, model.weights, strict=True):
             rows, where = model.linearised(stack, point), model.columns(stack, slots)
             root = np.repeat(np.sqrt(weights), 2, axis=1)
@@ -118,12 +114,18 @@ class Reduced:
             P = patterns(model, stack, point) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
             common.append(OfStack(stack, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
-        size = len(sums.squares) - 1
-        prior, off = np.zeros((size, size)), np.zeros(size)
-        for at, of in model.priors(point).items():
-            prior[slots[at], slots[at]] = of.precision
-            off[slots[at]] = vectors[at] - of.mean
-        return Reduced(slots, sums, number, prior, off, CommonErrors(tuple(common)))
+        prior = _prior(model, point, slots, len(sums.squares) - 1)
+        return Reduced(slots, sums, number, *prior, CommonErrors(tuple(common)))
+
+    @staticmethod
+    def whitened(model: Model, point: Point) -> Reduced:
+        """The sums at a point of rows of unit noise, what images' corners share among it."""
+        slots, sums, (off_A, R) = model.slots(point), model.sums(point), errors_of_A(model, point)
+        of_A, M = R.transpose(0, 2, 1) @ sums.of_A, R.transpose(0, 2, 1) @ sums.M @ R
+        sums.squares[:, -1] -= np.einsum("nid,ni->d", of_A, off_A)
+        of_A[..., -1] -= (M @ off_A[..., None])[..., 0]
+        prior = _prior(model, point, slots, len(sums.squares) - 1)
+        return Reduced(slots, Sums(sums.squares, of_A, M), 0.0, *prior, CommonErrors(()))
 
     @property
     def G(self) -> Array:
@@ -155,47 +157,80 @@ class Reduced:
         """(I, 6, 6): By A."""
         return self.sums.M
 
+    @cached_property
+    def _order(self) -> EliminationOrder:
+        return EliminationOrder.of(self.G + self.prior)
+
+    @cached_property
+    def _of_prior(self) -> tuple[np.ndarray, ...]:
+        return np.nonzero(self.prior)
+
+    def joint(self, noise: Noise) -> tuple[Reduced, ArrowInverse, float]:
+        """The sums without common errors, the covariance of all, and log |F| + log |H|; LinAlgError if there is none.
+
+        All are theta (d,), and the carriers' errors (6 I) in deviations, where A has noise. What of them is many and
+        tied to nothing alike is eliminated first: the carriers, or the targets.
+        """
+        sums, log_det = self.without_common(noise)
+        s2, S, d = noise.corner_px**2, noise.carrier, len(self.G)
+        arrow, whole = None, sums.G / s2 + self.prior
+        if S is not None:
+            A, places = np.eye(6) + sums.M * S[:, None] * S / s2, d + np.arange(6 * len(sums.M)).reshape(-1, 6)
+            C = sums.C * S[:, None] / s2
+            if self._order.blocks.size <= places.size:
+                arrow = Arrow(places, np.arange(d), A, C, whole)
+            else:
+                flat = C.reshape(-1, d)
+                whole = np.block([[whole, flat.T], [flat, block_diag(*A)]])
+        inverse = (arrow or self._order.split(whole)).inverse()
+        return sums, inverse, log_det + self.count * float(np.log(s2)) + inverse.log_det
+
+    def estimate(self, noise: Noise, sums: Reduced, inverse: ArrowInverse) -> tuple[Array, Array]:
+        """The gradient of half the cost by all that is in `joint`, and its best change."""
+        pull = sums.g / noise.corner_px**2 + self.prior @ self.prior_off
+        if noise.carrier is not None:
+            pull = np.r_[pull, (sums.b * noise.carrier / noise.corner_px**2).ravel()]
+        return pull, -inverse.times(pull)
+
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
         """Restricted: theta integrated out; and its derivatives by the logarithms of the deviations.
 
-        With K_i = (S^-1 + M_i / s^2)^-1 the carriers' errors are eliminated:
+        With the carriers' errors a eliminated, K_i = (S^-1 + M_i / s^2)^-1,
 
             H = G / s^2 - sum C_i' K_i C_i / s^4 + prior,    -2 log L = r' F^-1 r - h' H^-1 h + log |F| + log |H|.
 
-        The derivative by a component's log variance is its number less its squares, as estimated and as uncertain, over
-        its variance (Patterson and Thompson's equations).
+        All of it is of the information of (theta, a): `joint`. The derivative by a component's log variance is its
+        number less its squares, as estimated and as uncertain, over its variance (Patterson and Thompson's equations).
         """
-        s2, S = noise.corner_px**2, noise.carrier
-        sums, log_det = self.without_common(noise)
-        at = sums.eliminated(noise, log_det)
-        H, h, K, KC, Kb = at.H + self.prior, at.h + self.prior @ self.prior_off, at.K, at.KC, at.Kb
+        s2, d = noise.corner_px**2, len(self.G)
         try:
-            inverse, log_H = _inverse(H)
+            sums, inverse, log_det = self.joint(noise)
         except np.linalg.LinAlgError:
             return np.inf, np.zeros(4)
-        theta = -inverse @ h
-        off = float(self.prior_off @ self.prior @ self.prior_off)
-        value = at.rr + off + float(h @ theta) + at.log_det + log_H
-        free = len(H) - float((self.prior * inverse).sum())
+        pull, found = self.estimate(noise, sums, inverse)
+        places = np.arange(d, len(found)).reshape(-1, 6)
+        theta, variances = found[:d], inverse.diagonal[places]
+        value = sums.rr / s2 + float(self.prior_off @ self.prior @ self.prior_off) + float(pull @ found) + log_det
+        by_prior = inverse.at(*(each[:, None] for each in self._of_prior)).ravel()
+        free = d - float(self.prior[self._of_prior] @ by_prior) + float((1.0 - variances).sum())
         squares = sums.rr + 2.0 * float(sums.g @ theta) + float(theta @ sums.G @ theta)
-        gradient, a = np.zeros(4), -(Kb + KC @ theta)
-        KC_inverse = (KC.reshape(-1, len(H)) @ inverse).reshape(KC.shape)
-        if S is not None:
-            variances = np.diagonal(K, axis1=1, axis2=2) + (KC_inverse * KC).sum(axis=2)
+        gradient = np.zeros(4)
+        if noise.carrier is not None:
+            a = found[places] * noise.carrier
             squares += float(np.einsum("ni,nij,nj->", a, sums.M, a)) + 2.0 * float(
                 (a * (sums.b + sums.C @ theta)).sum()
             )
-            free += float((1.0 - variances / S**2).sum())
-            off = 2.0 * (len(a) - (a**2 + variances).sum(axis=0) / S**2)
+            off = 2.0 * (len(a) - (found[places] ** 2 + variances).sum(axis=0))
             gradient[1:3] = off[:3].sum(), off[3:].sum()
         # with t / s as it is, the sums without common errors are those of white noise
         gradient[0] = 2.0 * (self.count - squares / s2 - free)
-        if noise.common_px:
-            gradient[3] = self.common.twice_by_log(noise.common_px, s2, theta, inverse, Carriers(a, K, KC, KC_inverse))
+        if noise.common_px and noise.carrier is not None:
+            of_a = Carriers(places, noise.carrier)
+            gradient[3] = self.common.twice_by_log(noise.common_px, s2, found, inverse, of_a)
             gradient[0] -= gradient[3]
         return value, gradient
 
-    @property
+    @cached_property
     def common(self) -> CommonErrors:
         """Of what an image's corners share."""
         return self.patterns.first(OF_AN_IMAGE)
@@ -216,25 +251,16 @@ class Reduced:
 
     def without_carriers(self, noise: Noise) -> WithoutCarriers:
         """The sums of the measurements under a noise, the carriers' errors eliminated."""
-        sums, log_det = self.without_common(noise)
-        return sums.eliminated(noise, log_det)
-
-    def eliminated(self, noise: Noise, log_det: float) -> WithoutCarriers:
-        """``without_carriers`` of sums in which images' corners share nothing, with what these gained."""
-        s2, S = noise.corner_px**2, noise.carrier
-        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, log_det + self.count * np.log(s2)
-        K, KC, Kb = np.zeros_like(self.M), np.zeros_like(self.C), np.zeros_like(self.b)
+        sums, s2, S = self.without_common(noise)[0], noise.corner_px**2, noise.carrier
+        H, h, rr = sums.G / s2, sums.g / s2, sums.rr / s2
         if S is not None:
             # K = D (I + D M D / s2)^-1 D, D = diag(S)
-            inner = np.eye(6) + self.M * S[:, None] * S / s2
-            K = np.linalg.inv(inner) * S[:, None] * S
-            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
-            flat = self.C.reshape(-1, len(H))
-            H = H - flat.T @ KC.reshape(flat.shape) / s2
+            K = np.linalg.inv(np.eye(6) + sums.M * S[:, None] * S / s2) * S[:, None] * S
+            flat, Kb = sums.C.reshape(-1, len(H)), (K @ sums.b[..., None])[..., 0] / s2
+            H = H - flat.T @ (K @ sums.C / s2).reshape(flat.shape) / s2
             h = h - flat.T @ Kb.ravel() / s2
-            rr -= float((self.b * Kb).sum()) / s2
-            log_det += float(np.linalg.slogdet(inner)[1].sum())
-        return WithoutCarriers(H, h, rr, log_det, K, KC, Kb)
+            rr -= float((sums.b * Kb).sum()) / s2
+        return WithoutCarriers(H, h, rr)
 
     def information(self, noise: Noise) -> Array:
         """The information (d, d) of theta under a noise, the carriers' errors eliminated."""
@@ -243,23 +269,31 @@ class Reduced:
     def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
         """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""
         deviations, free = deviations_of(start), self.free(start, carrier=carrier)
-        begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free]
+        # steps of equal length are about as likely: by how many errors tell each deviation
+        t = TYPICAL * start.corner_px
+        K = np.concatenate(self.common.inverse(t, start.corner_px**2)[0])
+        shared = float(((1.0 - np.einsum("vkk->vk", K) / t**2) ** 2).sum())
+        told = np.array([self.count, 3 * len(self.M), 3 * len(self.M), shared])[free]
+        unit = 1.0 / np.sqrt(np.maximum(told, 1.0))
+        begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free] / unit
 
         def noise(x: Vector) -> Noise:
             found = deviations.copy()
-            found[free] = np.exp(x)
+            found[free] = np.exp(x * unit)
             return Noise(*found.tolist())
 
         def cost(x: Vector) -> tuple[float, Array]:
             value, gradient = self.minus_two_log_likelihood(noise(x))
-            return value, gradient[free]
+            return value, gradient[free] * unit
 
-        shared = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
-        limits = [(CORNER_PX, CARRIER, CARRIER, shared)[i] for i in free]
-        bounds = [(float(np.log(low)), float(np.log(high))) for low, high in limits]
+        common = LEAST_COMMON * start.corner_px, MOST_COMMON_PX
+        limits = np.log([(CORNER_PX, CARRIER, CARRIER, common)[i] for i in free]) / unit[:, None]
         from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
 
-        found = noise(minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11}).x)
+        bounds: list[tuple[float, float]] = [(low, high) for low, high in limits.tolist()]
+        found = noise(
+            minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11, "gtol": 1e-4}).x
+        )
         return found if found.common_px > 2.0 * LEAST_COMMON * found.corner_px else replace(found, common_px=0.0)
 
     def free(self, noise: Noise, *, carrier: bool) -> list[int]:
@@ -273,12 +307,20 @@ class Reduced:
         return [0, *((1, 2) if carrier else ()), *((3,) if shares else ())]
 
 
-def _inverse(H: Array) -> tuple[Array, float]:
-    """The inverse and log |H|; LinAlgError if it is not positive definite."""
-    size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-    scaled = H / size[:, None] / size
-    inverse, log_det = EliminationOrder.of(scaled).inverse(scaled)
-    return inverse / size[:, None] / size, log_det + 2.0 * float(np.log(size).sum())
+def errors_of_A(model: Model, point: Point) -> tuple[Array, Array]:
+    """A's perturbations (I, 6) from where it was measured, and what turns changes of them to the right (I, 6, 6)."""
+    moved = se3.logmap(se3.inverse(model.A) @ point.A)
+    off_A = np.linalg.solve(model.to_right, moved[..., None])[..., 0]
+    return off_A, np.linalg.solve(se3.right_jacobian_inverse(moved), model.to_right)
+
+
+def _prior(model: Model, point: Point, slots: Mapping[tuple[str, str], slice], size: int) -> tuple[Array, Array]:
+    """`Reduced.prior` and `Reduced.prior_off`."""
+    vectors, prior, off = model.vectors(point), np.zeros((size, size)), np.zeros(size)
+    for at, of in model.priors(point).items():
+        prior[slots[at], slots[at]] = of.precision
+        off[slots[at]] = vectors[at] - of.mean
+    return prior, off
 
 
 def deviations_of(noise: Noise) -> Array:
@@ -311,12 +353,12 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     hessian = np.array(gradients) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
     V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
-    above, below = ([_inverse(reduced.information(at(sign * step)))[0] for step in steps] for sign in (1.0, -1.0))
+    above, below = ([reduced.joint(at(sign * step))[1] for step in steps] for sign in (1.0, -1.0))
     result = {}
     for name, rows in reduced.slots.items():
-        size = rows.stop - rows.start
+        own = np.arange(rows.start, rows.stop)
         w = np.array([
-            (np.linalg.slogdet(up[rows, rows])[1] - np.linalg.slogdet(down[rows, rows])[1]) / (2.0 * STEP) / 2.0 / size
+            (np.linalg.slogdet(up.at(own, own))[1] - np.linalg.slogdet(down.at(own, own))[1]) / (4.0 * STEP) / len(own)
             for up, down in zip(above, below, strict=True)
         ])  # fmt: skip
         variance = float(w @ V @ w)

@@ -55,6 +55,8 @@ COMING_BACK = 4
 #: Steps end where the cost falls by less than this share; with outliers in the fit, which only tells which corners they
 #: are, by less than ``ROUGHLY``.
 EXACTLY, ROUGHLY = 1e-9, 1e-2
+#: And where it falls by less than this.
+LEAST_GAIN = 1e-7
 #: Images that their poses left out are taken back by their corners at most so many times, less one.
 READMISSIONS = 3
 #: Doubted priors are widened at most so many times.
@@ -264,16 +266,31 @@ def _settled(
 def optimum(
     model: Model, start: Point, most: int = CornerOptions.max_iterations, tolerance: float = EXACTLY
 ) -> tuple[CornerGraph, gtsam.Values, int]:
-    """The graph of a model, its optimum from a start, and how many steps it took."""
+    """The graph of a model, its optimum from a start, and how many steps it took.
+
+    Gauss and Newton's steps; Levenberg and Marquardt's from the start where these fail.
+    """
     graph = CornerGraph(model, start)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(most)
-    parameters.setRelativeErrorTol(tolerance)
-    parameters.setAbsoluteErrorTol(1e-7)
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.values(start), parameters)
+    values = first = graph.values(start)
     with told_where_it_fails(model, start):
-        values = optimiser.optimize()
-    return graph, values, optimiser.iterations()
+        cost = graph.graph.error(values)
+        for number in range(1, most + 1):
+            try:
+                moved = values.retract(graph.step(values))
+            except np.linalg.LinAlgError:
+                break
+            after = graph.graph.error(moved)
+            if not after <= cost * (1.0 + 1e-12):
+                break
+            values, gain, cost = moved, cost - after, after
+            if number == most or gain <= max(tolerance * (cost + gain), LEAST_GAIN):
+                return graph, values, number
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(most)
+        parameters.setRelativeErrorTol(tolerance)
+        parameters.setAbsoluteErrorTol(LEAST_GAIN)
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph.graph, first, parameters)
+        return graph, optimiser.optimize(), optimiser.iterations()
 
 
 def _check_start(model: Model, point: Point) -> None:

@@ -211,16 +211,19 @@ class Reduced:
         if self.carriers is not None:
             root_K, lost = self.carriers
             there, carrier, m = by_cross[of.shared], self.carrier, of.m
-            twists = self.cross[of.shared, :6] * carrier[:, None]
-            explained = _weighted(twists, by_total, there, m) * twists
+            product = lost[:, :, :m] @ by_total
+            once = lost[:, :, m:] @ there
+            once[:, :, :m] += product
+            # E' V^-1 of all columns is root_K' lost, over the carrier's deviations
+            root_t = root_K.transpose(0, 2, 1)
+            explained = (root_t @ once) * (root_t @ lost)
             each = 2.0 * (1.0 - (root_K**2).sum(axis=1) - explained.sum(axis=2)).sum(axis=0)
             result[C.CARRIER_ROTATION], result[C.CARRIER_TRANSLATION] = float(each[:3].sum()), float(each[3:].sum())
             # Of these rows the columns are Z - W lost, with all columns of their instant.
             own = Z[of.members]
             W = own[:, :, of.own : of.own + 6] @ (root_K * carrier).transpose(0, 2, 1)[of.shared_of]
-            once = _weighted(lost, by_total, there, m)
             both = once @ lost.transpose(0, 2, 1)
-            once[:, :, :m] += lost[:, :, :m] @ by_total
+            once[:, :, :m] += product
             once[:, :, m:] += lost @ there.transpose(0, 2, 1)
             if of.is_whole:
                 once = once[of.shared_of]

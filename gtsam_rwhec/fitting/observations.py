@@ -173,20 +173,27 @@ class Observations:
         """Each image's two poses (N, 2, 4, 4), nan where there is none, and their covariances (N, 2, 6, 6)."""
         from gtsam_rwhec.cameras.target_poses import plane_poses
 
-        result = {}
-        for (target, sensor), view in self.views.items():
-            flat, T_target_flat = in_plane(self.corners[target], target)
-            known = view.known & self.cameras[sensor].has_ray(view.pixels)
+        result: dict[tuple[str, str], tuple[Array, Array]] = {}
+        flat = {name: in_plane(self.corners[name], name) for name in self.targets}
+        alike: dict[tuple[str, int], list[tuple[str, str]]] = {}  # of one camera and as many corners: all at once
+        for target, sensor in self.views:
+            alike.setdefault((sensor, len(self.corners[target])), []).append((target, sensor))
+        for (sensor, _), pairs in alike.items():
+            camera = self.cameras[sensor]
+            known = {pair: self.views[pair].known & camera.has_ray(self.views[pair].pixels) for pair in pairs}
             found = plane_poses(
-                self.cameras[sensor],
-                [flat[seen] for seen in known],
-                [pixels[seen] for pixels, seen in zip(view.pixels, known, strict=True)],
+                camera,
+                [flat[pair[0]][0][seen] for pair in pairs for seen in known[pair]],
+                [px[seen] for pair in pairs for px, seen in zip(self.views[pair].pixels, known[pair], strict=True)],
                 corner_px=self.corner_px,
             )
-            # right perturbations of the flat frame become right perturbations of the target's frame by the adjoint
-            ad = se3.adjoint(T_target_flat[None])[0]
-            covariance = ad @ found.covariance @ ad.T
-            result[target, sensor] = found.T @ se3.inverse(T_target_flat), 0.5 * (covariance + covariance.mT)
+            ends = np.cumsum([len(known[pair]) for pair in pairs])[:-1]
+            for pair, T, C in zip(pairs, np.split(found.T, ends), np.split(found.covariance, ends), strict=True):
+                T_target_flat = flat[pair[0]][1]
+                # right perturbations of the flat frame become right perturbations of the target's frame by the adjoint
+                ad = se3.adjoint(T_target_flat[None])[0]
+                covariance = ad @ C @ ad.T
+                result[pair] = T @ se3.inverse(T_target_flat), 0.5 * (covariance + covariance.mT)
         return result
 
 

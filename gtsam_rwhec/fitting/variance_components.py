@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from rwhec_factors.batch import Linearization
+from rwhec_factors.batch import AT_ONCE, Linearization
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.fitting.fit_options import NoiseGroups
@@ -89,16 +89,21 @@ def from_measurements(
     that a residual keeps when residuals beyond a threshold are left out.
     """
     sums: dict[Group, _Sums] = {}
-    for item in data:
+    alike: dict[tuple[Group, int], list[tuple[Array, ...]]] = {}  # pairs of a group, some together
+    chunks = np.cumsum([item.count for item in data]) // AT_ONCE
+    for item, chunk in zip(data, chunks.tolist(), strict=True):
         pair, linear = item.pair, at[item.pair]
         C = residual_covariance(item, linear, factors[pair])
-        inverse = np.linalg.inv(C)
         J, rows = jacobian_of(item, linear, variables, joint)
         left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # the expectation of r r'
         d = np.sqrt(np.repeat(factors[pair], 3))
-        whole = item.measured * d[:, None] * d
-        whitened = np.einsum("nij,nj->ni", inverse, linear.residual)
-        total = sums.setdefault(group_of(pair, groups), _Sums())
+        parts = C, left, item.measured * d[:, None] * d, linear.residual
+        alike.setdefault((group_of(pair, groups), chunk), []).append(parts)
+    for (group, _), found in alike.items():
+        C, left, whole, residual = (np.concatenate(each) for each in zip(*found, strict=True))
+        inverse = np.linalg.inv(C)
+        whitened = np.einsum("nij,nj->ni", inverse, residual)
+        total = sums.setdefault(group, _Sums())
         scaled = []
         for k, block in enumerate((slice(0, 3), slice(3, 6))):
             # d (D Sigma D) / d log f_k: half of the block's rows plus half of its columns.

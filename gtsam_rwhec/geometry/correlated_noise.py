@@ -39,11 +39,15 @@ class CorrelatedNoise:
         """Noise without correlation."""
         return CorrelatedNoise(0.0, 1.0)
 
-    def weighted(self, seconds: Array, columns: Array) -> tuple[Array, float]:
-        """Sigma^-1 times columns (n, m), and log|Sigma|; ``seconds`` (n,) do not decrease."""
-        if self.share == 0.0:
+    def weighted(self, seconds: Array, columns: Array, track: np.ndarray | None = None) -> tuple[Array, float]:
+        """Sigma^-1 times columns (n, m), and log|Sigma|.
+
+        ``seconds`` (n,) do not decrease; where there are several tracks (n,), within each, one after the other.
+        """
+        if self.share == 0.0 or not len(seconds):
             return columns, 0.0
-        rho = np.minimum(np.exp(-np.diff(seconds) / self.time_constant_s), 1.0 - 1e-9)
+        apart = np.diff(seconds) if track is None else np.where(np.diff(track), np.inf, np.diff(seconds))
+        rho = np.minimum(np.exp(-apart / self.time_constant_s), 1.0 - 1e-9)
         rest = 1.0 - rho**2
         diagonal = np.ones(len(seconds))
         diagonal[1:] += rho**2 / rest
@@ -60,27 +64,23 @@ class CorrelatedNoise:
         return result, float(2.0 * np.log(factor[1]).sum() + np.log(rest).sum())
 
 
-def likeliest(tracks: list[tuple[Array, Array]]) -> tuple[CorrelatedNoise, float]:
+def likeliest(seconds: Array, residuals: Array, track: np.ndarray) -> tuple[CorrelatedNoise, float]:
     """The noise that makes residuals likeliest, and -2 log of this likelihood, up to a constant.
 
     White noise is the answer unless another one is clearly likelier.
 
     Parameters
     ----------
-    tracks : list of (seconds (n,), residuals (n, m))
-        Columns of residuals have one variance; tracks are independent of one another.
+    seconds, residuals, track : (n,), (n, m) and (n,) arrays
+        As in ``CorrelatedNoise.weighted``. All columns have one variance; tracks are independent.
     """
-    count = sum(r.size for _, r in tracks)
-    square = sum(float((r**2).sum()) for _, r in tracks)
-    best, lowest = CorrelatedNoise.white(), count * np.log(square + 1e-300) - CLEARLY_LIKELIER
+    square = float((residuals**2).sum())
+    best, lowest = CorrelatedNoise.white(), residuals.size * np.log(square + 1e-300) - CLEARLY_LIKELIER
     for share, constant in CHOICES:
         noise = CorrelatedNoise(share, constant)
-        square, determinants = 0.0, 0.0
-        for seconds, r in tracks:
-            weighted, determinant = noise.weighted(seconds, r)
-            square += float((r * weighted).sum())
-            determinants += r.shape[1] * determinant
-        value = count * np.log(square + 1e-300) + determinants
+        weighted, determinant = noise.weighted(seconds, residuals, track)
+        square = float((residuals * weighted).sum())
+        value = residuals.size * np.log(square + 1e-300) + residuals.shape[1] * determinant
         if value < lowest:
             best, lowest = noise, value
     return best, lowest

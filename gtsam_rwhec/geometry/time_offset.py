@@ -143,18 +143,17 @@ class RotationProblem:
             r, J = np.einsum("nij,nj->ni", self.R_B, r), self.R_B @ J
         return _At(r, J, variance[:, :3].sum(axis=1), self.carrier.gaps(stamps) <= self.max_gap_s)
 
-    def _by_track(self, good: np.ndarray) -> list[tuple[np.ndarray, Array]]:
-        """Indices and times (s) of each track's good detections."""
-        rows = [np.flatnonzero(good & (self.track == k)) for k in range(int(self.track.max()) + 1)]
-        return [(own, (self.stamps_ns[own] - self.stamps_ns[0]) * 1e-9) for own in rows if len(own)]
+    def _good(self, good: np.ndarray) -> tuple[np.ndarray, Array, np.ndarray]:
+        """Indices, times (s) and tracks of the good detections."""
+        own = np.flatnonzero(good)
+        return own, (self.stamps_ns[own] - self.stamps_ns[0]) * 1e-9, self.track[own]
 
     def _normal(self, at: _At, good: np.ndarray, noise: CorrelatedNoise) -> tuple[Array, Array, Array]:
         """J' W J, J' W r and W J (N, 3, p) over the good detections."""
         p = at.J.shape[2]
         weighted = np.zeros_like(at.J)
-        for own, seconds in self._by_track(good):
-            columns, _ = noise.weighted(seconds, at.J[own].reshape(len(own), -1))
-            weighted[own] = columns.reshape(len(own), 3, p)
+        own, seconds, track = self._good(good)
+        weighted[own] = noise.weighted(seconds, at.J[own].reshape(-1, 3 * p), track)[0].reshape(-1, 3, p)
         flat = weighted.reshape(-1, p)
         return at.J.reshape(-1, p).T @ flat, flat.T @ np.where(good[:, None], at.r, 0.0).ravel(), weighted
 
@@ -177,7 +176,8 @@ class RotationProblem:
         Visual odometry drifts in the axes of its world; errors of a detection follow its view.
         """
         turned = np.einsum("nij,nj->ni", self.R_B if not in_sensor else self.R_B.transpose(0, 2, 1), at.r)
-        here, there = (likeliest([(seconds, r[own]) for own, seconds in self._by_track(good)]) for r in (at.r, turned))
+        own, seconds, track = self._good(good)
+        here, there = (likeliest(seconds, r[own], track) for r in (at.r, turned))
         return (there[0], not in_sensor) if there[1] < here[1] else (here[0], in_sensor)
 
     def _finished(self, at: _At, offset_s: float, good: np.ndarray, noise: CorrelatedNoise) -> RotationFit:
@@ -195,8 +195,8 @@ class RotationProblem:
         scores = (Wg * r).sum(axis=1)
         scatter = max(_scatter(scores, share, count) for count in (BLOCKS // 2, BLOCKS))
         wr = np.zeros_like(r)
-        for own, seconds in self._by_track(good):
-            wr[own] = noise.weighted(seconds, r[own])[0]
+        own, seconds, track = self._good(good)
+        wr[own] = noise.weighted(seconds, r[own], track)[0]
         freedom = max(3 * int(good.sum()) - len(direction), 1)
         variance = float((r * wr).sum()) / freedom
         true = information * max(1.0 - noise_share, 1e-3)

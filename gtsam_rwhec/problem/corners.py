@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -312,28 +312,44 @@ def candidates_of(camera: Camera, board: Array, pixels: Array, corner_px: float,
     A CameraError says that the lens model has no ray for a corner, or that an image has no pose; a TargetError that the
     corners do not belong to the board.
     """
+    (both,) = candidates_of_each(camera, [(board, pixels, where)], corner_px)
+    return both
+
+
+def candidates_of_each(
+    camera: Camera, seen: Sequence[tuple[Array, Array, str]], corner_px: float
+) -> Iterator[Candidates]:
+    """The same of several boards, all at once: board, pixels and where of each, as `candidates_of` takes them."""
     from gtsam_rwhec.cameras.target_poses import plane_poses
 
-    known = np.asarray(np.isfinite(pixels).all(axis=2))
+    known = [np.asarray(np.isfinite(pixels).all(axis=2)) for _, pixels, _ in seen]
     found = plane_poses(
         camera,
-        [board[seen] for seen in known],
-        [corners[seen] for corners, seen in zip(pixels, known, strict=True)],
+        [board[there] for (board, _, _), masks in zip(seen, known, strict=True) for there in masks],
+        [
+            px[there]
+            for (_, each, _), masks in zip(seen, known, strict=True)
+            for px, there in zip(each, masks, strict=True)
+        ],
         corner_px=corner_px,
     )
-    lost = np.flatnonzero(~np.isfinite(found.squared_px[:, 0]))
-    _check_rays(lost, camera, pixels, known, where)
-    extent = np.sqrt(np.nanvar(np.where(known[..., None], pixels, np.nan), axis=1).sum(axis=1))
-    off = float(np.median(np.nan_to_num(found.reprojection_px[:, 0], nan=np.inf) / extent))
-    if off > FARTHEST:
-        missed = f"miss it by {100.0 * off:.0f} % of its size or more" if np.isfinite(off) else "have no pose of it"
-        raise TargetError(
-            f"{where}: the corners do not belong to the board: half of the images {missed}; give image_points in the "
-            "order of board_points, and check its numbers of rows and columns, and whether it is another board"
-        )
-    if lost.size:
-        raise CameraError(f"{where}: the corners of image {lost[0]} have no pose; are they on one line?")
-    return Candidates(found.T, found.squared_px, found.covariance, corner_px)
+    ends = np.cumsum([len(pixels) for _, pixels, _ in seen]).tolist()
+    for (_, pixels, where), masks, end in zip(seen, known, ends, strict=True):
+        own = slice(end - len(pixels), end)
+        squared_px, reprojection_px = found.squared_px[own], found.reprojection_px[own]
+        lost = np.flatnonzero(~np.isfinite(squared_px[:, 0]))
+        _check_rays(lost, camera, pixels, masks, where)
+        extent = np.sqrt(np.nanvar(np.where(masks[..., None], pixels, np.nan), axis=1).sum(axis=1))
+        off = float(np.median(np.nan_to_num(reprojection_px[:, 0], nan=np.inf) / extent))
+        if off > FARTHEST:
+            missed = f"miss it by {100.0 * off:.0f} % of its size or more" if np.isfinite(off) else "have no pose of it"
+            raise TargetError(
+                f"{where}: the corners do not belong to the board: half of the images {missed}; give image_points in "
+                "the order of board_points, and check its numbers of rows and columns, and whether it is another board"
+            )
+        if lost.size:
+            raise CameraError(f"{where}: the corners of image {lost[0]} have no pose; are they on one line?")
+        yield Candidates(found.T[own], squared_px, found.covariance[own], corner_px)
 
 
 def _check_rays(images: np.ndarray, camera: Camera, pixels: Array, known: np.ndarray, where: str) -> None:

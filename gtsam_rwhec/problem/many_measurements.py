@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,6 +54,22 @@ class Sorted:
         return Sorted(
             (pair,), np.array([0, len(raw.A)]), raw.A, raw.B, raw.sigma, raw.kappa, None, source, *raw.options
         )
+
+    @staticmethod
+    def for_moments(measurements: Mapping[Pair, Measurements]) -> Iterator[Sorted]:
+        """The measurements of many pairs, as many of them together as are summed at once."""
+        ends = np.cumsum([len(raw.A) for raw in measurements.values()])
+        for _, group in groupby(zip(measurements.items(), ends // SUMMED_AT_ONCE, strict=True), lambda each: each[1]):
+            pairs, raws = zip(*(item for item, _ in group), strict=True)
+            if len(pairs) == 1:
+                yield Sorted.of(pairs[0], raws[0])
+                continue
+            count = [len(raw.A) for raw in raws]
+            A, B, sigma, kappa = (
+                np.concatenate([getattr(raw, of) for raw in raws]) for of in ("A", "B", "sigma", "kappa")
+            )
+            given = np.concatenate([np.arange(number) for number in count])
+            yield Sorted(pairs, np.r_[0, np.cumsum(count)], A, B, sigma, kappa, given, "")
 
     def copied(self) -> Sorted:
         """A copy of the poses, which are the caller's arrays."""

@@ -73,7 +73,7 @@ class Problem(Additions):
         result._kept = {
             pair: KeptMeasurements((Section(many, 0),), many.covariances is not None) for pair, many in own.items()
         }
-        result._accumulator = Accumulator.of(own.values(), self.gauge)
+        result._accumulator = Accumulator.of(Sorted.for_moments(measurements), self.gauge)
         result._take_knowledge(self, frames=lost_frames, scales=lost_scales)
         return result
 

@@ -18,7 +18,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator, Row
-from gtsam_rwhec.problem.corners import candidates_of
+from gtsam_rwhec.problem.corners import candidates_of_each
 from gtsam_rwhec.problem.directions import aligned, common_slides, scaled, slides_of
 from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
@@ -165,24 +165,27 @@ def nearer_poses(
     """
     if not problem.boards or not problem.has_measurements:
         return problem, 0
-    every: dict[Pair, Measurements] = {}
+    every = {pair: problem.measurements(*pair) for pair in problem.pairs}
+    alike: dict[tuple[str, int], list[tuple[Pair, np.ndarray, Array]]] = {}  # of one camera and as many corners
+    for pair, raw in every.items():
+        if raw.pixels is not None and raw.covariances is not None and pair.target in X and pair.sensor in Y:
+            rows = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2)))
+            alike.setdefault((pair.sensor, raw.pixels.shape[1]), []).append((pair, rows, raw.pixels[rows]))
     number = 0
-    for pair in problem.pairs:
-        raw = every[pair] = problem.measurements(*pair)
-        if raw.pixels is None or raw.covariances is None or pair.target not in X or pair.sensor not in Y:
-            continue
-        camera = (cameras or {}).get(pair.sensor)
-        rows, board = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2))), problem.boards[pair.target]
-        intrinsics, corner_px = camera or problem.cameras[pair.sensor], problem.corner_px or 0.1
-        both = candidates_of(intrinsics, board, raw.pixels[rows], corner_px, pair.label)
-        predicted = np.linalg.inv(Y[pair.sensor].matrix()) @ raw.A[rows] @ X[pair.target].matrix()
-        T, covariance = both.chosen(both.nearer(predicted))
-        changed = np.abs(T[:, :3, :3] - raw.B[rows, :3, :3]).max(axis=(1, 2)) > SAME_POSE
-        number += int(changed.sum())
-        if camera is not None:
-            changed[:] = True
-        if changed.any():
-            every[pair] = with_poses(raw, rows[changed], T[changed], covariance[changed])
+    for (sensor, _), views in alike.items():
+        camera = (cameras or {}).get(sensor)
+        seen = [(problem.boards[pair.target], pixels, pair.label) for pair, _, pixels in views]
+        found = candidates_of_each(camera or problem.cameras[sensor], seen, problem.corner_px or 0.1)
+        for (pair, at, _), both in zip(views, found, strict=True):
+            raw = every[pair]
+            predicted = np.linalg.inv(Y[sensor].matrix()) @ raw.A[at] @ X[pair.target].matrix()
+            T, covariance = both.chosen(both.nearer(predicted))
+            changed = np.abs(T[:, :3, :3] - raw.B[at, :3, :3]).max(axis=(1, 2)) > SAME_POSE
+            number += int(changed.sum())
+            if camera is not None:
+                changed[:] = True
+            if changed.any():
+                every[pair] = with_poses(raw, at[changed], T[changed], covariance[changed])
     return (problem.with_measurements(every), number) if number or cameras else (problem, 0)
 
 

@@ -11,14 +11,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row
-from gtsam_rwhec.results.linear_model import OWN, LinearModel, inverse_of
+from gtsam_rwhec.results.linear_model import OWN, LinearModel, equilibrated, inverse_of
 
 #: If there are more images than this, neighbours are chosen together.
 MOST_CHOSEN_FROM = 125
 #: The choice begins with this share of all information, so that every direction has a finite deviation.
 BEGIN = 1e-6
+#: A parameter of which all but this share is along free directions has no deviation.
+FREE_SHARE = 1e-6
 #: How much larger the worst standard deviation may be.
 GROWTHS = (0.05, 0.1, 0.25, 0.5)
 #: So many measurements are looked at together.
@@ -163,44 +166,35 @@ def _alike(
         )
 
 
-def _stacked(model: LinearModel, J: Array, rows: np.ndarray) -> tuple[np.ndarray, Array]:
-    """The unknowns of some measurements, and their whitened derivatives by these (6 n, m)."""
-    places = model.places[rows]
-    own, at = np.unique(places, return_inverse=True)
-    derivative = np.zeros((len(rows), 6, len(own)))
-    at = at.reshape(len(rows), OWN)
-    for i in range(len(rows)):
-        np.add.at(derivative[i].T, at[i], J[rows[i]].T)
-    return own, derivative.reshape(-1, len(own))
-
-
 def _chosen(model: LinearModel, J: Array, covariance: Array, images: list[np.ndarray]) -> list[float]:
     """The largest growth of a standard deviation after each image, if the most informative image comes next each time.
 
-    The gain log det(1 + J S J') falls as images are added, so an image whose old gain is below another's new one need
-    not be looked at again.
+    The gain of the information's log det falls as images are added, so an image whose old gain is below another's new
+    one need not be looked at again.
     """
-    stacked = [_stacked(model, J, rows) for rows in images]
-    whole = np.zeros((len(covariance) + 1,) * 2)
-    for own, derivative in stacked:
-        whole[np.ix_(own, own)] += derivative.T @ derivative
-    final = inverse_of(whole[:-1, :-1])
-    known = np.diagonal(final) > 0.0
-    S = np.pad(final / BEGIN, ((0, 1), (0, 1)))
-    gains = [(-np.inf, i) for i in range(len(stacked))]
+    whole, unit = equilibrated(model.information(J, model.used))
+    least = covariance / unit[:, None] / unit
+    free = np.eye(len(whole)) - least @ whole  # along these directions nothing is known
+    if np.trace(free) < 0.5:
+        free = np.zeros_like(free)
+    known = np.diagonal(free) < 1.0 - FREE_SHARE
+    order = EliminationOrder.of(whole + free)
+    each = (model.information(J, np.isin(np.arange(len(J)), rows)) for rows in images)
+    parts = [order.split(one * unit[:, None] * unit) for one in each]
+    now = order.split(BEGIN * whole + free)
+    gains, log_det = [(-np.inf, i) for i in range(len(parts))], now.inverse().log_det
     heapq.heapify(gains)
     curve = []
     while gains:
         while True:
             _, i = heapq.heappop(gains)
-            own, derivative = stacked[i]
-            gain = np.linalg.slogdet(np.eye(len(derivative)) + derivative @ S[np.ix_(own, own)] @ derivative.T)[1]
+            inverse = (now + parts[i]).inverse()
+            gain = inverse.log_det - log_det
             if not gains or -gain <= gains[0][0]:
                 break
             heapq.heappush(gains, (-gain, i))
-        spread = S[:, own] @ derivative.T
-        S = S - spread @ np.linalg.solve(np.eye(len(derivative)) + derivative @ spread[own], spread.T)
-        ratio = np.diagonal(S)[:-1][known] / np.diagonal(final)[known]
+        now, log_det = inverse.of, inverse.log_det
+        ratio = (inverse.diagonal - np.diagonal(free))[known] / np.diagonal(least)[known]
         curve.append(float(np.sqrt(ratio.max(initial=1.0)) - 1.0))
     return curve
 

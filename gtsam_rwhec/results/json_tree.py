@@ -63,7 +63,10 @@ def to_json(value: Any, place: str, field: str = "") -> Any:
     if isinstance(value, slice):
         return [value.start, value.stop]
     if isinstance(value, np.ndarray):
+        is_finite = value.dtype == np.float64 and bool(np.isfinite(value).all())
         value = value.tolist()
+        if is_finite:  # a covariance of all unknowns has hundreds of thousands
+            return value
     if isinstance(value, list | tuple):
         return [to_json(item, f"{place}[{index}]", field) for index, item in enumerate(value)]
     if not isinstance(value, float) or math.isfinite(value):

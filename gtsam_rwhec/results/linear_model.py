@@ -107,13 +107,11 @@ class LinearModel:
 
     def information(self, J: Array, which: np.ndarray) -> Array:
         """J'J (d, d) of some measurements (N,) bool, with whitened derivatives ``J``."""
-        total = np.zeros((self.dimension + 1, self.dimension + 1))
-        for number in range(len(self.pairs)):
-            mine = which & (self.pair == number)
-            if mine.any():
-                rows = J[mine].reshape(-1, OWN)
-                at = self.places[mine][0]
-                np.add.at(total, (at[:, None], at[None, :]), rows.T @ rows)
+        total, rows = np.zeros((self.dimension + 1, self.dimension + 1)), J[which]
+        first = np.flatnonzero(np.diff(self.pair[which], prepend=-1))
+        at = self.places[which][first]
+        of_pairs = np.add.reduceat(rows.transpose(0, 2, 1) @ rows, first)
+        np.add.at(total, (at[:, :, None], at[:, None]), of_pairs)
         return total[:-1, :-1]
 
     def gradient(self, J: Array, r: Array, which: np.ndarray) -> Array:

@@ -169,15 +169,20 @@ def with_intrinsics(
 
     Raises TargetError for a target that is not flat: it has no pose in an image alone.
     """
-    changed = dict(pairs)
+    views: dict[tuple[str, str], tuple[Array, Array, Array | None]] = {}
+    rows, predicted = {}, {}
     for pair, measured in pairs.items():
         seen, pixels = logged.seen(measured)
-        if not len(seen) or pair.target not in X or pair.sensor not in Y:
-            continue
-        A = measured.A[seen]
-        predicted: Array = np.linalg.inv(Y[pair.sensor].matrix()) @ A @ X[pair.target].matrix()
-        observations = replace(logged.of_views({pair: (A, pixels, None)}, cameras), corner_px=corner_px)
-        poses = observations.poses({pair: predicted}).measurements(*pair)
+        if len(seen) and pair.target in X and pair.sensor in Y:
+            A = measured.A[seen]
+            rows[pair], views[pair] = seen, (A, pixels, None)
+            predicted[pair.target, pair.sensor] = np.linalg.inv(Y[pair.sensor].matrix()) @ A @ X[pair.target].matrix()
+    changed = dict(pairs)
+    if not views:
+        return changed
+    found = replace(logged.of_views(views, cameras), corner_px=corner_px).poses(predicted)
+    for pair, seen in rows.items():
+        measured, poses = pairs[pair], found.measurements(*pair)
         B = measured.B.copy()
         B[seen] = poses.B
         covariance = None if measured.covariance is None else measured.covariance.copy()

@@ -105,11 +105,13 @@ def hypotheses_of(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array,
 
 def distances(A: Array, B: Array, X: Array, Y: Array, scale: Array) -> tuple[Array, Array]:
     """How far each of N measurements is from each of H hypotheses: metres and radians, (H, N)."""
-    R = np.einsum("hji,njk,hkl->hnil", Y[:, :3, :3], A[:, :3, :3], X[:, :3, :3])  # predicted R_B
+    # of R_B' R_Y' R_A R_X: all products of entries that are of hypotheses, with all that are of measurements
+    of_hypotheses = (Y[:, :3, :3, None, None] * X[:, None, None, :3, :3]).reshape(-1, 81)
+    of_measurements = (A[:, :3, None, :3, None] * B[:, None, :3, None, :3]).reshape(-1, 81)
+    trace = of_hypotheses @ of_measurements.T
     c = np.einsum("nij,hj->hni", A[:, :3, :3], X[:, :3, 3]) + A[:, :3, 3] - Y[:, None, :3, 3]
     t = np.einsum("hji,hnj->hni", Y[:, :3, :3], c)
     metres = np.linalg.norm(t - B[:, :3, 3] / scale[:, None, None], axis=2)
-    trace = np.einsum("hnij,nij->hn", R, B[:, :3, :3])
     return metres, np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 

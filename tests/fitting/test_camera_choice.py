@@ -184,7 +184,7 @@ def test_the_linear_answer_is_the_nonlinear_one() -> None:
     wide, chosen = wide_and_chosen(given, rw.CornerOptions(carrier_noise="exact"))
     blocks = Blocks.of(wide)
     model = LinearModel.of(wide, given.observations.cameras, chosen.options)
-    theta = model.theta(blocks.all_H, blocks.all_h)
+    theta = model.theta(blocks.all)
     own = rw.refine_corners(given.observations, given.X, given.Y, chosen.options)
     rows = wide.slots["k", "cam_2"]
     at = wide.point.cameras["cam_2"] + theta[rows]
