@@ -14,11 +14,10 @@ from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.block_agreement import Scatter
 from gtsam_rwhec.fitting.clock_rates import ClockRate
-from gtsam_rwhec.fitting.component_posterior import SAMPLES, Mixture, mixture_of
+from gtsam_rwhec.fitting.component_posterior import Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.noise_search import (
-    INSTANTS,
     MOST_TRACKS,
     Settled,
     Task,
@@ -206,8 +205,6 @@ class NoiseInData:
         return f"{self._size(component)} ({rounded(of.low * factor)} to {rounded(of.high * factor)})"
 
 
-#: A dense log has fewer samples of the components, which are known well.
-FEWER_SAMPLES = 16
 #: Where no drift can be tried, the verdict says so beyond this many deviations of the residuals' lag-1 correlation.
 SURELY_CORRELATED = 8.0
 #: Before the data, the hand is the carrier that is nearer to its frames: this times log of the ratio of distances.
@@ -312,8 +309,7 @@ def mixed(task: Task, found: Settled, larger: float = 1.0) -> tuple[JointCovaria
 
     It is ``larger`` where blocks of the log, or errors of the view, say so.
     """
-    is_dense = task.instants.count > INSTANTS
-    mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
+    mixture = mixture_of(thinned(found.model), found.fit, found.model)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     constant = constant_variances(task, found, state, mixture)

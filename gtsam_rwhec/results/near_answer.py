@@ -15,13 +15,13 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import CountError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
-from gtsam_rwhec.fitting.component_posterior import FEWEST, SAMPLES, mixture_of
+from gtsam_rwhec.fitting.component_posterior import FEWEST, mixture_of
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
-from gtsam_rwhec.fitting.noise_in_data import FEWER_SAMPLES, is_drift_untried, settled
+from gtsam_rwhec.fitting.noise_in_data import is_drift_untried, settled
 from gtsam_rwhec.fitting.noise_refinement import SPARE_EQUATIONS, agreeing
 from gtsam_rwhec.fitting.noise_rows import Instants
-from gtsam_rwhec.fitting.noise_search import INSTANTS, Settled, Task, moved, thinned
+from gtsam_rwhec.fitting.noise_search import Settled, Task, moved, thinned
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import data_of, scale_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
@@ -75,8 +75,7 @@ def near(
         inliers = again
         task, found = _settled(old, selected(problem, inliers), how, noise, tell)
     tell("covariances")
-    is_dense = task.instants.count > INSTANTS
-    mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
+    mixture = mixture_of(thinned(found.model), found.fit, found.model)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     worst = too_much(scatter_of_blocks(task, found), is_drift_untried=is_drift_untried(task, found))

@@ -30,7 +30,7 @@ def test_a_good_problem_is_to_be_used_and_its_truth_is_inside() -> None:
         assert calibration.contains(name, truth, 0.9999)
     assert choice(calibration, "outliers").chosen == "none"
     said = choice(calibration, "noise of A and B")
-    assert said.chosen.startswith("estimated, for each axis 0.5° and 4.8 mm for B, ")
+    assert said.chosen.startswith("estimated, for each axis 0.5° and 4.9 mm for B, ")
     assert said.evidence == "that is what the residuals of 80 measurements show"
     said = choice(calibration, "systematic errors")
     assert said.chosen == "none found; the covariances hold as much as could hide"

@@ -246,6 +246,15 @@ def test_a_mixture_has_weights_and_quantiles() -> None:
     assert refined.degrees_of_freedom > 3.0
 
 
+@pytest.mark.parametrize(("count", "seed"), [(10, 3), (12, 5), (12, 7), (15, 5)])
+def test_errors_that_few_measurements_do_not_show_may_also_be_nothing(count: int, seed: int) -> None:
+    """Before the data the 5 % quantile is e^-3.3 of the median, and nothing in the data speaks against small ones."""
+    _, noise = refined_under(simulated(count, seed=seed, of_A=(0.002, 0.001)))
+    assert not noise.has_systematic
+    of = noise.deviations[C.SYSTEMATIC_ROTATION]
+    assert of.low < 0.1 * of.value
+
+
 def test_the_ellipsoid_is_the_average_of_models_with_and_without_an_arms_errors() -> None:
     """The share of the constant error falls with the probability that it is there, down to nothing."""
     chance = np.random.default_rng(5)
