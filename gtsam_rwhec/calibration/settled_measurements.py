@@ -58,6 +58,8 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], Corners
     A stays as it was if options leave clocks to the data, A lies on no path, or no measurements agree.
     """
     problem, options = run.problem, run.options
+    if options.sizes == "estimate" and problem.scale == "known" and options.time_offsets == "auto":
+        run = replace(run, problem=with_free_sizes(problem, list(problem.targets)), stated=problem)
     if not problem.has_measurements or options.time_offsets == "auto":
         return run, (), None
     looks_at_sizes = options.sizes in ("correct", "estimate") and problem.scale != "shared"

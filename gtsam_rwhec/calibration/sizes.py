@@ -47,6 +47,8 @@ BLOCKS = 10
 #: With so few blocks, the standard deviation itself is uncertain: the ratio of Student's and Gauss's quantiles at the
 #: five standard deviations of the test, for nine degrees of freedom.
 STUDENT = 2.6
+#: The same at two deviations.
+USUAL_STUDENT = 1.15
 #: Standard deviations of the priors that stand for fixed poses here, in metres and rad.
 FIXED_M, FIXED_RAD = 1e-4, 1e-4
 
@@ -80,6 +82,8 @@ class TargetSize:
     is_untested: bool = False
     #: Whether it has no stated size, but lengths in clouds
     is_of_clouds: bool = False
+    #: Standard deviation at the usual two deviations, where ``sigma`` has the caution of a test at five; None: as that
+    usual_sigma: float | None = None
     #: (6,) by frame: how its pose moves (right perturbation) with the scale
     moves: Mapping[str, Array] = field(default_factory=dict, hash=False, compare=False, repr=False)
 
@@ -97,7 +101,8 @@ class TargetSize:
     @property
     def may_be_off(self) -> bool:
         """Whether it may be wrong by a share that few would measure: then the poses are known less well."""
-        return _is_off(self.scale, self.sigma, SPEAKING_SIGMAS, CLOUDS_SHARE)
+        sigma = self.sigma if self.usual_sigma is None else self.usual_sigma
+        return _is_off(self.scale, sigma, SPEAKING_SIGMAS, CLOUDS_SHARE)
 
     def __str__(self) -> str:
         if self.sigma is None:
@@ -293,7 +298,11 @@ def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:
     }
     known = [size.sigma is not None and size.target in sigmas for size in found]
     return [
-        replace(size, sigma=max(size.sigma or 0.0, sigmas[size.target]))
+        replace(
+            size,
+            sigma=max(size.sigma or 0.0, sigmas[size.target]),
+            usual_sigma=max(size.sigma or 0.0, sigmas[size.target] * USUAL_STUDENT / STUDENT),
+        )
         if is_known
         else replace(size, sigma=None, is_untested=size.is_doubted or size.is_uncertain)
         for size, is_known in zip(found, known, strict=True)

@@ -33,8 +33,9 @@ LAST = (4.0, 8)
 #: Starts that differ by less than these (rad, share of the size) are one.
 SAME = (0.02, 0.05)
 #: Views show one thing if points are closer to other views than this, as shares of the gate's square: all of them, or
-#: those within the gate (wrong poses have 0.18 and more, right ones less than 0.1, however little the views overlap).
-MISFIT, CLOSE = 0.45, 0.13
+#: those within the gate (wrong poses have 0.18 and more, right ones less than 0.1, however little the views overlap; a
+#: LiDAR's in rooms, and a thing before an endless wall, up to 0.14).
+MISFIT, CLOSE = 0.45, 0.15
 #: A start is worse than the best if it is so by this many of the deviations of pairs.
 CLEARLY = 4.0
 

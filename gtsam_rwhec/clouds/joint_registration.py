@@ -34,6 +34,8 @@ LOOSE = 3.0
 NOTHING = 1e-9
 #: Variances of predicted poses, in those of A: a prior that leaves residuals of A as they are.
 WEAK = 9.0
+#: All points of a view are off together by this share of the gate, however little noise they have.
+FINEST = 0.0025
 #: Huber's constant for six dimensions.
 HUBER = 1.869
 
@@ -102,8 +104,9 @@ def joint_poses(
         if np.abs(moved).max() < SETTLED * gate_m:
             break
     of_faces = alike(float(sigma_m[0]), noise_m)
+    of_view = np.hypot(of_faces, FINEST * gate_m) / sigma_m[0]
     by_views, by_groups = (
-        (float(np.hypot(faces, of_faces / sigma_m[0])), edges) for faces, edges in (SHARED_BY_VIEWS, SHARED_BY_GROUPS)
+        (float(np.hypot(faces, of_view)), edges) for faces, edges in (SHARED_BY_VIEWS, SHARED_BY_GROUPS)
     )
     alone = _covariances(surfaces, poses, i, j, gate_m, sigma_m, by_views)
     count = np.bincount(np.r_[i[at], j[at]], minlength=len(surfaces))

@@ -139,7 +139,7 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
         raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
     inside = registrations.selected(together[registrations.i] & together[registrations.j]).renamed(place)
     of_A = noise_of_A(inside, Y)
-    spacing_m, noise_m = views.spacing.faces_m, views.spacing.noise_m
+    spacing_m, noise_m = views.spacing.faces_m, views.spacing.left_m
     joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, of_A, inside, GATE * spacing_m, noise_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
     stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)

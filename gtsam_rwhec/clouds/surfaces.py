@@ -105,6 +105,11 @@ class Spacing:
         """Whether ranges are smoothed before views are thinned."""
         return self.noise_m > NOISY * self.faces_m
 
+    @property
+    def left_m(self) -> float:
+        """The noise of a point along its ray after that."""
+        return self.noise_m / np.sqrt(RAYS) if self.is_noisy else self.noise_m
+
 
 def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
     """The spacing at which clouds (n, 3) keep as many points as they need, or their own if it is larger.

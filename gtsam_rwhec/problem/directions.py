@@ -35,8 +35,10 @@ SHIFTED = 0.3
 #: And by this many squares of the deviation over the distance of points: noise that is large beside it bends normals,
 #: and chooses wrong neighbours. By simulations of 1 to 3 mm of noise on things of 12 cm.
 BENT = 2.0
-#: And turned about the thing by this share of the angle by which neighbours that are off together lift its rim.
-TURNED = 0.5
+#: And by this share of the distance of points, however little noise they have: normals bend over that distance.
+FINEST = 0.01
+#: And turned about the thing by this many times the angle by which neighbours that are off together lift its rim.
+TURNED = 1.0
 #: Which directions [omega, v] of a target's own axes a kind of measurement does not see.
 UNSEEN = {
     Kind.POSE: np.zeros(6, dtype=bool),
@@ -314,7 +316,8 @@ def alike_in_clouds(sigma_m: float, spacing_m: float, alike_m: float, size_m: fl
 
     By the deviation of points, their distance, what neighbours among them are off by together, and the thing's size.
     """
-    shift = np.sqrt((SHIFTED * sigma_m) ** 2 + (BENT * sigma_m**2 / spacing_m) ** 2 + alike_m**2)
+    of_noise, of_spacing = np.hypot(SHIFTED * sigma_m, BENT * sigma_m**2 / spacing_m), FINEST * spacing_m
+    shift = np.sqrt(of_noise**2 + of_spacing**2 + alike_m**2)
     return float(shift), TURNED * alike_m / size_m
 
 

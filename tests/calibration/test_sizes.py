@@ -54,18 +54,27 @@ def test_right_sizes_are_not_doubted() -> None:
     assert [size.is_doubted for size in sizes(with_wrong_size(1.0))] == [False, False]
 
 
-def test_a_size_that_is_wrong_by_less_than_is_doubted_is_in_the_ellipsoid() -> None:
-    """A board at 0.8 m that was printed 0.3 % too large: 2.1 mm off where 0.7 mm were claimed, with 'use'."""
+def board_of_another_size(factor: float, **kwargs: object) -> tuple[rw.Problem, np.ndarray]:
+    """A board at 0.8 m whose stated size is so many times the true one, and the camera's true pose."""
     rng = np.random.default_rng(0)
     Y, X = random_poses(2, 0.1, rng)
     turns = Rotation.from_rotvec(rng.normal(0.0, 0.4, (30, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
     B = se3.pose(turns, np.column_stack([rng.uniform(-0.15, 0.15, (30, 2)), rng.uniform(0.5, 0.9, 30)]))
     A = perturb(Y @ B @ np.linalg.inv(X), Noise(2e-4, 0.5 / np.radians(0.03) ** 2), rng)
     B = perturb(B, Noise(3e-4, 0.5 / np.radians(0.05) ** 2), rng)
-    B[:, :3, 3] *= 1.003
+    B[:, :3, 3] *= factor
     problem = rw.Problem()
-    problem.add("board", "camera", A, B)
-    found = rw.calibrate(problem)
+    problem.add("board", "camera", A, B, **kwargs)
+    return problem, Y
+
+
+@pytest.mark.parametrize("noise", ["auto", "given"])
+def test_a_size_that_is_wrong_by_less_than_is_doubted_is_in_the_ellipsoid(noise: str) -> None:
+    """A board that was printed 0.3 % too large: 2.1 mm off where 0.7 mm were claimed, with 'use'."""
+    variances = np.repeat([np.radians(0.05) ** 2 + np.radians(0.03) ** 2, 3e-4**2 + 2e-4**2], 3)
+    stated = {"covariances": np.tile(np.diag(variances), (30, 1, 1))} if noise == "given" else {}
+    problem, Y = board_of_another_size(1.003, **stated)
+    found = rw.calibrate(problem, rw.CalibrateOptions(noise=noise))
     assert found.verdict is rw.Verdict.USE
     (size,) = found.sizes
     assert size.may_be_off
@@ -74,6 +83,12 @@ def test_a_size_that_is_wrong_by_less_than_is_doubted_is_in_the_ellipsoid() -> N
     assert off @ np.linalg.solve(found.refined.covariance("camera"), off) < 16.8  # chi-square, 99 %
     assert 2.0 * np.sqrt(np.trace(found.refined.covariance("camera")[3:, 3:])) > np.linalg.norm(off[3:]) > 1.5e-3
     assert "may be wrong" in next(choice for choice in found.choices if choice.what == "sizes of targets").chosen
+
+
+def test_all_sizes_are_estimated_where_that_is_asked_for() -> None:
+    """It did nothing, in silence, where clocks are left to the data."""
+    found = rw.calibrate(board_of_another_size(1.02)[0], rw.CalibrateOptions(sizes="estimate"))
+    assert found.scale["board"] == pytest.approx(1.02, abs=0.002)
 
 
 def test_the_log_road_has_the_same_rule() -> None:

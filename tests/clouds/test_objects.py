@@ -81,6 +81,15 @@ def test_an_exact_arm_gives_the_sensor_to_a_tenth_of_a_millimetre(shape: Shape, 
     assert error @ np.linalg.solve(covariance, error) < 22.5  # 99.9 %
 
 
+def test_points_that_are_nearly_exact_do_not_contradict_each_other() -> None:
+    """Noise of 0.05 mm: 7 of 9 views of a cube 'contradicted the answer'."""
+    seen = clouds_of_thing("cube", 9, 1, noise_m=5e-5)
+    calibration, Y, covariance = answer(seen.clouds, seen.A)
+    off = apart(seen.T_sensorcarrier_sensor, Y)
+    assert calibration.verdict is rw.Verdict.USE
+    assert off @ np.linalg.solve(covariance, off) < CHI2_95
+
+
 def test_arrays_of_points_are_clouds_and_other_things_are_named(bust: SimulatedClouds) -> None:
     plain = seen_object([each.points for each in bust.clouds[:4]], bust.A[:4])
     assert np.array_equal(plain.T_sensor_object, seen_object(bust.clouds[:4], bust.A[:4]).T_sensor_object)
