@@ -32,8 +32,8 @@ BUDGET = {
     # that cannot be used 45
     # clouds with noise and patterns 110; sizes that are off by less than is doubted 50; corners and noise of many tags
     # by steps that eliminate targets 270; samples of noise that reach as far as it does 10; what is named 65
-    "lines": 100_560,
-    "code": 62_760,
+    "lines": 100_570,
+    "code": 62_765,
     # capture has 25 files, and is a package of its own
     "files": 439,
     "packages": 20,
