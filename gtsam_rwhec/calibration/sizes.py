@@ -49,6 +49,8 @@ BLOCKS = 10
 STUDENT = 2.6
 #: The same at two deviations.
 USUAL_STUDENT = 1.15
+#: Printers and focal lengths are off by such a share, usually.
+PRINTED = 0.002
 #: Standard deviations of the priors that stand for fixed poses here, in metres and rad.
 FIXED_M, FIXED_RAD = 1e-4, 1e-4
 
@@ -103,6 +105,19 @@ class TargetSize:
         """Whether it may be wrong by a share that few would measure: then the poses are known less well."""
         sigma = self.sigma if self.usual_sigma is None else self.usual_sigma
         return _is_off(self.scale, sigma, SPEAKING_SIGMAS, CLOUDS_SHARE)
+
+    @property
+    def untold(self) -> str:
+        """What an error that the motion would not show does, in words; empty where it would show."""
+        if self.sigma is None or self.sigma < 0.5 * PRINTED or not self.moves:
+            return ""
+        moved_mm = {name: 1e3 * PRINTED * float(np.linalg.norm(of[3:])) for name, of in self.moves.items()}
+        most = max(moved_mm, key=lambda name: moved_mm[name])
+        return (
+            f"it tells the size of {self.target} to {rounded(100.0 * self.sigma)} % only, and an error of "
+            f"{100.0 * PRINTED:g} %, as printers make it, moves {most} by {rounded(moved_mm[most])} mm, which no "
+            "standard deviation has"
+        )
 
     def __str__(self) -> str:
         if self.sigma is None:

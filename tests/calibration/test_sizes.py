@@ -54,12 +54,12 @@ def test_right_sizes_are_not_doubted() -> None:
     assert [size.is_doubted for size in sizes(with_wrong_size(1.0))] == [False, False]
 
 
-def board_of_another_size(factor: float, **kwargs: object) -> tuple[rw.Problem, np.ndarray]:
+def board_of_another_size(factor: float, reach: float = 1.0, **kwargs: object) -> tuple[rw.Problem, np.ndarray]:
     """A board at 0.8 m whose stated size is so many times the true one, and the camera's true pose."""
     rng = np.random.default_rng(0)
     Y, X = random_poses(2, 0.1, rng)
     turns = Rotation.from_rotvec(rng.normal(0.0, 0.4, (30, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
-    B = se3.pose(turns, np.column_stack([rng.uniform(-0.15, 0.15, (30, 2)), rng.uniform(0.5, 0.9, 30)]))
+    B = se3.pose(turns, [0.0, 0.0, 0.7] + reach * rng.uniform([-0.15, -0.15, -0.2], [0.15, 0.15, 0.2], (30, 3)))
     A = perturb(Y @ B @ np.linalg.inv(X), Noise(2e-4, 0.5 / np.radians(0.03) ** 2), rng)
     B = perturb(B, Noise(3e-4, 0.5 / np.radians(0.05) ** 2), rng)
     B[:, :3, 3] *= factor
@@ -83,6 +83,12 @@ def test_a_size_that_is_wrong_by_less_than_is_doubted_is_in_the_ellipsoid(noise:
     assert off @ np.linalg.solve(found.refined.covariance("camera"), off) < 16.8  # chi-square, 99 %
     assert 2.0 * np.sqrt(np.trace(found.refined.covariance("camera")[3:, 3:])) > np.linalg.norm(off[3:]) > 1.5e-3
     assert "may be wrong" in next(choice for choice in found.choices if choice.what == "sizes of targets").chosen
+
+
+def test_a_size_that_the_motion_hardly_tells_is_said_with_what_it_moves() -> None:
+    problem, _ = board_of_another_size(1.0, reach=0.05)
+    (choice,) = [one for one in rw.calibrate(problem).choices if one.what == "sizes of targets"]
+    assert "% only, and an error of 0.2 %, as printers make it, moves" in choice.evidence
 
 
 def test_all_sizes_are_estimated_where_that_is_asked_for() -> None:
