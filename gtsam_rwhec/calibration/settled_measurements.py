@@ -15,7 +15,7 @@ import numpy as np
 from gtsam_rwhec.calibration.calibrate_options import Inliers, Run, agreeing, offsets_of, with_sizes_of
 from gtsam_rwhec.calibration.from_corners import CornersFound, with_estimated_intrinsics
 from gtsam_rwhec.calibration.outliers import refined_with_outliers
-from gtsam_rwhec.calibration.sizes import TargetSize, refined_by, sizes_in
+from gtsam_rwhec.calibration.sizes import TargetSize, free_scale, refined_by, sizes_in
 from gtsam_rwhec.errors import (
     CountError,
     NoiseError,
@@ -58,9 +58,11 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], Corners
     A stays as it was if options leave clocks to the data, A lies on no path, or no measurements agree.
     """
     problem, options = run.problem, run.options
-    if options.sizes == "estimate" and problem.scale == "known" and options.time_offsets == "auto":
-        run = replace(run, problem=with_free_sizes(problem, list(problem.targets)), stated=problem)
-    if not problem.has_measurements or options.time_offsets == "auto":
+    if not problem.has_measurements:
+        return run, (), None
+    if options.time_offsets == "auto":
+        if options.sizes == "estimate" and problem.scale == "known":
+            run = replace(run, problem=with_free_sizes(problem, problem.targets), stated=problem)
         return run, (), None
     looks_at_sizes = options.sizes in ("correct", "estimate") and problem.scale != "shared"
     if not looks_at_sizes and not _asked(problem, run) and run.recording is None:
@@ -192,8 +194,9 @@ def with_free_sizes(problem: Problem, targets: Collection[str]) -> Problem:
     free = {*targets, *_estimated(problem)}
     result = summed_again(problem)
     known = {pair.target: problem.fixed_scales.get(pair.target, 1.0) for pair in problem.pairs}
-    result.scale = "per_target"
-    result.fixed_scales = {name: scale for name, scale in known.items() if name not in free}
+    result.scale = free_scale(problem)
+    if result.scale == "per_target":
+        result.fixed_scales = {name: scale for name, scale in known.items() if name not in free}
     return result
 
 

@@ -26,6 +26,7 @@ from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected, summed_again
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -38,8 +39,9 @@ UNCERTAIN_SIGMAS = 3.5
 SPEAKING_SIGMAS = 2.0
 #: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
-#: Lengths in clouds are uncertain from this share on: nobody states them, and 0.3 % was 1.1 mm with 0.04 mm claimed.
-CLOUDS_SHARE = 0.0005
+#: Smaller shares move nobody's poses. Lengths in clouds are uncertain from it on, since nobody states them: 0.3 % was
+#: 1.1 mm with 0.04 mm claimed.
+LEAST_SHARE = 0.0005
 #: A size that is wrong by more than this factor is not determined by the motion.
 LARGEST = 1e4
 #: So many blocks of each pair's rows are left out in turn.
@@ -86,7 +88,7 @@ class TargetSize:
     is_of_clouds: bool = False
     #: Standard deviation at the usual two deviations, where ``sigma`` has the caution of a test at five; None: as that
     usual_sigma: float | None = None
-    #: (6,) by frame: how its pose moves (right perturbation) with the scale
+    #: (6, 1) by frame: how its pose moves (right perturbation) with the scale
     moves: Mapping[str, Array] = field(default_factory=dict, hash=False, compare=False, repr=False)
 
     @property
@@ -97,26 +99,24 @@ class TargetSize:
     @property
     def is_uncertain(self) -> bool:
         """Whether the measurements speak against the stated size, though not clearly."""
-        share = CLOUDS_SHARE if self.is_of_clouds else SIZE_SHARE
+        share = LEAST_SHARE if self.is_of_clouds else SIZE_SHARE
         return _is_off(self.scale, self.sigma, UNCERTAIN_SIGMAS, share) and not self.is_doubted
 
     @property
     def may_be_off(self) -> bool:
         """Whether it may be wrong by a share that few would measure: then the poses are known less well."""
         sigma = self.sigma if self.usual_sigma is None else self.usual_sigma
-        return _is_off(self.scale, sigma, SPEAKING_SIGMAS, CLOUDS_SHARE)
+        return _is_off(self.scale, sigma, SPEAKING_SIGMAS, LEAST_SHARE)
 
     @property
     def untold(self) -> str:
         """What an error that the motion would not show does, in words; empty where it would show."""
         if self.sigma is None or self.sigma < 0.5 * PRINTED or not self.moves:
             return ""
-        moved_mm = {name: 1e3 * PRINTED * float(np.linalg.norm(of[3:])) for name, of in self.moves.items()}
-        most = max(moved_mm, key=lambda name: moved_mm[name])
+        moved_mm, most = max((1e3 * PRINTED * float(np.linalg.norm(of[3:])), name) for name, of in self.moves.items())
         return (
-            f"it tells the size of {self.target} to {rounded(100.0 * self.sigma)} % only, and an error of "
-            f"{100.0 * PRINTED:g} %, as printers make it, moves {most} by {rounded(moved_mm[most])} mm, which no "
-            "standard deviation has"
+            f"it tells the size of {self.target} to {rounded(100.0 * self.sigma)} % only, and {100.0 * PRINTED:g} %, "
+            f"as printers err, moves {most} by {rounded(moved_mm)} mm, which no standard deviation has"
         )
 
     def __str__(self) -> str:
@@ -190,8 +190,7 @@ def sizes(
         return ()
     (progress or silent)("looking at the targets' sizes")
     free = summed_again(problem)
-    # What weighs by direction has one factor for all.
-    free.scale = "shared" if problem.directed else "per_target"
+    free.scale = free_scale(problem)
     free.fixed, free.priors = dict(problem.fixed), dict(problem.priors)
     # Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are.
     for name in {pair.target for pair in free.pairs} & set(free.fixed):
@@ -218,8 +217,14 @@ def sizes(
     return tuple(_marked(found, problem))
 
 
+def free_scale(problem: Problem) -> ScaleMode:
+    """How sizes of a problem are estimated: what weighs by direction has one factor for all."""
+    return "shared" if problem.directed else "per_target"
+
+
 def _marked(found: Sequence[TargetSize], problem: Problem) -> list[TargetSize]:
-    return [replace(size, is_of_clouds=size.target in problem.alike) for size in found]
+    of_clouds = {pair.target for pair in problem.alike}
+    return [replace(size, is_of_clouds=size.target in of_clouds) for size in found]
 
 
 def refined_by(
@@ -270,10 +275,7 @@ def sizes_in(refined: Refined) -> list[TargetSize]:
 
 
 def moves_of_sizes(found: Sequence[TargetSize]) -> list[dict[str, Array]]:
-    """How frames are off (6,) by sizes that may be off by a share that is not doubted: printers are no more exact.
-
-    With 0.3 % a board at 0.8 m gave 'use', 2.1 mm off where 0.7 mm were claimed.
-    """
+    """How frames are off (6, 1) by sizes that may be off by a share that is not doubted: printers are no more exact."""
     off = [size for size in found if size.may_be_off and not size.is_doubted]
     several = {id(size.moves): size for size in off}  # targets that share a scale have one error
     return [{name: (one.scale - 1.0) * move for name, move in one.moves.items()} for one in several.values()]
@@ -287,7 +289,7 @@ def _moves(refined: Refined, scale: Unknown) -> dict[str, Array]:
     with_scale = joint.finite[:, joint.slots[scale]][:, 0]
     variance = float(with_scale[joint.slots[scale]][0])
     frames = [unknown for unknown in joint.slots if unknown.kind is UnknownKind.FRAME]
-    return {str(frame): with_scale[joint.slots[frame]] / variance for frame in frames} if variance > 0.0 else {}
+    return {str(frame): with_scale[joint.slots[frame], None] / variance for frame in frames} if variance > 0.0 else {}
 
 
 def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:

@@ -202,6 +202,8 @@ def _check_what_needs_measurements(problem: Problem, options: CalibrateOptions) 
     for name in ("carrier_noise", "carrier_path", "time_offsets"):
         if getattr(options, name) not in (None, "auto", False, ()):
             problem.require_raw_measurements(f"CalibrateOptions.{name}")
+    if options.sizes == "estimate" and problem.scale == "known":
+        problem.require_raw_measurements('CalibrateOptions.sizes="estimate" (or give the problem scale="per_target")')
 
 
 def _calibrated(run: Run) -> Calibration:
@@ -271,10 +273,9 @@ def _calibrated(run: Run) -> Calibration:
     if reading.finding is None and solution is not None:
         free = solution.identifiability.free_directions if refined is None else refined.free_directions
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
-    if refined is not None and problem.alike:
-        refined = refined.with_views_off_alike(problem.alike, problem.pairs)
-    if refined is not None and problem.scale == "known":
-        for moves in moves_of_sizes(found_sizes):
+    if refined is not None:
+        of_sizes = moves_of_sizes(found_sizes) if problem.scale == "known" else []
+        for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes):
             refined = refined.with_errors(moves)
     best = solution if refined is None else refined
     views = {} if best is None else views_of(problem, inliers, best.scale)

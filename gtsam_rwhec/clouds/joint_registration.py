@@ -35,7 +35,7 @@ NOTHING = 1e-9
 #: Variances of predicted poses, in those of A: a prior that leaves residuals of A as they are.
 WEAK = 9.0
 #: All points of a view are off together by this share of the gate, however little noise they have.
-FINEST = 0.0025
+OF_EACH_VIEW = 0.0025
 #: Huber's constant for six dimensions.
 HUBER = 1.869
 
@@ -104,7 +104,7 @@ def joint_poses(
         if np.abs(moved).max() < SETTLED * gate_m:
             break
     of_faces = alike(float(sigma_m[0]), noise_m)
-    of_view = np.hypot(of_faces, FINEST * gate_m) / sigma_m[0]
+    of_view = np.hypot(of_faces, OF_EACH_VIEW * gate_m) / sigma_m[0]
     by_views, by_groups = (
         (float(np.hypot(faces, of_view)), edges) for faces, edges in (SHARED_BY_VIEWS, SHARED_BY_GROUPS)
     )

@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 from rwhec_factors import se3
-from scipy.linalg import block_diag
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.lidar_boards import (
@@ -23,6 +22,7 @@ from gtsam_rwhec.clouds.lidar_boards import (
 from gtsam_rwhec.errors import CloudError, CountError, NoiseError
 from gtsam_rwhec.geometry.poses import Array, PoseLike, PosesLike, as_transforms, one_transform
 from gtsam_rwhec.geometry.real_numbers import real_array
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 
 #: Two sensors' boards are compared on pairs of places; of more pairs than these, some are drawn.
@@ -261,7 +261,7 @@ def lidar_and_camera(
         problem.add_prior(target, np.eye(4), placed_m, 0.5 / placed_rad**2)
     sight = (B[:, :3, 3] / np.linalg.norm(B[:, :3, 3], axis=1)[:, None]).mean(axis=0)
     if common_m > 0.0:
-        problem.alike[target] = block_diag(np.zeros((3, 3)), common_m**2 * np.outer(sight, sight))
+        problem.alike[Pair(target, sensor)] = common_m * np.r_[np.zeros(3), sight][:, None]
     return problem
 
 

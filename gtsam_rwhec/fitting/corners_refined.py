@@ -89,7 +89,7 @@ class CornersRefined:
     graph: CornerGraph = field(repr=False)
     #: The values of all variables, with the carriers' poses at the instants.
     point: Point = field(repr=False)
-    #: Levenberg-Marquardt steps, in all rounds together.
+    #: Steps, in all rounds together.
     iterations: int
     #: What one more Gauss-Newton step would move, in deviations: it is far below 1 at an optimum.
     last_step: float

@@ -285,7 +285,7 @@ class CornerOptions:
     time_offsets: tuple[str, ...] = ()
     #: Leave corners out that disagree with all others.
     outliers: bool = True
-    #: Largest number of Levenberg-Marquardt steps of one round.
+    #: Largest number of steps of one round.
     max_iterations: int = 100
 
     def __post_init__(self) -> None:

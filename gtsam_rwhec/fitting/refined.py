@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple, Self
@@ -133,24 +133,14 @@ class RefinedPoses:
                     covariance += J @ self.joint.turned(unknown) @ J.T
         return covariance
 
-    def with_views_off_alike(self, of_targets: Mapping[str, Array], pairs: Sequence[Pair]) -> Self:
-        """The same, where all that a sensor saw of targets is off alike in its axes: covariances (6, 6) by target."""
-        finite = self.joint.finite.copy()
-        for name in self.Y:
-            off = [of_targets.get(pair.target, np.zeros((6, 6))) for pair in pairs if pair.sensor == name]
-            rows = self.joint.slots.get(Unknown.of(name))
-            if rows is not None and off:
-                finite[rows, rows] += min(off, key=np.trace)
-        return replace(self, joint=replace(self.joint, finite=finite))
-
     def with_errors(self, moves: Mapping[str, Array]) -> Self:
-        """The same, where frames are off together by so much (6,), one standard deviation, by one error."""
-        along = np.zeros(len(self.joint.unit))
+        """The same, where k errors, one standard deviation each, move frames together by so much (6, k)."""
+        along = np.zeros((len(self.joint.unit), len(next(iter(moves.values()), np.zeros((6, 0))).T)))
         for name, move in moves.items():
             rows = self.joint.slots.get(Unknown.of(name))
             if rows is not None:
                 along[rows] = move
-        return replace(self, joint=replace(self.joint, finite=self.joint.finite + np.outer(along, along)))
+        return replace(self, joint=replace(self.joint, finite=self.joint.finite + along @ along.T))
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

@@ -29,16 +29,6 @@ MEANINGLESS_RAD = 30.0
 MEANINGLESS_M = 30.0
 #: Variances, rad^2 or m^2, from which on a direction slides: nothing that is measured is so rough.
 SLIDES = 25.0
-#: Clouds are all shifted alike by this (standard deviation), in deviations of their points: noise along rays and edges
-#: that are thinned move what every view sees in one direction, by 0.03 to 0.06 mm of 0.1 mm of noise.
-SHIFTED = 0.3
-#: And by this many squares of the deviation over the distance of points: noise that is large beside it bends normals,
-#: and chooses wrong neighbours. By simulations of 1 to 3 mm of noise on things of 12 cm.
-BENT = 2.0
-#: And by this share of the distance of points, however little noise they have: normals bend over that distance.
-FINEST = 0.01
-#: And turned about the thing by this many times the angle by which neighbours that are off together lift its rim.
-TURNED = 1.0
 #: Which directions [omega, v] of a target's own axes a kind of measurement does not see.
 UNSEEN = {
     Kind.POSE: np.zeros(6, dtype=bool),
@@ -311,21 +301,10 @@ def scaled(covariances: Array, slides: Array | None, deviation: Array) -> Array:
     return np.asarray(back @ at_centre @ back.transpose(0, 2, 1) + slides)
 
 
-def alike_in_clouds(sigma_m: float, spacing_m: float, alike_m: float, size_m: float) -> tuple[float, float]:
-    """What all clouds of a thing are shifted (m) and turned (rad) by alike, standard deviations.
-
-    By the deviation of points, their distance, what neighbours among them are off by together, and the thing's size.
-    """
-    of_noise, of_spacing = np.hypot(SHIFTED * sigma_m, BENT * sigma_m**2 / spacing_m), FINEST * spacing_m
-    shift = np.sqrt(of_noise**2 + of_spacing**2 + alike_m**2)
-    return float(shift), TURNED * alike_m / size_m
-
-
 def shifted_and_turned(shift_m: float, turn_rad: float, B: Array) -> Array:
-    """The covariance (6, 6) of a sensor whose views B (N, 4, 4) of a thing are all shifted, and turned about it."""
-    turn = np.hstack([np.eye(3), se3.hat(B[:, :3, 3].mean(axis=0)).T])
-    covariance: Array = np.diag(np.repeat([0.0, shift_m**2], 3)) + turn_rad**2 * turn.T @ turn
-    return covariance
+    """How a sensor is off, (6, 6), whose views B (N, 4, 4) of a thing are all shifted, and turned about it."""
+    about = se3.hat(B[:, :3, 3].mean(axis=0))
+    return np.block([[np.zeros((3, 3)), turn_rad * np.eye(3)], [shift_m * np.eye(3), turn_rad * about]])
 
 
 def centres_of(covariances: Array) -> Array:

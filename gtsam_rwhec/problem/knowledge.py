@@ -14,7 +14,7 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
 from gtsam_rwhec.problem.corners import check_camera, check_corner_px, same_board
-from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, positive_weights
+from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, Pair, positive_weights
 
 ScaleMode = Literal["known", "shared", "per_target"]
 #: Scales below this are refused, as weights are: no target has them, and their squares overflow.
@@ -99,8 +99,8 @@ class Knowledge:
         self.fixed_scales: dict[str, float] = {}
         self.cameras: dict[str, Camera] = {}
         self.boards: dict[str, Array] = {}
-        #: Of targets seen in clouds: the covariance (6, 6), in the sensor's axes, of what all of its views are off by.
-        self.alike: dict[str, Array] = {}
+        #: Of targets in clouds: what all views are off by alike, in the sensor's axes: (6, k), one deviation a column.
+        self.alike: dict[Pair, Array] = {}
         self.corner_px: float | None = None
 
     def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
@@ -200,5 +200,5 @@ class Knowledge:
         self.fixed_scales = {name: scale for name, scale in other.fixed_scales.items() if name not in scales}
         self.cameras = {name: camera for name, camera in other.cameras.items() if name not in frames}
         self.boards = {name: board for name, board in other.boards.items() if name not in frames}
-        self.alike = {name: covariance for name, covariance in other.alike.items() if name not in frames}
+        self.alike = {pair: of for pair, of in other.alike.items() if not {*pair.frames} & {*frames}}
         self.corner_px = other.corner_px

@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.additions import Additions
 from gtsam_rwhec.problem.directions import axes_told, unseen_by
@@ -108,6 +109,13 @@ class Problem(Additions):
     def directed(self) -> frozenset[Pair]:
         """The pairs with measurements that weigh by direction; all of such a pair's measurements do."""
         return frozenset(pair for pair, kept in self._kept.items() if kept.has_kinds)
+
+    @property
+    def alike_of_sensors(self) -> dict[str, Array]:
+        """By sensor what all of its views are off by alike, where all of its targets have such: that of the best."""
+        seen = {name: [pair for pair in self.pairs if pair.sensor == name] for name in self.sensors}
+        of_clouds = {name: pairs for name, pairs in seen.items() if pairs and self.alike.keys() >= {*pairs}}
+        return {name: min((self.alike[p] for p in pairs), key=np.linalg.norm) for name, pairs in of_clouds.items()}
 
     @property
     def is_of_registrations(self) -> bool:

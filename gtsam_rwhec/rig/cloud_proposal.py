@@ -47,6 +47,8 @@ from gtsam_rwhec.rig.section_types import is_text
 from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import ObjectTarget
 
+#: Why clouds of other sensors are not in a proposed rig file.
+ONE_SENSOR = "a rig file calibrates the clouds of one sensor, as each gives the object a frame of its own"
 #: Readings are judged by at most this number of clouds, spread evenly.
 LOOKED_AT = 12
 #: A reading lets clouds agree if their points are nearer to each other than this share of the gate's square.
@@ -92,27 +94,11 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
     RigError
         No file of poses fits the clouds.
     """
-    notes: list[str] = []
-    taken = {PARENT, CHILD, OBJECT}
-    sensors: dict[str, Sensor] = {}
-    chosen: tuple[_Reading, str, bool] | None = None
-    for clouds in found:
-        tables = list(_tables(folder, clouds))
-        if not tables or not is_text(clouds.path):
-            notes.append(f"not used: {clouds.path}, no poses fit its {len(clouds.files)} clouds")
-            continue
-        if chosen is None:
-            tell(f"trying readings of the poses in {', '.join(tables)}")
-            chosen = _best(folder, clouds, tables, tell)
-        poses = chosen[0].poses if chosen[0].poses.path in tables else None
-        path = tables[0] if poses is None else poses.path
-        name = free_name("camera" if clouds.path in (".", "*") else camera_name(clouds.path, ""), taken)
-        sensors[name] = Sensor(clouds=clouds.path, poses=path, unit_m=clouds.unit_m if clouds.unit_m != 1.0 else None)
-        place = "this folder" if clouds.path == "." else clouds.path
-        notes.append(f"sensor {name}: {len(clouds.files)} clouds in {place}, poses in {path}")
-        if clouds.unit_m != 1.0:
-            notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
-    if chosen is None:
+    by_table = {clouds.path: list(_tables(folder, clouds)) for clouds in found}
+    usable = [clouds for clouds in found if by_table[clouds.path] and is_text(clouds.path)]
+    notes = [f"not used: {of.path}, no poses fit its {len(of.files)} clouds" for of in found if of not in usable]
+    notes += [f"not used: {of.path}, {ONE_SENSOR}" for of in usable[1:]]
+    if not usable:
         whys = [words for clouds in found for words in _why_none(folder, clouds)][:3]
         raise RigError(
             f"{folder}: clouds in {', '.join(each.path for each in found[:5])}, and no file of poses that fits them"
@@ -120,7 +106,14 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             "Put the robot's pose at each cloud beside them, as poses.csv with a line a cloud: name, x, y, z, qx, qy, "
             "qz, qw (metres)"
         )
-    reading, words, is_sure = chosen
+    clouds = usable[0]
+    tell(f"trying readings of the poses in {', '.join(by_table[clouds.path])}")
+    reading, words, is_sure = _best(folder, clouds, by_table[clouds.path], tell)
+    name = free_name("camera" if clouds.path in (".", "*") else camera_name(clouds.path, ""), {PARENT, CHILD, OBJECT})
+    place = "this folder" if clouds.path == "." else clouds.path
+    notes.append(f"sensor {name}: {len(clouds.files)} clouds in {place}, poses in {reading.poses.path}")
+    if clouds.unit_m != 1.0:
+        notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
     notes.append(words)
     said = reading.poses.stated
     source = PoseSource(
@@ -135,7 +128,9 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             f". If the files have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above: no "
             "measurement tells these apart"
         )
-    rig = Rig(carriers=carriers, sensors={**sensors}, targets={OBJECT: ObjectTarget(type="object")})
+    unit_m = clouds.unit_m if clouds.unit_m != 1.0 else None
+    sensor = Sensor(clouds=clouds.path, poses=reading.poses.path, unit_m=unit_m)
+    rig = Rig(carriers=carriers, sensors={name: sensor}, targets={OBJECT: ObjectTarget(type="object")})
     remarks: dict[KeyPath, str] = {("carriers", "poses"): remark}
     remarks["targets", OBJECT] = "anything that stood still in front of the sensor"
     head = "# Paths start from that folder.\n"

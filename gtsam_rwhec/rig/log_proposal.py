@@ -101,37 +101,35 @@ def _of_clouds(log: Log, contents: LogContents) -> tuple[str, tuple[str, ...]] |
     topics = [topic for topic in topics if topic.count and is_text(topic.name) and not topic.unreadable]
     if not topics:
         return None
-    from gtsam_rwhec.rig.cloud_proposal import OBJECT, evidence_of_clouds  # needs an extra that images do without
+    from gtsam_rwhec.rig.cloud_proposal import (
+        OBJECT,
+        ONE_SENSOR,
+        evidence_of_clouds,
+    )  # needs an extra that images do without
 
-    frames = {topic.name: frame_of(log, topic.name) for topic in topics}
-    notes: list[str] = []
-    pair = _moving(log, contents, list(frames.values()), notes)
+    # a depth image's topic may show the same
+    topic, *others = sorted(topics, key=lambda topic: not topic.has_clouds)
+    of_topic = frame_of(log, topic.name)
+    notes = [f"not used: {other.name}, {ONE_SENSOR}" for other in others]
+    pair = _moving(log, contents, [of_topic], notes)
     parent, child = pair.source.parent_and_child
-    taken, of_log, solved, words = (
-        {parent, child, OBJECT},
-        evidence_of_log(log, contents, pair.source, {}, []),
-        None,
-        "",
-    )
-    sensors: dict[str, Sensor] = {}
+    taken = {parent, child, OBJECT}
+    of_log = evidence_of_log(log, contents, pair.source, {}, [])
     remarks: dict[KeyPath, str] = {("targets", OBJECT): "anything that stood still in front of the sensor"}
-    for topic in topics:
-        name = free_name(camera_name(topic.name, frames[topic.name]), taken)
-        frame = frames[topic.name] if is_name(frames[topic.name]) and frames[topic.name] not in taken else None
-        taken |= {frame} if frame else set()
-        intrinsics = cameras.get(topic.name)
-        if intrinsics is None and topic.name in cameras:
-            intrinsics, remarks["sensors", name, "intrinsics"] = _NO_INTRINSICS, MISSING
-        sensor = Sensor(clouds=topic.name, frame=frame, intrinsics=intrinsics)
-        if topic.has_clouds and of_log.path is not None:
-            found = evidence_of_clouds(log, topic, of_log.path, parent, child)
-            sensor = sensor.model_copy(update={"unit_m": found.unit_m if found.unit_m != 1.0 else None})
-            solved, words = (found.role, f"; {found}") if solved is None else (solved, words)
-        sensors[name] = sensor
-        notes.append(f"sensor {name}: {topic.count} {'clouds' if topic.has_clouds else 'depth images'} in {topic.name}")
+    name = free_name(camera_name(topic.name, of_topic), taken)
+    intrinsics = cameras.get(topic.name)
+    if intrinsics is None and topic.name in cameras:
+        intrinsics, remarks["sensors", name, "intrinsics"] = _NO_INTRINSICS, MISSING
+    frame = of_topic if is_name(of_topic) and of_topic not in taken else None
+    sensor, solved, words = Sensor(clouds=topic.name, frame=frame, intrinsics=intrinsics), None, ""
+    if topic.has_clouds and of_log.path is not None:
+        found = evidence_of_clouds(log, topic, of_log.path, parent, child)
+        sensor = sensor.model_copy(update={"unit_m": found.unit_m if found.unit_m != 1.0 else None})
+        solved, words = found.role, f"; {found}"
+    notes.append(f"sensor {name}: {topic.count} {'clouds' if topic.has_clouds else 'depth images'} in {topic.name}")
     carriers, remarks["carriers", "poses"] = _carriers(pair, solved, words, of_log.origin)
     carriers = carriers.model_copy(update={"noise": None})  # clouds state theirs, so residuals tell it
-    rig = Rig(carriers=carriers, sensors={**sensors}, targets={OBJECT: ObjectTarget(type="object")})
+    rig = Rig(carriers=carriers, sensors={name: sensor}, targets={OBJECT: ObjectTarget(type="object")})
     return first_rig_text("log", log.files[0].path.name, rig, remarks), tuple(notes)
 
 

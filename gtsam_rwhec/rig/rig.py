@@ -228,7 +228,7 @@ def _carriers(carriers: Carriers) -> Iterator[Fault]:
 def _sensors(rig: RigFile) -> Iterator[Fault]:
     if not rig.all_sensors:
         yield ("sensors",), "none; give at least one sensor"
-    for key in ("images", "detections", "clouds"):
+    for key in ("images", "detections"):
         first: dict[str, str] = {}
         for name, sensor in rig.sensors.items():
             topic = getattr(sensor, key)
@@ -261,6 +261,12 @@ def _clouds(rig: RigFile) -> Iterator[Fault]:
     if of_clouds and not objects:
         words = "clouds, and no target that they show; give one: targets: {object: {type: object}}"
         yield ("sensors", of_clouds[0], "clouds"), words
+    for name in of_clouds[1:]:
+        yield (
+            ("sensors", name, "clouds"),
+            f"{of_clouds[0]} has clouds too, and each sensor's clouds give the object a frame of its own; make a rig "
+            "file for each",
+        )
     for name in objects[1:]:
         yield (
             ("targets", name),

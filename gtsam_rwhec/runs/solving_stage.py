@@ -28,6 +28,7 @@ from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs.mcap_reader import Log, open_log
 from gtsam_rwhec.problem.directions import shifted_and_turned
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.results.log_history import (
@@ -221,8 +222,9 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
     pairs, against = with_comparable_noise(log.pairs, rig, log.motion, offsets_s, progress or silent)
     problem = log.problem_of(pairs)
     for one in log.metadata.detection.objects:
-        B = np.concatenate([each.B for pair, each in pairs.items() if pair.target == one.target])
-        problem.alike[one.target] = shifted_and_turned(1e-3 * one.alike_mm, np.radians(one.alike_deg), B)
+        pair = Pair(one.target, one.sensor)
+        if pair in pairs:
+            problem.alike[pair] = shifted_and_turned(1e-3 * one.alike_mm, np.radians(one.alike_deg), pairs[pair].B)
     try:
         problem = log.corners.in_problem(problem, pairs, log.cameras)
     except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt

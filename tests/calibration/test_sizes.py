@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.sizes import SIZE_SHARE, TargetSize, common_factor, is_size_doubted, sizes
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.simulated_noise import random_poses
@@ -88,13 +88,16 @@ def test_a_size_that_is_wrong_by_less_than_is_doubted_is_in_the_ellipsoid(noise:
 def test_a_size_that_the_motion_hardly_tells_is_said_with_what_it_moves() -> None:
     problem, _ = board_of_another_size(1.0, reach=0.05)
     (choice,) = [one for one in rw.calibrate(problem).choices if one.what == "sizes of targets"]
-    assert "% only, and an error of 0.2 %, as printers make it, moves" in choice.evidence
+    assert "% only, and 0.2 %, as printers err, moves" in choice.evidence
 
 
 def test_all_sizes_are_estimated_where_that_is_asked_for() -> None:
     """It did nothing, in silence, where clocks are left to the data."""
     found = rw.calibrate(board_of_another_size(1.02)[0], rw.CalibrateOptions(sizes="estimate"))
     assert found.scale["board"] == pytest.approx(1.02, abs=0.002)
+    moments = general(1, 1, seed=4, noise=NOISE, keep_measurements=False).problem
+    with pytest.raises(MeasurementsNotKeptError, match='sizes="estimate"'):
+        rw.calibrate(moments, rw.CalibrateOptions(sizes="estimate"))
 
 
 def test_the_log_road_has_the_same_rule() -> None:

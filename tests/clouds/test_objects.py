@@ -17,7 +17,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, ViewFault, seen_object
 from gtsam_rwhec.clouds.joint_registration import LOOSE, of_groups
 from gtsam_rwhec.clouds.point_to_plane import alike, known, matches
-from gtsam_rwhec.clouds.surfaces import Features, Surface, spacing_of
+from gtsam_rwhec.clouds.surfaces import Features, Surface, spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, PoseError
 from gtsam_rwhec.problem.directions import Weighing
 from gtsam_rwhec.results.linear_model import LinearModel, measured_rows
@@ -218,6 +218,9 @@ def test_a_view_in_which_the_thing_was_elsewhere_is_left_out(bust: SimulatedClou
     assert np.isnan(seen.T_sensor_object[4]).all()
     assert not seen.used[4]
     assert seen.used.sum() == 8
+    first, _, left_out = str(seen).splitlines()
+    assert first.startswith("A thing in 8 of 9 views, by ")
+    assert left_out.startswith("  left out: view 4 (bust 4) shows the thing 13.")
 
 
 def test_a_thing_that_moved_and_stayed_is_an_error(bust: SimulatedClouds) -> None:
@@ -261,6 +264,17 @@ def test_poses_that_explain_nothing_are_named(bust: SimulatedClouds) -> None:
             seen_object(clouds, A)
 
 
+def test_a_second_sensor_gives_the_thing_a_frame_of_its_own(bust: SimulatedClouds) -> None:
+    """As one target two sensors were 3.5 mm off with 'use', since their frames of the thing differ."""
+    seen = seen_object(bust.clouds[:6], bust.A[:6])
+    problem = rw.Problem()
+    seen.add_to(problem, "thing", "left")
+    with pytest.raises(CloudError, match="give the thing another; add it as a target of its own, such as thing_right"):
+        seen.add_to(problem, "thing", "right")
+    seen.add_to(problem, "thing_right", "right")
+    assert [pair.target for pair in problem.pairs] == ["thing", "thing_right"]
+
+
 def test_a_wall_that_does_not_move_before_the_sensor_is_named(bust: SimulatedClouds) -> None:
     draw = np.random.default_rng(5)
     wall = np.column_stack([draw.uniform(-0.25, 0.25, (1000, 2)), draw.normal(0.6, 1e-4, 1000)])
@@ -277,13 +291,31 @@ def test_poses_or_clouds_that_are_all_the_same_are_named(bust: SimulatedClouds) 
 
 
 def test_points_far_beyond_all_others_change_nothing(bust: SimulatedClouds, capfd: pytest.CaptureFixture[str]) -> None:
-    plain_clouds = [cloud.selected(np.arange(0, len(cloud), 2)) for cloud in bust.clouds[:6]]
-    far = np.vstack([plain_clouds[2].points, [[1e20, 0.0, 0.0], [3e7, 1.0, 1.0]]])
-    clouds = [*plain_clouds[:2], Cloud.of(far), *plain_clouds[3:]]
-    found, plain = seen_object(clouds, bust.A[:6]), seen_object(plain_clouds, bust.A[:6])
-    np.testing.assert_allclose(found.T_sensor_object, plain.T_sensor_object, rtol=0.0, atol=1e-12)
+    points = bust.clouds[2].points
+    far = np.vstack([points, [[1e20, 0.0, 0.0], [3e7, 1.0, 1.0]]])
+    spacing = spacing_of([far], 9)
+    found, plain = (surface_of(Cloud.of(each), "view", spacing) for each in (far, points))
+    np.testing.assert_array_equal(found.faces.points, plain.faces.points)
     assert capfd.readouterr().err == ""  # the library for registrations writes there
-    assert str(found).startswith("A thing in 6 of 6 views, by 15 registrations; the sensor's pose by them is certified")
+
+
+def test_a_thing_before_an_endless_wall_is_not_refused() -> None:
+    """The wall stands still as the thing does, and each view shows another part of it: it was "no overlap"."""
+    seen, draw, half = clouds_of_thing("bust", 9, 2), np.random.default_rng(2), np.tan(np.radians(15.0))
+    side = half * np.linspace(-1.0, 1.0, 110)
+    rays = np.stack([*np.meshgrid(side, side), np.ones((110, 110))], axis=-1).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    clouds = []
+    for cloud, T_sensor_object in zip(seen.clouds, seen.T_sensor_object, strict=True):
+        normal = T_sensor_object[:3, 2]
+        lengths = normal @ (T_sensor_object @ [0.0, 0.0, -0.1, 1.0])[:3] / (rays @ normal)
+        column, row = np.round((cloud.points[:, :2] / cloud.points[:, 2:] / half + 1.0) * 54.5).astype(int).T
+        free = lengths > 0.0
+        free[110 * row + column] = False
+        wall = rays[free] * (lengths[free] + draw.normal(0.0, 1e-4, free.sum()))[:, None]
+        clouds.append(Cloud.of(np.vstack([cloud.points, wall])))
+    found = seen_object(clouds, seen.A)
+    assert np.abs(apart(seen.T_sensorcarrier_sensor, found.T_sensorcarrier_sensor)).max() < 3e-4
 
 
 def test_what_is_too_little_is_said(bust: SimulatedClouds) -> None:
