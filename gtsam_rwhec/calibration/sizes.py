@@ -53,6 +53,8 @@ STUDENT = 2.6
 USUAL_STUDENT = 1.15
 #: Printers and focal lengths are off by such a share, usually.
 PRINTED = 0.002
+#: Such an error must not move a frame by more than this within what is claimed: the quantile of chi2(6) at 99.9 %.
+FAR_OUTSIDE = 22.5
 #: Standard deviations of the priors that stand for fixed poses here, in metres and rad.
 FIXED_M, FIXED_RAD = 1e-4, 1e-4
 
@@ -105,19 +107,30 @@ class TargetSize:
     @property
     def may_be_off(self) -> bool:
         """Whether it may be wrong by a share that few would measure: then the poses are known less well."""
-        sigma = self.sigma if self.usual_sigma is None else self.usual_sigma
-        return _is_off(self.scale, sigma, SPEAKING_SIGMAS, LEAST_SHARE)
+        return _is_off(self.scale, self._usual, SPEAKING_SIGMAS, LEAST_SHARE)
+
+    @property
+    def _usual(self) -> float | None:
+        return self.sigma if self.usual_sigma is None else self.usual_sigma
 
     @property
     def untold(self) -> str:
         """What an error that the motion would not show does, in words; empty where it would show."""
-        if self.sigma is None or self.sigma < 0.5 * PRINTED or not self.moves:
+        sigma = self._usual
+        if sigma is None or sigma < 0.5 * PRINTED or not self.moves:
             return ""
         moved_mm, most = max((1e3 * PRINTED * float(np.linalg.norm(of[3:])), name) for name, of in self.moves.items())
+        of, who = ("lengths in the clouds", "cameras") if self.is_of_clouds else ("the size", "printers")
         return (
-            f"it tells the size of {self.target} to {rounded(100.0 * self.sigma)} % only, and {100.0 * PRINTED:g} %, "
-            f"as printers err, moves {most} by {rounded(moved_mm)} mm, which no standard deviation has"
+            f"the motion tells {of} of {self.target} to {rounded(100.0 * sigma)} % only, and {100.0 * PRINTED:g} %, as "
+            f"{who} err, moves {most} by {rounded(moved_mm)} mm, which no standard deviation has"
         )
+
+    def is_untold(self, refined: Refined) -> bool:
+        """Whether a usual error, which the motion would not show, moves a frame far out of what is claimed of it."""
+        known = [unknown for unknown in refined.unknowns if str(unknown) in self.moves]
+        moved = [(PRINTED * self.moves[str(of)][:, 0], refined.information(of)) for of in known]
+        return bool(self.untold) and max((float(m @ W @ m) for m, W in moved), default=0.0) > FAR_OUTSIDE
 
     def __str__(self) -> str:
         if self.sigma is None:
@@ -125,7 +138,8 @@ class TargetSize:
         if self.is_of_clouds:
             return (
                 f"lengths in the clouds of {self.target} are {_off(self.scale)} than the motion says (standard "
-                f"deviation {rounded(100.0 * self.sigma)} %): those of the camera, or of the robot's poses, are wrong"
+                f"deviation {rounded(100.0 * self.sigma)} %): those of the clouds are wrong, or those of the poses (of "
+                "the robot, or of a camera by a printed size)"
             )
         return (
             f"the stated size of {self.target} is {_off(self.scale)} than the motion says "
@@ -192,8 +206,9 @@ def sizes(
     free = summed_again(problem)
     free.scale = free_scale(problem)
     free.fixed, free.priors = dict(problem.fixed), dict(problem.priors)
-    # Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are.
-    for name in {pair.target for pair in free.pairs} & set(free.fixed):
+    # Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are, unless
+    # measurements weigh by direction.
+    for name in {pair.target for pair in free.pairs if not free.directed} & set(free.fixed):
         T = free.fixed.pop(name)
         free.priors.pop(name, None)
         free.add_prior(name, T, FIXED_M, 0.5 / FIXED_RAD**2)
@@ -223,7 +238,7 @@ def free_scale(problem: Problem) -> ScaleMode:
 
 
 def _marked(found: Sequence[TargetSize], problem: Problem) -> list[TargetSize]:
-    of_clouds = {pair.target for pair in problem.alike}
+    of_clouds = {pair.target for pair in (*problem.alike, *problem.directed)}
     return [replace(size, is_of_clouds=size.target in of_clouds) for size in found]
 
 

@@ -217,8 +217,7 @@ def doubt_stated_sizes(
         words = "; ".join(map(str, off))
         record.choose(what, "as stated, and the poses' standard deviations hold that they may be wrong", words)
     elif any(size.sigma is not None for size in found):
-        why = "".join(f"; {size.untold}" for size in found if size.untold)
-        record.choose(what, "as stated", f"the motion does not contradict them{why}")
+        record.choose(what, "as stated", "the motion does not contradict them")
     else:
         record.choose(what, "as stated", "the motion does not tell them, so a wrong size would not show")
     return found

@@ -91,6 +91,8 @@ class Ground(StrEnum):
     SHAPE_UNCERTAIN = "shape_uncertain"
     #: The stated size of a target fits the motion badly.
     SIZE_UNCERTAIN = "size_uncertain"
+    #: The motion hardly tells the stated size of a target, on which the poses rest.
+    SIZE_UNTOLD = "size_untold"
     #: A stated pose fits the measurements badly.
     POSE_UNCERTAIN = "pose_uncertain"
     #: Single images are upside down.
@@ -149,7 +151,9 @@ _MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Groun
 _NOT_DETERMINED = frozenset({Ground.NOT_UNIQUE, Ground.NO_COVARIANCE, Ground.NOT_CHECKED})
 #: What cannot be checked of an answer that is none, or is not to be used, is no question.
 _UNASKED = frozenset({Ground.NO_COVARIANCE, Ground.NOT_CHECKED})
-_OF_SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED, Ground.SIZE_UNCERTAIN})
+_OF_SIZES = frozenset({
+    Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED, Ground.SIZE_UNCERTAIN, Ground.SIZE_UNTOLD,
+})  # fmt: skip
 #: What each ground makes too, which is then no fact of its own beside it.
 _MADE_BY = {
     **dict.fromkeys(
@@ -234,6 +238,10 @@ _ADVICE = {
     Ground.SIZE_UNCERTAIN: (
         'measure the named target with a caliper, or let its size be estimated: rw.Problem(scale="per_target") or '
         "--scale per_target (in a rig file: sizes: estimate)"
+    ),
+    Ground.SIZE_UNTOLD: (
+        'measure the named target with a caliper, state what it is, and say that it is known: sizes="known" (in a rig '
+        "file: sizes: known), or measure it from other distances too"
     ),
     Ground.POSE_UNCERTAIN: (
         "measure the stated pose again, or state it as uncertain as it is: Problem.add_prior in place of Problem.fix"

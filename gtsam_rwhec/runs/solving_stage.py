@@ -334,6 +334,7 @@ def _findings(
     if is_misread and (said := Reading(in_rig_file(found.misreadings, rig)).finding) is not None:
         yield said
     dropped = SAID_BY_THE_LOG | ({Ground.MISREAD} if is_misread else set())
+    dropped |= {Ground.SIZE_UNTOLD} if rig.sizes == "known" else set()
     yield from (finding for finding in found.findings if finding.ground not in dropped)
     yield from estimated_sizes(fields.sizes, rig, with_intrinsics=bool(refined.intrinsics))
     yield from (Finding(Ground.IMAGES_BLURRED, words) for words in log.metadata.detection.blurred)
