@@ -135,12 +135,15 @@ def find_sphere(cloud: Cloud, radius_m: float | None = None, *, noise_m: float |
     bounds = (0.0, largest) if radius_m is None else (0.8 * radius_m, 1.2 * radius_m)
     best, off = _by_ransac(points, 4, _sphere_through, _off_sphere, noise, where, "sphere", bounds)
     centre, radius = best[:3], float(best[3]) if radius_m is None else radius_m
-    for _ in range(10):
-        away = points - centre
-        distance = np.linalg.norm(away, axis=1)
-        off = distance - radius
-        normal = away / np.maximum(distance, 1e-12)[:, None]
-        cosine = -(normal * points).sum(axis=1) / np.linalg.norm(points, axis=1)
+    ranges = np.linalg.norm(points, axis=1)
+    beams = points / ranges[:, None]
+    for _ in range(10):  # least squares of errors along the beams, as sensors make them
+        along = beams @ centre
+        inside = along**2 - centre @ centre + radius**2
+        expected = along - np.sqrt(np.maximum(inside, 0.0))
+        normal = (beams * expected[:, None] - centre) / radius
+        cosine = np.sqrt(np.maximum(inside, 0.0)) / radius
+        off = ranges - expected
         near = (np.abs(off) < GATE * _spread(off[cosine > GRAZING], noise)) & (cosine > 0.0)
         used = near & (cosine > GRAZING)
         if used.sum() < FEWEST_POINTS:
@@ -148,13 +151,13 @@ def find_sphere(cloud: Cloud, radius_m: float | None = None, *, noise_m: float |
                 f"{where}: no such sphere in {len(points)} points: the nearest to one has {used.sum()} points on its "
                 "side towards the sensor, away from its edge; look whether it is seen, and from near enough"
             )
-        J = -normal[used] if radius_m is not None else np.column_stack([-normal[used], -np.ones(used.sum())])
+        J = normal[used] if radius_m is not None else np.column_stack([normal[used], np.ones(used.sum())])
+        J /= cosine[used, None]
         step = -np.linalg.lstsq(J, off[used], rcond=None)[0]
         centre, radius = centre + step[:3], radius + (float(step[3]) if radius_m is None else 0.0)
         if np.abs(step).max() < 1e-4 * noise:
             break
-    off = np.linalg.norm(points[used] - centre, axis=1) - radius
-    sigma, covariance = _covariance(J, off, normal[used], points.mean(axis=0) - centre)
+    sigma, covariance = _covariance(J, off[used] + J @ step, normal[used], points.mean(axis=0) - centre)
     away = np.linalg.norm(points - centre, axis=1) - radius
     mixed = (np.abs(away) < MIXED * noise) & ~near
     return SeenSphere(
@@ -190,13 +193,15 @@ def find_plane(cloud: Cloud, *, noise_m: float | None = None) -> SeenPlane:
         used = np.abs(off) < GATE * _spread(off, noise)
         middle = points[used].mean(axis=0)
         axes = np.linalg.svd(points[used] - middle, full_matrices=False)[2]
-        normal = -axes[2] if axes[2] @ middle > 0.0 else axes[2]
+        if abs(axes[2] @ middle) < GRAZING * np.linalg.norm(middle):
+            raise CloudError(f"{where}: the beams graze the largest plane; turn it towards the sensor")
+        m = _plane_by_ranges(points[used], axes[2] / (axes[2] @ middle))
+        middle, normal = middle / (m @ middle), -m / np.linalg.norm(m)
         off = (points - middle) @ normal
         if np.array_equal(used, np.abs(off) < GATE * _spread(off, noise)):
             break
-    if -(normal @ middle) < GRAZING * np.linalg.norm(middle):
-        raise CloudError(f"{where}: the beams graze the largest plane; turn it towards the sensor")
-    R = np.stack([axes[0], np.cross(normal, axes[0]), normal], axis=1)
+    first = np.cross(axes[1], normal) / np.linalg.norm(np.cross(axes[1], normal))
+    R = np.stack([first, np.cross(normal, first), normal], axis=1)
     x, y = ((points[used] - middle) @ R[:, :2]).T
     J = np.stack([y, -x, np.ones(len(x))], axis=1)
     squares = np.stack([x**2, x * y, y**2], axis=1)
@@ -210,6 +215,19 @@ def find_plane(cloud: Cloud, *, noise_m: float | None = None) -> SeenPlane:
     sigma, covariance = _covariance(J, off[used], points[used], normal)
     mixed = (np.abs(off) < MIXED * noise) & ~used
     return SeenPlane(pose(R, middle), covariance, sigma, int(used.sum()), int(mixed.sum()))
+
+
+def _plane_by_ranges(points: Array, m: Array) -> Array:
+    """The plane m.x = 1 (3,) with the least squares of errors along the beams, as sensors make them.
+
+    Distances from the plane would turn it where beams are oblique: errors shift points along it, too.
+    """
+    ranges = np.linalg.norm(points, axis=1)
+    beams = points / ranges[:, None]
+    for _ in range(3):
+        expected = 1.0 / (beams @ m)
+        m = m + np.linalg.lstsq(-(expected[:, None] ** 2) * beams, ranges - expected, rcond=None)[0]
+    return m
 
 
 def surface_noise(points: Array) -> float:

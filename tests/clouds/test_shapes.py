@@ -13,7 +13,7 @@ from gtsam_rwhec.geometry.poses import Array
 RADIUS_M, NOISE_M, WALL_M = 0.03, 2e-4, 0.8
 
 
-def scene(rng: np.random.Generator) -> tuple[rw.clouds.Cloud, Array]:
+def scene(rng: np.random.Generator, noise_m: float = NOISE_M) -> tuple[rw.clouds.Cloud, Array]:
     """The near half of a ball before a wall, and the ball's centre."""
     centre = rng.normal((0.0, 0.0, 0.6), 0.1)
     normals = rng.normal(size=(4000, 3))
@@ -22,27 +22,30 @@ def scene(rng: np.random.Generator) -> tuple[rw.clouds.Cloud, Array]:
     ball = ball[(normals * ball).sum(axis=1) < 0.0]
     wall = np.column_stack([rng.uniform(-0.3, 0.3, (3000, 2)), np.full(3000, WALL_M)])
     points = np.concatenate([ball, wall])
-    points += rng.normal(0.0, NOISE_M, (len(points), 1)) * points / np.linalg.norm(points, axis=1, keepdims=True)
+    points += rng.normal(0.0, noise_m, (len(points), 1)) * points / np.linalg.norm(points, axis=1, keepdims=True)
     return rw.clouds.Cloud.of(points), centre
 
 
-def test_spheres_and_planes_are_as_near_to_the_truth_as_their_covariances_say() -> None:
+@pytest.mark.parametrize("noise_m", [NOISE_M, 0.003])
+def test_spheres_and_planes_are_as_near_to_the_truth_as_their_covariances_say(noise_m: float) -> None:
+    """By distances from the shape in place of errors along the beams, much noise moved and turned both."""
     free, known, plane = [], [], []
-    for seed in range(30):
-        cloud, centre = scene(np.random.default_rng(seed))
+    for seed in range(15):
+        cloud, centre = scene(np.random.default_rng(seed), noise_m)
         for squares, radius in ((free, None), (known, RADIUS_M)):
-            ball = rw.clouds.find_sphere(cloud, radius, noise_m=NOISE_M)
+            ball = rw.clouds.find_sphere(cloud, radius, noise_m=noise_m)
             error = ball.centre - centre
             squares.append(error @ np.linalg.solve(ball.covariance, error))
         assert abs(ball.radius_m - RADIUS_M) < 1e-12
-        wall = rw.clouds.find_plane(cloud, noise_m=NOISE_M)
+        corner = cloud.points[:, :2].min(axis=1) > 0.2
+        wall = rw.clouds.find_plane(cloud.selected(corner), noise_m=noise_m)
         assert wall.offset_m < 0.0
         z = wall.T_sensor_plane[:3, :3].T @ (0.0, 0.0, -1.0)
         twist = np.array([-z[1], z[0], (WALL_M - wall.point[2]) * wall.normal[2]])
         plane.append(twist @ np.linalg.solve(wall.covariance, twist))
     for squares in (free, known, plane):
         assert 1.5 < np.mean(squares) < 4.5  # chi2 with 3 degrees of freedom
-        assert np.mean(np.array(squares) < 7.81) > 0.8
+        assert np.mean(np.array(squares) < 7.81) >= 0.8
 
 
 def test_smooth_errors_of_a_surface_make_its_covariance_larger() -> None:
