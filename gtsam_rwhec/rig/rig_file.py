@@ -135,13 +135,12 @@ def _path(loc: tuple[str | int, ...]) -> KeyPath:
 def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     kind, given = fault["type"], fault["input"]
     context: dict[str, Any] = fault.get("ctx", {})
+    around = _section(path[:-1], file.data)
+    field = keys_of(around).get(str(path[-1])) if around else None
     if kind == "missing":
-        model = _section(path[:-1], file.data)
-        field = keys_of(model).get(str(path[-1])) if model else None
         return f"is missing{'' if field is None else _about(str(path[-1]), field)}"
     if kind == "extra_forbidden":
-        model = _section(path[:-1], file.data)
-        return suggestion(str(path[-1]), list(keys_of(model)) if model else [])
+        return suggestion(str(path[-1]), list(keys_of(around)) if around else [])
     if kind == "literal_error":
         section = " or a section" if path == ("noise",) else ""
         return f"{shown(given)}; give {context['expected']}{section}"
@@ -152,7 +151,7 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     if kind in ("model_type", "model_attributes_type"):
         model = _section(path, file.data)
         keys = f" with {', '.join(keys_of(model))}" if model else " with type and sizes"
-        return f"{shown(given)}; give a section{keys}"
+        return f"{shown(given)}; give a section{keys}{_such_as(str(path[-1]), field)}"
     if kind == "greater_than":
         return f"{given:g} must be above {context['gt']:g}"
     if kind in _KINDS:
@@ -163,8 +162,11 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
 def _about(key: str, field: FieldInfo) -> str:
     """What a key is, its unit, and an example."""
     unit = unit_of(key, field)
-    example = f", such as {key}: {in_yaml(field.examples[0])}" if field.examples else ""
-    return f": {field.description}{f', {unit}' if unit else ''}{example}" if field.description else ""
+    return f": {field.description}{f', {unit}' if unit else ''}{_such_as(key, field)}" if field.description else ""
+
+
+def _such_as(key: str, field: FieldInfo | None) -> str:
+    return f", such as {key}: {in_yaml(field.examples[0])}" if field and field.examples else ""
 
 
 def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:

@@ -85,7 +85,7 @@ FAULTS = [
         29,
         "targets.b.layout[0].siz: unknown key; did you mean size?",
     ),
-    ("noise: estimate", "noise:", 30, "noise: empty; give a section with rotation_deg, translation_mm, corner_px"),
+    ("noise: estimate", "noise:", 30, "corner_px, such as noise: {corner_px: 0.1}"),
     ("noise: estimate", "noise: {rotation_deg: 1}", 30, "noise: rotation_deg given; give rotation_deg and"),
     ("min_side_px: 18", "min_side_px: big", 31, "detection.min_side_px: DetectionOptions.min_side_px='big'; give a"),
     ("thin: false", "thin: no", 38, "cleaning.thin: 'no'; give true or false"),
