@@ -11,7 +11,7 @@ from gtsam_rwhec.logs import CloudRecord, DetectionRecord, ImageRecord, Intrinsi
 from gtsam_rwhec.logs.records import TAG_DETECTIONS, TF_TOPICS
 from gtsam_rwhec.logs.ros2_messages import DETECTIONS
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.runs.run_log import detections_topic, pairs_topic
+from gtsam_rwhec.runs.run_log import detections_topic, is_from_stage, pairs_topic
 
 #: The types of messages that are read, by what the rig file takes from them.
 READ = {
@@ -44,9 +44,13 @@ def check_topics(log: Log, rig: Rig) -> None:
             "intrinsics",
             "topic",
         ):  # the reader of intrinsics says what else there is
-            raise LogError(
-                f"{rig.source.place(path)}: {log.files[0].path} has no topic {topic}; it has: {log.topics_in_words()}."
-            )
+            file = log.files[0].path
+            if is_from_stage(log):
+                raise LogError(
+                    f"{file} holds the detections and no topic {topic}: run gtsam-rwhec clean {file}, or detect in the "
+                    "recording"
+                )
+            raise LogError(f"{rig.source.place(path)}: {file} has no topic {topic}; it has: {log.topics_in_words()}.")
     owners = {frame: name for name in rig.sensors for frame in (name, rig.frame_of(name))}
     for path, topic in named_topics(rig):
         frame, sensor = _frame_of(log, topic) if topic in there else "", str(path[1])

@@ -183,3 +183,14 @@ def test_the_target_of_a_detection(family: str, id_: str, name: str | None) -> N
 def test_an_id_of_two_families_is_refused_without_a_family() -> None:
     with pytest.raises(FrameError, match="could be near or far"):
         target_of(seen("", "3"), TARGETS)
+
+
+def test_a_log_of_detections_is_sent_to_the_next_stage(tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "raw.mcap", made.recording(0.5))
+    detect_log(raw, made.rig(), tmp_path / "detected.mcap")
+    text = made.rig_text(cam_0="detections: /cam_0/apriltags")
+    with (
+        open_log(tmp_path / "detected.mcap") as log,
+        pytest.raises(LogError, match=r"run gtsam-rwhec clean .*detected"),
+    ):
+        check_topics(log, parse_rig(text, "rig.yaml"))
