@@ -286,6 +286,8 @@ _SCALE = (
 
 #: So many clouds, at least so many a second, are the sweeps of a LiDAR that may move; few clouds are views of a thing.
 MANY_SWEEPS, SWEEPS_PER_S = 50, 2.0
+#: What goes farther from its first pose (m) is no arm's hand.
+BEYOND_ARMS_M = 3.0
 
 
 def is_of_sweeps(topic: Topic) -> bool:
@@ -300,12 +302,15 @@ def propose_odometries(
 ) -> tuple[str, tuple[str, ...]] | None:
     """The text of a rig file, and what was seen; None with fewer than two sensors that know how they moved.
 
-    That are topics of poses that move, and two or more of a LiDAR's ``sweeps``. `where` is the log's name, for the head
-    of the file. Poses in tf are of the robot's own tree, and are not proposed.
+    That are topics of poses that move, the ``sweeps`` of two LiDARs or more, or of one beside poses of a vehicle.
+    `where` is the log's name, for the head of the file. Other poses in tf are of the robot's own tree: not proposed.
     """
     taken: set[str] = set()
-    if len(sweeps) > 1:
-        return _of_sweeps(sweeps, where)
+    poses = list(poses)
+    driven = [of for of in poses if sweeps and of.is_moving and of.motion()[0] > BEYOND_ARMS_M]
+    if len(sweeps) > 1 or driven:
+        vehicle = max(driven, key=lambda of: of.count) if len(sweeps) == 1 else None
+        return _of_sweeps(sweeps, where, vehicle)
     found = {free_name(_name(s.topic), taken): s for s in moving_topics(poses) if is_text(s.topic)}
     if len(found) < 2:
         return None
@@ -329,19 +334,24 @@ def propose_odometries(
     return text, (*notes, f"reference: {reference} (of those with metres, most poses)")
 
 
-def _of_sweeps(sweeps: Sequence[Topic], where: str) -> tuple[str, tuple[str, ...]]:
-    """LiDARs that know their motion by their own sweeps; poses in the log are no other sensor's, as a rule."""
+def _of_sweeps(sweeps: Sequence[Topic], where: str, vehicle: PoseTopic | None) -> tuple[str, tuple[str, ...]]:
+    """LiDARs that know their motion by their own sweeps; poses beside several are no other sensor's, as a rule."""
     taken: set[str] = set()
     found = {free_name(_name(topic.name), taken): topic for topic in sweeps}
-    reference = max(found, key=lambda name: found[name].count)
+    sources = {name: OdometrySource(clouds=topic.name) for name, topic in found.items()}
+    reference, why = max(found, key=lambda name: found[name].count), "most clouds"
+    if vehicle is not None:
+        frames = (vehicle.parent, vehicle.child)
+        reference, why = free_name(vehicle.child if is_name(vehicle.child) else "vehicle", taken), "the vehicle's poses"
+        sources[reference] = OdometrySource(tf=frames) if vehicle.is_tf else OdometrySource(topic=vehicle.topic)
     more = (
         "# Each LiDAR's motion is found by registering its sweeps. A vehicle that moves in a plane does not tell\n"
         "# heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of poses may be a sensor too: {topic: /odom}.\n"
     )
     remarks: dict[KeyPath, str] = {("reference",): "TODO a guess: the sensor in whose frame you want the others"}
     notes = tuple(f"sweeps: {name}, topic {topic.name}, {topic.count} clouds" for name, topic in found.items())
-    rig = _of_odometries({name: OdometrySource(clouds=topic.name) for name, topic in found.items()}, reference)
-    return first_rig_text("log", where, rig, remarks, more), (*notes, f"reference: {reference} (most clouds)")
+    rig = _of_odometries(sources, reference)
+    return first_rig_text("log", where, rig, remarks, more), (*notes, f"reference: {reference} ({why})")
 
 
 def _of_odometries(sources: Mapping[str, OdometrySource], reference: str) -> Rig:

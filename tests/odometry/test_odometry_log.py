@@ -17,9 +17,12 @@ from scipy.spatial.transform import Rotation
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.failures import ExitStatus, exit_status
 from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.logs.records import Topic
 from gtsam_rwhec.odometry.odometry_report import odometry_page, pose_table
 from gtsam_rwhec.odometry.odometry_result import read_odometry_result, result_json
 from gtsam_rwhec.report.report_blocks import Number, Table, every
+from gtsam_rwhec.rig.log_contents import PoseTopic
+from gtsam_rwhec.rig.log_proposal import propose_odometries
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive, frame_distance
 
 #: Of each sensor: about x, y, z in degrees, and where it is on the vehicle in metres.
@@ -210,6 +213,24 @@ def test_a_first_rig_file_names_the_odometries_of_a_log(
     assert rig.reference in {"lidar_front", "lidar_rear", "lidar_roof", "wheels"}
     assert {line.key for line in rw.rig.todo_lines(text)} >= {"reference", "odometry"}
     assert sum(note.startswith("moves: ") for note in notes) == 6
+
+
+def test_one_lidar_beside_poses_of_a_vehicle_is_no_camera_on_an_arm() -> None:
+    """Its sweeps were taken for views of a thing."""
+    points = Topic("/velodyne/points", "sensor_msgs/msg/PointCloud2", "cdr", 200, 0, 20_000_000_000, "")
+    driven = PoseTopic("/tf", "odom", "base_link", is_tf=True, is_static=False)
+    for x in np.linspace(0.0, 9.0, 10):
+        driven.add(se3.pose(np.eye(3), np.array([x, 0.0, 0.0])))
+    proposed = propose_odometries([driven], "drive.mcap", [points])
+    assert proposed is not None
+    rig = rw.rig.parse_rig(proposed[0], "rig.yaml")
+    assert rig.reference == "base_link"
+    assert (rig.odometries["base_link"].odometry.tf, rig.odometries["velodyne"].odometry.clouds) == (
+        ("odom", "base_link"),
+        "/velodyne/points",
+    )
+    driven.kept = driven.kept[:2]  # within an arm's reach
+    assert propose_odometries([driven], "arm.mcap", [points]) is None
 
 
 @pytest.mark.slow
