@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import expit
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
@@ -53,8 +54,8 @@ STUDENT = 2.6
 USUAL_STUDENT = 1.15
 #: Printers and focal lengths are off by such a share, usually.
 PRINTED = 0.002
-#: Such an error must not move a frame by more than this within what is claimed: the quantile of chi2(6) at 99.9 %.
-FAR_OUTSIDE = 22.5
+#: Such an error must not move a frame out of its ellipsoid of 95 %: the quantile of chi2(6).
+OUTSIDE = 12.59
 #: Standard deviations of the priors that stand for fixed poses here, in metres and rad.
 FIXED_M, FIXED_RAD = 1e-4, 1e-4
 
@@ -110,6 +111,20 @@ class TargetSize:
         return _is_off(self.scale, self._usual, SPEAKING_SIGMAS, LEAST_SHARE)
 
     @property
+    def share_off(self) -> float:
+        """By which share it may be wrong (root mean square) where the motion tells it, or speaks against it; else 0.
+
+        Either it is exact, or off as printers err; both are as likely beforehand, and the motion weighs them (Bayes).
+        Where the motion does neither, a printer's error would be a guess: then `is_untold` judges.
+        """
+        sigma = self._usual
+        if sigma is None or sigma <= 0.0 or not (sigma < 0.5 * PRINTED or self.may_be_off):
+            return 0.0
+        off, shrunk = self.scale - 1.0, PRINTED**2 / (PRINTED**2 + sigma**2)
+        is_off = expit(0.5 * math.log(1.0 - shrunk) + 0.5 * (off / sigma) ** 2 * shrunk)
+        return float(np.sqrt(is_off * ((shrunk * off) ** 2 + shrunk * sigma**2)))
+
+    @property
     def _usual(self) -> float | None:
         return self.sigma if self.usual_sigma is None else self.usual_sigma
 
@@ -127,10 +142,10 @@ class TargetSize:
         )
 
     def is_untold(self, refined: Refined) -> bool:
-        """Whether a usual error, which the motion would not show, moves a frame far out of what is claimed of it."""
+        """Whether a usual error, which the motion would not show, moves a frame out of its ellipsoid of 95 %."""
         known = [unknown for unknown in refined.unknowns if str(unknown) in self.moves]
         moved = [(PRINTED * self.moves[str(of)][:, 0], refined.information(of)) for of in known]
-        return bool(self.untold) and max((float(m @ W @ m) for m, W in moved), default=0.0) > FAR_OUTSIDE
+        return bool(self.untold) and max((float(m @ W @ m) for m, W in moved), default=0.0) > OUTSIDE
 
     def __str__(self) -> str:
         if self.sigma is None:
@@ -291,9 +306,9 @@ def sizes_in(refined: Refined) -> list[TargetSize]:
 
 def moves_of_sizes(found: Sequence[TargetSize]) -> list[dict[str, Array]]:
     """How frames are off (6, 1) by sizes that may be off by a share that is not doubted: printers are no more exact."""
-    off = [size for size in found if size.may_be_off and not size.is_doubted]
+    off = [size for size in found if size.share_off and not size.is_doubted]
     several = {id(size.moves): size for size in off}  # targets that share a scale have one error
-    return [{name: (one.scale - 1.0) * move for name, move in one.moves.items()} for one in several.values()]
+    return [{name: one.share_off * move for name, move in one.moves.items()} for one in several.values()]
 
 
 def _moves(refined: Refined, scale: Unknown) -> dict[str, Array]:
