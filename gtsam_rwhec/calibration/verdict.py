@@ -146,8 +146,9 @@ def _rank(ground: Ground) -> int:
 
 
 _MISREAD = frozenset({Ground.MISREAD, Ground.IMPLAUSIBLE})
-#: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
-_MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
+#: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time;
+#: what a size that the motion hardly tells would move beside them is no question.
+_MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC, Ground.SIZE_UNTOLD})
 _NOT_DETERMINED = frozenset({Ground.NOT_UNIQUE, Ground.NO_COVARIANCE, Ground.NOT_CHECKED})
 #: What cannot be checked of an answer that is none, or is not to be used, is no question.
 _UNASKED = frozenset({Ground.NO_COVARIANCE, Ground.NOT_CHECKED})
@@ -172,6 +173,7 @@ _MADE_BY = {
     # How well poses are known that are not determined is no question.
     Ground.NOT_UNIQUE: _UNASKED,
     Ground.KNOWN_TO_NOTHING: _UNASKED,
+    Ground.NOISE_UNDERSTATED: frozenset({Ground.SIZE_UNTOLD}),
     **dict.fromkeys((Ground.NO_SCALE, Ground.NO_COVARIANCE), frozenset({Ground.NOT_CHECKED})),
 }
 _CALIBRATE_INTRINSICS = (
