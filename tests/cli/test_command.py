@@ -34,7 +34,7 @@ from gtsam_rwhec.simulate import Noise, general
 pytestmark = pytest.mark.usefixtures("without_figures")
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
-COMMAND = (sys.executable, "-m", "gtsam_rwhec")
+COMMAND = (str(Path(sys.executable).with_name("gtsam-rwhec")),)
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
