@@ -16,6 +16,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli import compare_results
 from gtsam_rwhec.cli.failures import ExitStatus
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 BAD_NAME = "\x1b[31mleft<script>"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,18 +38,22 @@ def errors(refined: CornersRefined, given: Cell) -> np.ndarray:
     return se3.logmap(np.array([se3.inverse(given.Y[name]) @ T.matrix() for name, T in refined.Y.items()]))
 
 
-def four(seed: int, **more: object) -> Cell:
+def four(seed: int) -> Cell:
     """Four cameras of one pinhole; a small board."""
     return cell(
-        seed, images=100, cameras=4, camera=PINHOLE, board=SMALL, stated_off=OFF, carrier=(2e-4, 1e-4), corner_px=0.03,
-        **more,  # type: ignore[arg-type]
-    )  # fmt: skip
+        seed, images=100, cameras=4, camera=PINHOLE, board=SMALL, stated_off=OFF, carrier=(2e-4, 1e-4), corner_px=0.03
+    )
+
+
+@cache
+def chosen_of_four(seed: int) -> tuple[Cell, CornersRefined, ChosenCameras]:
+    given = four(seed)
+    return given, *wide_and_chosen(given, rw.CornerOptions())
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_four_alike_pinholes_share_one_focal_length_and_their_errors_shrink(seed: int) -> None:
-    given = four(seed)
-    wide, chosen = wide_and_chosen(given, rw.CornerOptions())
+    given, wide, chosen = chosen_of_four(seed)
     assert chosen.options.shared == (("cam_0", "cam_1", "cam_2", "cam_3"),)
     assert {chosen.options.lens_of(name) for name in given.Y} <= {"focal", "focals"}
     assert chosen.options.warp_m == {}
@@ -194,7 +199,7 @@ def test_the_linear_answer_is_the_nonlinear_one() -> None:
 
 
 def test_the_blocks_are_the_whole() -> None:
-    wide, _ = wide_and_chosen(four(0), rw.CornerOptions())
+    _, wide, _ = chosen_of_four(0)
     blocks = Blocks.of(wide)
     whole = Reduced.of(wide.graph.model, wide.point).without_carriers(wide.noise)
     for way in (0, 1):
@@ -208,7 +213,7 @@ def test_blocks_of_independent_images_scatter_as_the_covariance_says() -> None:
     """Also where the images of one camera come after those of the other: each block has a part of both."""
     factors = []
     for seed in range(6):
-        _, chosen = wide_and_chosen(four(seed), rw.CornerOptions())
+        _, _, chosen = chosen_of_four(seed)
         factors += [factor for (letter, _), factor in chosen.spread.items() if letter in "xy"]
     assert np.mean(np.array(factors) > 1.0) <= 0.1
 

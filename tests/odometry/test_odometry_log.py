@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import synthetic_logs as made
+from given_commands import given
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
@@ -79,23 +78,19 @@ def at(tree: Any, pointer: str) -> Any:
     return tree
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "gtsam_rwhec", *map(str, arguments)], capture_output=True, text=True)
-
-
 @pytest.fixture(scope="module")
-def six(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, Path, subprocess.CompletedProcess[str]]:
+def six(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, Path, Any]:
     """A drive with six sensors in three dimensions, calibrated by the command."""
     folder = tmp_path_factory.mktemp("six")
     driven = drive(sensors(*MOUNTS), "3d", seconds=12.0, rate_hz=5.0, seed=5)
     log = write_log(folder / "raw.mcap", driven)
     (folder / "rig.yaml").write_text(RIG, encoding="utf-8")
-    return driven, folder, run("calibrate", log, "--rig", folder / "rig.yaml", "-o", folder / "out")
+    return driven, folder, given("calibrate", log, "--rig", folder / "rig.yaml", "-o", folder / "out")
 
 
-def test_six_odometries_through_the_command(six: tuple[Drive, Path, subprocess.CompletedProcess[str]]) -> None:
+def test_six_odometries_through_the_command(six: tuple[Drive, Path, Any]) -> None:
     driven, folder, done = six
-    assert done.returncode == ExitStatus.CERTIFIED, done.stdout + done.stderr
+    assert done.exit_code == ExitStatus.CERTIFIED, done.stdout + done.stderr
     assert done.stdout.startswith("Use these poses")
     result = read_odometry_result(folder / "out" / "result.json")
     assert result.certificate.status == "certified"
@@ -116,9 +111,7 @@ def test_six_odometries_through_the_command(six: tuple[Drive, Path, subprocess.C
     assert "Sensors in the frame of lidar_front" in (folder / "out" / "report.html").read_text(encoding="utf-8")
 
 
-def test_what_a_stage_writes_the_next_reads(
-    six: tuple[Drive, Path, subprocess.CompletedProcess[str]], tmp_path: Path
-) -> None:
+def test_what_a_stage_writes_the_next_reads(six: tuple[Drive, Path, Any], tmp_path: Path) -> None:
     _, folder, _ = six
     first = read_odometry_result(folder / "out" / "result.json")
     solved = rw.odometry.solve_odometries_into(folder / "out" / "calibration.mcap", None, tmp_path)
@@ -195,15 +188,13 @@ def test_the_reference_may_be_a_file_beside_the_log(tmp_path: Path) -> None:
     rig = "reference: lidar_front\nsensors:\n  lidar_front: {odometry: {file: front.tum}}\n"
     rig += "  lidar_rear: {odometry: {topic: /lidar_rear/odom}}\n"
     (tmp_path / "rig.yaml").write_text(rig, encoding="utf-8")
-    done = run("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
-    assert done.returncode == ExitStatus.CERTIFIED, done.stdout + done.stderr
+    done = given("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert done.exit_code == ExitStatus.CERTIFIED, done.stdout + done.stderr
     result = read_odometry_result(tmp_path / "out" / "result.json")
     assert np.linalg.norm(result.pose("lidar_rear")[:3, 3] - driven.T("lidar_front", "lidar_rear")[:3, 3]) < 0.1
 
 
-def test_a_first_rig_file_names_the_odometries_of_a_log(
-    six: tuple[Drive, Path, subprocess.CompletedProcess[str]],
-) -> None:
+def test_a_first_rig_file_names_the_odometries_of_a_log(six: tuple[Drive, Path, Any]) -> None:
     _, folder, _ = six
     with rw.logs.open_log(folder / "raw.mcap") as log:
         text, notes = rw.rig.propose_rig(log, "rig.yaml")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from given_commands import given
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
@@ -24,7 +23,8 @@ from gtsam_rwhec.runs import cloud_detections
 from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
 from gtsam_rwhec.simulate.simulated_clouds import SimulatedClouds, clouds_of_thing
 
-COMMAND = Path(sys.executable).with_name("gtsam-rwhec")
+pytestmark = pytest.mark.usefixtures("without_figures")  # but the module's own run has them
+
 VIEWS = 8
 RIG = """\
 carriers:
@@ -40,10 +40,10 @@ targets:
 
 def run(*arguments: object, status: int | tuple[int, ...] = (0, 1)) -> str:
     """What a user reads, of a command that ends with this status."""
-    done = subprocess.run([COMMAND, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=120)
+    done = given(*arguments)
     wanted = (status,) if isinstance(status, int) else status
-    assert done.returncode in wanted, done.stderr
-    return done.stdout + done.stderr
+    assert done.exit_code in wanted, done.stderr
+    return str(done.stdout + done.stderr)
 
 
 def write_poses(A: np.ndarray, path: Path) -> None:
