@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,6 +29,9 @@ from gtsam_rwhec.logs import ImageRecord
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE, TABLES, image_stamps, match, pose_stamps, read_poses
 from gtsam_rwhec.logs.pose_tables import NamedPoses, PoseStatement
 from gtsam_rwhec.logs.pose_trees import TREES
+
+if TYPE_CHECKING:
+    from gtsam_rwhec.clouds.object_views import SeenObject  # needs an extra that images do without
 
 #: Folders are searched to this depth.
 DEPTH = 4
@@ -88,6 +92,15 @@ class CloudFolder:
     path: str  #: Or pattern, from the folder that was looked at
     files: tuple[Path, ...]  #: In natural order
     unit_m: float  #: Metres of one unit, as far away as the points are
+
+
+@dataclass(frozen=True, eq=False)
+class FolderProposal:
+    """A first rig file: its text, notes, and the clouds that were registered for it, if there are any."""
+
+    text: str
+    notes: tuple[str, ...]
+    registered: SeenObject | None = None
 
 
 def is_folder_without_logs(path: Path) -> bool:

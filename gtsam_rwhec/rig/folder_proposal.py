@@ -26,7 +26,15 @@ from gtsam_rwhec.rig.carrier_roles import (
     origin_of,
     rest_of,
 )
-from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, cloud_folders, poses_read, read_folder, read_gray
+from gtsam_rwhec.rig.folder_contents import (
+    FolderPoses,
+    FolderProposal,
+    ImageFolder,
+    cloud_folders,
+    poses_read,
+    read_folder,
+    read_gray,
+)
 from gtsam_rwhec.rig.guessed_boards import STATED, guessed_intrinsics
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
 from gtsam_rwhec.rig.log_contents import ImageTopic, camera_name, free_name
@@ -61,15 +69,20 @@ def propose_folder_rig(
     RigError
         There are no images, or no poses that fit them; the message says what was looked at.
     """
-    folder, tell = Path(folder), progress or silent
+    proposal = proposal_for_folder(Path(folder), path, progress or silent)
+    return proposal.text, proposal.notes
+
+
+def proposal_for_folder(folder: Path, path: str | Path, tell: Progress) -> FolderProposal:
+    """As `propose_folder_rig`, with what calibration need not do again."""
     notes: list[str] = []
     of_clouds = cloud_folders(folder)
     if of_clouds and not read_folder(folder):
         from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig  # needs an extra that images do without
 
-        text, of_readings = propose_cloud_rig(folder, of_clouds, tell)
-        parse_rig(text, str(path))
-        return text, of_readings
+        proposal = propose_cloud_rig(folder, of_clouds, tell)
+        parse_rig(proposal.text, str(path))
+        return proposal
     notes += [f"not used: {each.path}, {len(each.files)} clouds beside images" for each in of_clouds]
     cameras = _cameras(folder, notes)
     topics = []
@@ -83,7 +96,7 @@ def propose_folder_rig(
         topics.append(topic)
     text = _text(folder, cameras, topics, notes, tell)
     parse_rig(text, str(path))
-    return text, tuple(notes)
+    return FolderProposal(text, tuple(notes))
 
 
 def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPoses]]:

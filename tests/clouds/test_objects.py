@@ -10,7 +10,6 @@ import pytest
 from robot_clouds import views_of
 from rwhec_factors import se3
 from scipy.linalg import block_diag
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
@@ -232,7 +231,7 @@ def test_a_thing_that_moved_and_stayed_is_an_error(bust: SimulatedClouds) -> Non
 
 def test_one_point_that_matches_tells_nothing() -> None:
     def features(points: np.ndarray, normals: np.ndarray) -> Features:
-        return Features(points, normals, cKDTree(points))
+        return Features(points, normals)
 
     far, z = np.array([[9.0, 9.0, 9.0]]), np.array([[0.0, 0.0, 1.0]])
     one = Surface("one", features(np.zeros((1, 3)), z), features(far, z), None, None)
