@@ -36,7 +36,6 @@ from gtsam_rwhec.rig.folder_contents import (
     LEAST_CLOUDS,
     CloudFolder,
     FolderPoses,
-    FolderProposal,
     poses_read,
     readable_cloud,
     why_not_read,
@@ -45,7 +44,7 @@ from gtsam_rwhec.rig.log_contents import camera_name, free_name
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import first_rig_text
 from gtsam_rwhec.rig.section_types import is_text
-from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import ObjectTarget
 
 #: Why clouds of other sensors are not in a proposed rig file.
@@ -89,7 +88,16 @@ class _Reading:
         return f"{words[0]}, {'mm' if said.length else 'm'}, the sensor on {CHILD if self.role == 'child' else PARENT}"
 
 
-def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> FolderProposal:
+@dataclass(frozen=True, eq=False)
+class CloudProposal:
+    """A first rig file: its text, notes, and the clouds as they were registered for it, where that settled all."""
+
+    text: str
+    notes: tuple[str, ...]
+    registered: SeenObject | None
+
+
+def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> CloudProposal:
     """A first rig file for folders of clouds with poses beside them; its notes say what was seen and chosen.
 
     Raises
@@ -110,12 +118,16 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             "qz, qw (metres)"
         )
     clouds = usable[0]
+    if clouds.size is not None and clouds.camera is None:
+        raise RigError(_no_intrinsics(folder, clouds, clouds.size))
     tell(f"trying readings of the poses in {', '.join(by_table[clouds.path])}")
     reading, words, is_sure, registered = _best(folder, clouds, by_table[clouds.path], tell)
     name = free_name("camera" if clouds.path in (".", "*") else camera_name(clouds.path, ""), {PARENT, CHILD, OBJECT})
     place = "this folder" if clouds.path == "." else clouds.path
-    notes.append(f"sensor {name}: {len(clouds.files)} clouds in {place}, poses in {reading.poses.path}")
-    if clouds.unit_m != 1.0:
+    what = "clouds" if clouds.size is None else "depth images"
+    beside = f", intrinsics in {clouds.intrinsics}" if clouds.intrinsics else ""
+    notes.append(f"sensor {name}: {len(clouds.files)} {what} in {place}, poses in {reading.poses.path}{beside}")
+    if clouds.unit_m is not None:
         notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
     notes.append(words)
     said = reading.poses.stated
@@ -131,14 +143,27 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             f". If the files have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above: no "
             "measurement tells these apart"
         )
-    unit_m = clouds.unit_m if clouds.unit_m != 1.0 else None
-    sensor = Sensor(clouds=clouds.path, poses=reading.poses.path, unit_m=unit_m)
+    stated = Intrinsics(file=clouds.intrinsics, camera=clouds.camera_name or None) if clouds.intrinsics else None
+    sensor = Sensor(clouds=clouds.path, poses=reading.poses.path, unit_m=clouds.unit_m, intrinsics=stated)
     rig = Rig(carriers=carriers, sensors={name: sensor}, targets={OBJECT: ObjectTarget(type="object")})
     remarks: dict[KeyPath, str] = {("carriers", "poses"): remark}
     remarks["targets", OBJECT] = "anything that stood still in front of the sensor"
     head = "# Paths start from that folder.\n"
     text = first_rig_text("folder", folder.resolve().name, rig, remarks, head)
-    return FolderProposal(text, tuple(notes), registered)
+    return CloudProposal(text, tuple(notes), registered)
+
+
+def _no_intrinsics(folder: Path, clouds: CloudFolder, size: tuple[int, int]) -> str:
+    """Words for depth images without intrinsics: the file that lacks, in the form of ROS."""
+    width, height = size
+    beside = clouds.files[0].parent.relative_to(folder)
+    return (
+        f"{folder}: depth images of {width} x {height} in {clouds.path}, and no file of intrinsics of this size. Write "
+        f"{(beside / 'depth.yaml').as_posix()} with the numbers of the depth camera: {{image_width: {width}, "
+        f"image_height: {height}, camera_matrix: {{rows: 3, cols: 3, data: [fx, 0, cx, 0, fy, cy, 0, 0, 1]}}, "
+        "distortion_model: plumb_bob, distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}, or put the "
+        "driver's camera_info there"
+    )
 
 
 def _near(folder: Path, clouds: CloudFolder) -> Iterator[Path]:
@@ -213,7 +238,8 @@ def _best(
     readings = list(_readings(folder, clouds, tables))
     posed = np.flatnonzero(np.isfinite(readings[0].poses.T[:, 0, 0]))
     at = posed[np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).round().astype(int))]
-    seen = {int(i): cloud for i in at if (cloud := readable_cloud(clouds.files[i], clouds.unit_m)) is not None}
+    read = partial(readable_cloud, unit_m=clouds.unit_m, camera=clouds.camera)
+    seen = {int(i): cloud for i in at if (cloud := read(clouds.files[i])) is not None}
     at = np.array(list(seen))
     readings = [reading for reading in readings if np.isfinite(reading.poses.T[at]).all()]
     named = (replace(cloud, source=clouds.files[i].relative_to(folder).as_posix()) for i, cloud in seen.items())
@@ -248,6 +274,8 @@ def _best(
         "euler, angles, length, and which frame carries the sensor; look whether the thing stood still, and whether "
         "neighbouring clouds share a third of what they see"
     )
+    if clouds.size is not None:
+        words += ", and whether one unit of the depth images is a millimetre (else state unit_m)"
     return readings[best], words, False, None
 
 

@@ -26,15 +26,7 @@ from gtsam_rwhec.rig.carrier_roles import (
     origin_of,
     rest_of,
 )
-from gtsam_rwhec.rig.folder_contents import (
-    FolderPoses,
-    FolderProposal,
-    ImageFolder,
-    cloud_folders,
-    poses_read,
-    read_folder,
-    read_gray,
-)
+from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, cloud_folders, poses_read, read_folder, read_gray
 from gtsam_rwhec.rig.guessed_boards import STATED, guessed_intrinsics
 from gtsam_rwhec.rig.guessed_targets import first_targets, take_sizes
 from gtsam_rwhec.rig.log_contents import ImageTopic, camera_name, free_name
@@ -69,12 +61,7 @@ def propose_folder_rig(
     RigError
         There are no images, or no poses that fit them; the message says what was looked at.
     """
-    proposal = proposal_for_folder(Path(folder), path, progress or silent)
-    return proposal.text, proposal.notes
-
-
-def proposal_for_folder(folder: Path, path: str | Path, tell: Progress) -> FolderProposal:
-    """As `propose_folder_rig`, with what calibration need not do again."""
+    folder, tell = Path(folder), progress or silent
     notes: list[str] = []
     of_clouds = cloud_folders(folder)
     if of_clouds and not read_folder(folder):
@@ -82,7 +69,7 @@ def proposal_for_folder(folder: Path, path: str | Path, tell: Progress) -> Folde
 
         proposal = propose_cloud_rig(folder, of_clouds, tell)
         parse_rig(proposal.text, str(path))
-        return proposal
+        return proposal.text, proposal.notes
     notes += [f"not used: {each.path}, {len(each.files)} clouds beside images" for each in of_clouds]
     cameras = _cameras(folder, notes)
     topics = []
@@ -96,7 +83,7 @@ def proposal_for_folder(folder: Path, path: str | Path, tell: Progress) -> Folde
         topics.append(topic)
     text = _text(folder, cameras, topics, notes, tell)
     parse_rig(text, str(path))
-    return FolderProposal(text, tuple(notes))
+    return text, tuple(notes)
 
 
 def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPoses]]:
@@ -105,7 +92,10 @@ def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPo
         raise RigError(f"{folder}: there is no such folder")
     found = [camera for camera in read_folder(folder) if is_text(camera.path)]
     if not found:
-        raise RigError(f"{folder}: no folder in it has two images or more that can be read")
+        raise RigError(
+            f"{folder}: no folder in it has two images or more that can be read (of depth images three, of 16 bits or "
+            "of floating point)"
+        )
     with_poses = [(camera, camera.poses) for camera in found if camera.poses is not None]
     if not with_poses:
         named = ", ".join(f"{camera.path} ({len(camera.files)} images)" for camera in found[:5])

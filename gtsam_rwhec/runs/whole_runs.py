@@ -19,7 +19,6 @@ from gtsam_rwhec.results.result_file import result_json
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, export_all
 from gtsam_rwhec.rig.folder_contents import cloud_folders, is_folder_without_logs
-from gtsam_rwhec.rig.folder_proposal import proposal_for_folder
 from gtsam_rwhec.rig.rig_file import parse_rig, todo_lines
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import cleaned
@@ -111,7 +110,7 @@ def calibrate_log(
         paths then start, or a file of samples of a hand-eye tool.
     rig : Rig or None
         None: the rig file embedded in a log that a stage wrote; or, of a folder of clouds with poses beside them, the
-        one that ``propose_folder_rig`` makes, if it leaves nothing to a person.
+        one that ``gtsam-rwhec init`` proposes, if it leaves nothing to a person.
     out
         The folder; it is made if it does not exist.
     images : "copy" or "leave_out"
@@ -179,7 +178,9 @@ def _is_folder_of_clouds(path: Path) -> bool:
 
 def _proposed(folder: Path, tell: Progress) -> tuple[Rig, SeenObject | None]:
     """The rig file that is proposed for a folder, where nothing in it is left to a person, and what was registered."""
-    proposal = proposal_for_folder(folder, folder / "rig.yaml", tell)
+    from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig  # needs an extra that images do without
+
+    proposal = propose_cloud_rig(folder, cloud_folders(folder), tell)
     for note in proposal.notes:
         tell(Remark(note))
     if todo_lines(proposal.text):
