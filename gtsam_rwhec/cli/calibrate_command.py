@@ -38,7 +38,6 @@ from gtsam_rwhec.cli.shared_options import (
     written_in,
 )
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Method = Literal["auto", "sdp", "local"]
@@ -189,7 +188,8 @@ def calibrate(
     if rig is not None or is_log(source) or is_of_clouds:
         refuse(context, NOT_FOR_A_LOG)
         described = None if rig is None else rw.rig.read_rig(rig)
-        is_of_odometries = rw.odometry.is_of_odometries(described, source)
+        # Asking needs packages that take long to load.
+        is_of_odometries = not is_of_clouds and rw.odometry.is_of_odometries(described, source)
         if is_of_odometries:
             refuse(context, NOT_FOR_ODOMETRIES)
         if output is None:
@@ -303,20 +303,6 @@ def _has_clouds(folder: Path) -> bool:
     return not set(CLOUD_FORMATS).isdisjoint(several) and bool(rw.rig.cloud_folders(folder))
 
 
-def _proposed(folder: Path, stage: StageDisplay) -> rw.rig.Rig:
-    """The rig file that ``init`` proposes for a folder of clouds, where nothing in it is left to a person."""
-    proposal = folder / "rig.yaml"
-    text, notes = rw.rig.propose_folder_rig(folder, proposal, progress=stage)
-    for note in notes:
-        say(note, to_errors=True)
-    if rw.rig.todo_lines(text):
-        raise RigError(
-            f"{shown_path(folder)}: the folder does not tell how its poses are to be read. gtsam-rwhec init "
-            f"{shown_path(folder)} -o rig.yaml writes a rig file; complete it, and give it with --rig"
-        )
-    return rw.rig.parse_rig(text, f"the rig file that was made of {folder}", folder)
-
-
 def is_log(source: Path) -> bool:
     """Whether this is a log, and not a folder of CSV files."""
     return source.suffix.lower() == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
@@ -353,8 +339,6 @@ def calibrate_log(
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
         described = None if rig is None else rw.rig.read_rig(rig)
-        if rig is None and not is_log(source):
-            described = _proposed(source, stage)
         if described is not None and rw.runs.is_file_of_samples(source, described):
             samples, on_hand = rw.runs.samples_of_rig(source, described)
             say(f"{samples.reading(on_hand)}.", to_errors=True)

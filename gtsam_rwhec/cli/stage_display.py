@@ -22,6 +22,8 @@ INTERVAL_S = 1.0
 SILENCE_S = 10.0
 #: A stage is shown with at most this many characters.
 LONGEST_STAGE = 200
+#: And a remark, of which nothing is to be lost.
+LONGEST_REMARK = 2000
 #: The length of the progress bar, characters.
 BAR = 24
 
@@ -71,7 +73,7 @@ class StageDisplay:
     def __call__(self, stage: str) -> None:
         """Show a stage that begins, or the count of the current stage; a remark gets a line that stays."""
         if isinstance(stage, Remark):
-            self._console.print(shown(stage, LONGEST_STAGE), markup=False, soft_wrap=True)
+            self._console.print(shown(stage, LONGEST_REMARK), markup=False, soft_wrap=True)
             return
         if isinstance(stage, Counted):
             if self._pace[0] != stage.what:

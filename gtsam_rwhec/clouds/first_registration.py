@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.clouds.surfaces import Surface, size_of
+from gtsam_rwhec.clouds.surfaces import Features, Surface, size_of
 from gtsam_rwhec.geometry.poses import Array
 
 #: Rotations of the sensor on its carrier that are tried: neighbours are 40 degrees apart.
@@ -102,7 +101,7 @@ class _Search:
         self.coarse = {}
         for k, faces in self.fine.items():
             few = draw.permutation(len(faces.points))[:COARSE]
-            self.coarse[k] = type(faces)(faces.points[few], faces.normals[few], cKDTree(faces.points[few]))
+            self.coarse[k] = Features(faces.points[few], faces.normals[few])
 
     def starts(self) -> Array:
         """Poses (H, 4, 4): each rotation with the translation by which the views' centres meet best."""
@@ -122,22 +121,20 @@ class _Search:
         gradient, normal = np.zeros((len(Y), 6)), np.zeros((len(Y), 6, 6))
         inverse = se3.inverse(Y)
         for points, other, motion in zip(self.pairs.points, self.pairs.others, self.pairs.motions, strict=True):
-            turning = se3.hat(points)
             T = inverse @ motion @ Y
             R = T[:, :3, :3]
-            moved = np.einsum("hij,nj->hni", R, points) + T[:, None, :3, 3]
+            moved = points @ R.transpose(0, 2, 1) + T[:, None, :3, 3]
             faces = self.fine[other] if fine else self.coarse[other]
-            distances, nearest = faces.tree.query(moved, distance_upper_bound=gate)
+            distances, at = (each.reshape(moved.shape[:2]) for each in faces.nearest(moved.reshape(-1, 3), gate))
             misfits.append((np.minimum(distances / gate, 1.0) ** 2).mean(axis=1))
             near.append(np.isfinite(distances).mean(axis=1))
-            at = np.minimum(nearest, len(faces.points) - 1)  # one past the last is none, and weighs nothing
             weights = np.maximum(1.0 - (distances / gate) ** 2, 0.0) ** 2
             normals = faces.normals[at]
             residuals = np.einsum("hni,hni->hn", normals, moved - faces.points[at])
             local = normals @ R
             # d T = T (x - Ad(T^-1) x) for Y exp(x)
             by_Y = np.eye(6) - se3.adjoint(se3.inverse(T))
-            rows = np.concatenate([np.einsum("nij,hnj->hni", turning, local), local], axis=2) @ by_Y
+            rows = np.concatenate([np.cross(points, local), local], axis=2) @ by_Y
             weighted = weights[:, :, None] * rows
             gradient += np.einsum("hni,hn->hi", weighted, residuals)
             normal += weighted.transpose(0, 2, 1) @ rows

@@ -21,6 +21,7 @@ from gtsam_rwhec.clouds.registered_views import (
     Views,
     certified_pose,
     check_agreement,
+    first_pose,
     noise_of_A,
     prepared,
     registered_in_turn,
@@ -144,10 +145,16 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     Views are registered in pairs (Segal et al. 2009, "Generalized-ICP"; small_gicp), in turn with the certified
     solution of the motions, and then all at once by points to planes and edges.
     """
-    views, out = prepared(clouds, A, options or ObjectOptions())
-    registrations, Y = registered_in_turn(views, options or ObjectOptions())
+    options = options or ObjectOptions()
+    views, few = prepared(clouds, A, options)
+    return seen_from(views, few, as_transforms(A, None, "A"), first_pose(views, options))
+
+
+def seen_from(views: Views, few: Sequence[ViewFinding], A: Array, Y: Array) -> SeenObject:
+    """As `seen_object`, of `prepared` views and those with too few points, from a pose (4, 4) that explains them."""
+    registrations, Y = registered_in_turn(views, Y)
     together = largest_group(len(views.at), registrations.i, registrations.j)
-    out += [_apart(views, int(k)) for k in np.flatnonzero(~together)]
+    out = [*few, *(_apart(views, int(k)) for k in np.flatnonzero(~together))]
     kept, place = views.selected(together), np.cumsum(together) - 1
     if len(kept.at) < FEWEST_VIEWS:
         raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
@@ -163,15 +170,14 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     B, covariances = _about(origin @ se3.pose(np.eye(3), centre), joint)
     covariances = with_common_slides(covariances)
     used = np.setdiff1d(np.arange(len(kept.at)), list(stays))
-    transforms = as_transforms(A, None, "A")
-    poses, of_poses = np.full((len(transforms), 4, 4), np.nan), np.full((len(transforms), 6, 6), np.nan)
+    poses, of_poses = np.full((len(A), 4, 4), np.nan), np.full((len(A), 6, 6), np.nan)
     poses[kept.at[used]] = B[used]
     of_poses[kept.at[used]] = covariances[used]
     return SeenObject(
-        transforms,
+        A,
         poses,
         of_poses,
-        np.isin(np.arange(len(transforms)), kept.at[used]),
+        np.isin(np.arange(len(A)), kept.at[used]),
         {each.view: each for each in sorted(out, key=lambda each: each.view)},
         registrations.renamed(views.at),
         Y,
@@ -201,8 +207,9 @@ def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None
 
     Arguments and errors as in `seen_object`, which is better where the sensor sees one thing: it registers all at once.
     """
-    views, _ = prepared(clouds, A, options or ObjectOptions())
-    registrations, Y = registered_in_turn(views, options or ObjectOptions())
+    options = options or ObjectOptions()
+    views, _ = prepared(clouds, A, options)
+    registrations, Y = registered_in_turn(views, first_pose(views, options))
     check_agreement(views, registrations, Y)
     return registrations.renamed(views.at)
 

@@ -64,23 +64,33 @@ def matches(surface: Surface, other: Surface, T_other_surface: Array, gate_m: fl
     found: list[_Arrays] = []
     first = 0
     for kind, (own, its) in enumerate(((surface.faces, other.faces), (surface.edges, other.edges))):
-        distances, nearest = its.nearest(own.points @ R.T + t, gate_m)
+        moved = own.points @ R.T + t
+        distances, nearest = its.nearest(moved, gate_m)
         at = np.flatnonzero(np.isfinite(distances))
-        normals = its.normals[nearest[at]] @ R
-        cosine = np.einsum("ij,ij->i", normals, own.normals[at])
-        alike = cosine > ALIKE if kind else np.abs(cosine) > ALIKE
-        at, normals, sign = at[alike], normals[alike], np.sign(cosine[alike])[:, None]
-        points = own.points[at]
-        both = 0.5 * (normals + sign * own.normals[at])
-        apart = points - (its.points[nearest[at]] - t) @ R
-        residuals = np.einsum("ij,ij->i", both, apart)
+        cosine = np.einsum("ij,ij->i", its.normals[nearest[at]], own.normals[at] @ R.T)
+        at = at[cosine > ALIKE if kind else np.abs(cosine) > ALIKE]
+        apart = (moved[at] - its.points[nearest[at]]) @ R
+        normals, own_normals = its.normals[nearest[at]] @ R, own.normals[at]
+        own_normals = np.where((np.einsum("ij,ij->i", normals, own_normals) < 0.0)[:, None], -own_normals, own_normals)
+        residuals = np.einsum("ij,ij->i", 0.5 * (normals + own_normals), apart)
         # Farther aside than any neighbour within a surface: the point is beyond the end of the other.
-        within = (apart**2).sum(axis=1) - residuals**2 < (ASIDE * gate_m) ** 2
-        at, normals, sign, points, residuals = (each[within] for each in (at, normals, sign, points, residuals))
-        rows, own_rows = (np.hstack([np.cross(points, n), n]) for n in (normals, sign * own.normals[at]))
+        within = np.einsum("ij,ij->i", apart, apart) - residuals**2 < (ASIDE * gate_m) ** 2
+        at, residuals = at[within], residuals[within]
+        points = own.points[at]
+        rows, own_rows = (_across(points, each[within]) for each in (normals, own_normals))
         found.append((points, residuals, rows, own_rows, np.full(len(at), kind), first + at))
         first += len(own.points)
     return _of_arrays(found, len(found[0][0]) / len(surface.faces.points))
+
+
+def _across(points: Array, normals: Array) -> Array:
+    """Derivatives (m, 6) of points across normals by a right perturbation; `np.cross` takes five times as long."""
+    rows = np.empty((len(points), 6))
+    for k in range(3):
+        one, other = (k + 1) % 3, (k + 2) % 3
+        rows[:, k] = points[:, one] * normals[:, other] - points[:, other] * normals[:, one]
+    rows[:, 3:] = normals
+    return rows
 
 
 def sigmas(several: Sequence[Matches], spacing_m: float) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, islice
 
@@ -12,7 +12,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.cloud import Cloud
-from gtsam_rwhec.clouds.first_registration import Start, first_poses
+from gtsam_rwhec.clouds.first_registration import first_poses
 from gtsam_rwhec.clouds.registration import Registrations, aligned, overlapping_pairs, registered
 from gtsam_rwhec.clouds.surfaces import (
     FEWEST_POINTS,
@@ -117,12 +117,19 @@ class Views:
         surfaces = [each for each, yes in zip(self.surfaces, mask, strict=True) if yes]
         return Views(self.at[mask], surfaces, self.A[mask], self.spacing)
 
+    def posed(self, A: PosesLike) -> Views:
+        """The same surfaces at other A of all views that were given."""
+        return replace(self, A=_checked(A)[self.at])
+
+
+def _checked(A: PosesLike) -> Array:
+    transforms = as_transforms(A, None, "A")
+    return rows_to_transforms(checked_rows(transforms, 0, "A").rows) if len(transforms) else transforms
+
 
 def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> tuple[Views, list[ViewFinding]]:
     """The surfaces of all views, and those that have too few points."""
-    transforms = as_transforms(A, None, "A")
-    if len(transforms):
-        transforms = rows_to_transforms(checked_rows(transforms, 0, "A").rows)
+    transforms = _checked(A)
     given = Cloud.each(clouds)
     first = list(islice(given, SPACED))
     spacing = Spacing(0.0, 0.0, 0.0)
@@ -159,10 +166,12 @@ def _check_different(surfaces: Sequence[Surface], A: Array) -> None:
         )
 
 
-def registered_in_turn(views: Views, options: ObjectOptions) -> tuple[Registrations, Array]:
-    """Registrations of pairs and the certified pose of the sensor on its carrier, in turn until both are still."""
+def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
+    """Registrations of pairs and the certified pose of the sensor on its carrier, in turn until both are still.
+
+    ``Y`` (4, 4) is the pose from which they start.
+    """
     spacing = views.spacing.faces_m
-    Y = _first(views, options).T_sensorcarrier_sensor
     i, j = overlapping_pairs(views.surfaces, se3.inverse(views.A) @ Y, GATE * spacing)
     starts: Array = np.zeros((0, 4, 4))
     for _ in range(ROUNDS):
@@ -228,8 +237,8 @@ def _by_motions(pairs: Registrations, of_A: Array) -> tuple[Array, bool]:
     return np.asarray(solution.Y[SENSOR].matrix()), solution.certificate.status is Status.CERTIFIED
 
 
-def _first(views: Views, options: ObjectOptions) -> Start:
-    """The one start that explains the clouds; a CloudError if there are none or several."""
+def first_pose(views: Views, options: ObjectOptions) -> Array:
+    """The one pose (4, 4) of the sensor that explains the clouds; a CloudError if there are none or several."""
     guess = None if options.start is None else one_transform(options.start, "ObjectOptions.start")
     spacing = views.spacing.faces_m
     found = first_poses(views.surfaces, views.A, spacing, guess)
@@ -246,7 +255,7 @@ def _first(views: Views, options: ObjectOptions) -> Start:
             "thing looks the same from several sides. State roughly where the sensor is (ObjectOptions.start), or take "
             "a thing without symmetry"
         )
-    return found[0]
+    return found[0].T_sensorcarrier_sensor
 
 
 def _unexplained(views: Views, misfit: float) -> str:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.files.optional_packages import extra_named
@@ -57,12 +57,36 @@ class Features:
 
     points: Array
     normals: Array
-    tree: cKDTree
+
+    @cached_property
+    def _tree(self) -> Any:
+        return tree_of(self.points)
+
+    @cached_property
+    def _ends(self) -> tuple[Array, Array]:
+        return self.points.min(axis=0), self.points.max(axis=0)
 
     def nearest(self, points: Array, gate_m: float = np.inf) -> tuple[Array, np.ndarray]:
         """Distances (m,) of points (m, 3) to the nearest here, infinite beyond the gate, and the places of these."""
-        distances, places = self.tree.query(points, distance_upper_bound=gate_m)
-        return np.asarray(distances), np.asarray(places)
+        distances, places = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
+        if len(self.points):
+            # What is far from all is slow to search.
+            low, high = self._ends
+            at = np.flatnonzero(((points > low - gate_m) & (points < high + gate_m)).all(axis=1))
+            found, its = neighbours_in(self._tree, points[at], 1)
+            distances[at], places[at] = np.where(found < gate_m, found, np.inf)[:, 0], its[:, 0]
+        return distances, places
+
+
+def tree_of(points: Array) -> Any:
+    """The tree of points (n, 3), n > 0, in which `neighbours_in` searches: in less than half of scipy's time."""
+    return small_gicp.KdTree(small_gicp.PointCloud(points))
+
+
+def neighbours_in(tree: Any, points: Array, count: int) -> tuple[Array, np.ndarray]:
+    """Distances (m, count) of points (m, 3) to their neighbours in a tree, the nearest first, and their places."""
+    places, squares = tree.batch_knn_search(points, count)
+    return np.sqrt(squares), np.asarray(places, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -122,7 +146,7 @@ def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
         points = _reachable(every)
         few = points[:: max(1, len(points) // SAMPLED)]
         points = points[:: max(1, len(points) // DENSE)]
-        own.append(float(np.median(np.asarray(cKDTree(points).query(few, 2)[0])[:, 1])))
+        own.append(float(np.median(neighbours_in(tree_of(points), few, 2)[0][:, 1])))
         noise.append(float(np.median(_along_rays(points, np.linspace(0, len(points) - 1, PROBES).astype(int))[1])))
         spacing = THINNED * own[-1]
         for _ in range(10):
@@ -144,7 +168,7 @@ def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
         given = np.where((off_m < ON_A_PLANE * np.median(off_m))[:, None], smooth, given)
     native, tree = small_gicp.preprocess_points(given, spacing.faces_m, NEIGHBOURS)
     points = native.points()[:, :3]
-    faces = Features(points, native.normals()[:, :3], cKDTree(points))
+    faces = Features(points, native.normals()[:, :3])
     return Surface(name, faces, _edges(given, spacing.edges_m, faces), native, tree)
 
 
@@ -160,7 +184,7 @@ def _along_rays(points: Array, at: np.ndarray) -> tuple[Array, Array]:
     (m,) of ranges from these planes, m."""
     lengths = np.linalg.norm(points, axis=1)
     rays = points / lengths[:, None]
-    near = cKDTree(rays).query(rays[at], min(RAYS, len(points)))[1].reshape(len(at), -1)
+    near = neighbours_in(tree_of(rays), rays[at], min(RAYS, len(points)))[1]
     # Differences of rays lie across the ray, so one slope of three is none, and rays of a scanned line leave one.
     slopes = rays[near] - rays[at, None]
     slopes /= np.linalg.norm(slopes, axis=2).max(axis=1)[:, None, None] + np.finfo(float).tiny
@@ -180,7 +204,7 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     if spacing_m > 0.0:
         fine = small_gicp.voxelgrid_sampling(fine, spacing_m)
     points = np.asarray(fine.points()[:, :3])
-    neighbours = np.asarray(small_gicp.KdTree(fine).batch_knn_search(points, AROUND + 1)[0], dtype=np.int64)[:, 1:]
+    neighbours = neighbours_in(small_gicp.KdTree(fine), points, AROUND + 1)[1][:, 1:]
     # Around a point within a surface its neighbours' offsets sum to little.
     lop = np.linalg.norm(points[neighbours].mean(axis=1) - points, axis=1)
     at = np.flatnonzero(lop > LOPSIDED * np.linalg.norm(points[neighbours[:, -1]] - points, axis=1))
@@ -196,7 +220,7 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     on = (gaps.max(axis=1) > FREE_ANGLE) & facing
     inwards = x.mean(axis=1)[on, None] * first[on] + y.mean(axis=1)[on, None] * second[on]
     outwards = -inwards / np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-12)
-    return Features(points[on], outwards, cKDTree(points[on]))
+    return Features(points[on], outwards)
 
 
 def without_border(surfaces: Sequence[Surface], spacing_m: float) -> list[Surface]:
@@ -217,6 +241,5 @@ def without_border(surfaces: Sequence[Surface], spacing_m: float) -> list[Surfac
         points = each.edges.points
         inside = np.minimum(points[:, :2] / points[:, 2:] - low, high - points[:, :2] / points[:, 2:]).min(axis=1)
         kept = inside * points[:, 2] > spacing_m
-        edges = Features(points[kept], each.edges.normals[kept], cKDTree(points[kept]))
-        result.append(replace(each, edges=edges))
+        result.append(replace(each, edges=Features(points[kept], each.edges.normals[kept])))
     return result

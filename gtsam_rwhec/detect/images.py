@@ -219,6 +219,22 @@ def decode_depth(image: ImageRecord, size: Size) -> NDArray[Any]:
     return depth
 
 
+#: Where nothing is seen depths are 0 or nan, as is at least this share of an image that is not named after depth.
+UNSEEN = 0.01
+
+
+def has_depths(image: ImageRecord, *, is_named: bool) -> bool:
+    """Whether an image of a file has depths: more than 8 bits, and its name says so, or some pixels see nothing."""
+    size = stated_size(image.data)
+    if size is None or bytes_a_pixel(image.data) != _WIDE:
+        return False
+    try:
+        depth = decode_depth(image, size)
+    except ImageError:
+        return False
+    return is_named or float(((depth == 0) | (depth != depth)).mean()) > UNSEEN
+
+
 def decode_small(image: ImageRecord, width: int) -> Gray:
     """Pixels, 8 bits, of a small picture of so many columns; a JPEG is decoded at a part of its size, which is faster.
 

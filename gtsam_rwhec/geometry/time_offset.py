@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.ndimage import median_filter
 from scipy.special import stdtrit
 
 from gtsam_rwhec.errors import StampError
@@ -161,6 +160,8 @@ class RotationProblem:
         """Detections that are not gross errors; where residuals drift, those near their neighbours' median."""
         off = at.r
         if drifts:
+            from scipy.ndimage import median_filter  # slow to import, and few logs need it
+
             off = at.r.copy()
             for k in range(int(self.track.max()) + 1):
                 own = np.flatnonzero(at.known & (self.track == k))

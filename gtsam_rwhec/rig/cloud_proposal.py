@@ -12,11 +12,11 @@ from typing import Literal
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.calibration.trial_fits import Spread, fitted
+from gtsam_rwhec.calibration.trial_fits import ROUNDS, Spread, fitted
 from gtsam_rwhec.clouds.first_registration import first_poses
 from gtsam_rwhec.clouds.named_fields import cloud_of_record
-from gtsam_rwhec.clouds.object_views import seen_object
-from gtsam_rwhec.clouds.registered_views import ObjectOptions
+from gtsam_rwhec.clouds.object_views import SeenObject, seen_from
+from gtsam_rwhec.clouds.registered_views import ObjectOptions, prepared
 from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, RigError
 from gtsam_rwhec.files.progress import Progress
@@ -44,7 +44,7 @@ from gtsam_rwhec.rig.log_contents import camera_name, free_name
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import first_rig_text
 from gtsam_rwhec.rig.section_types import is_text
-from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import ObjectTarget
 
 #: Why clouds of other sensors are not in a proposed rig file.
@@ -53,6 +53,8 @@ ONE_SENSOR = "a rig file calibrates the clouds of one sensor, as each gives the 
 LOOKED_AT = 12
 #: A reading lets clouds agree if their points are nearer to each other than this share of the gate's square.
 AGREES = 0.45
+#: So many of the best readings after one round of weights are fitted with all rounds.
+FITTED_WELL = 4
 #: Another reading explains the registered clouds as well if its residuals' product is below this many times the best.
 AS_WELL = 2.0
 #: Names for the frames of a folder's poses; files do not name them.
@@ -86,8 +88,17 @@ class _Reading:
         return f"{words[0]}, {'mm' if said.length else 'm'}, the sensor on {CHILD if self.role == 'child' else PARENT}"
 
 
-def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> tuple[str, tuple[str, ...]]:
-    """The text of a first rig file for folders of clouds with poses beside them, and notes: what was seen and chosen.
+@dataclass(frozen=True, eq=False)
+class CloudProposal:
+    """A first rig file: its text, notes, and the clouds as they were registered for it, where that settled all."""
+
+    text: str
+    notes: tuple[str, ...]
+    registered: SeenObject | None
+
+
+def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> CloudProposal:
+    """A first rig file for folders of clouds with poses beside them; its notes say what was seen and chosen.
 
     Raises
     ------
@@ -107,12 +118,16 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             "qz, qw (metres)"
         )
     clouds = usable[0]
+    if clouds.size is not None and clouds.camera is None:
+        raise RigError(_no_intrinsics(folder, clouds, clouds.size))
     tell(f"trying readings of the poses in {', '.join(by_table[clouds.path])}")
-    reading, words, is_sure = _best(folder, clouds, by_table[clouds.path], tell)
+    reading, words, is_sure, registered = _best(folder, clouds, by_table[clouds.path], tell)
     name = free_name("camera" if clouds.path in (".", "*") else camera_name(clouds.path, ""), {PARENT, CHILD, OBJECT})
     place = "this folder" if clouds.path == "." else clouds.path
-    notes.append(f"sensor {name}: {len(clouds.files)} clouds in {place}, poses in {reading.poses.path}")
-    if clouds.unit_m != 1.0:
+    what = "clouds" if clouds.size is None else "depth images"
+    beside = f", intrinsics in {clouds.intrinsics}" if clouds.intrinsics else ""
+    notes.append(f"sensor {name}: {len(clouds.files)} {what} in {place}, poses in {reading.poses.path}{beside}")
+    if clouds.unit_m is not None:
         notes.append(f"the points of {clouds.path} are more than {FAR_UNITS:g} units away: millimetres")
     notes.append(words)
     said = reading.poses.stated
@@ -128,13 +143,27 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
             f". If the files have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above: no "
             "measurement tells these apart"
         )
-    unit_m = clouds.unit_m if clouds.unit_m != 1.0 else None
-    sensor = Sensor(clouds=clouds.path, poses=reading.poses.path, unit_m=unit_m)
+    stated = Intrinsics(file=clouds.intrinsics, camera=clouds.camera_name or None) if clouds.intrinsics else None
+    sensor = Sensor(clouds=clouds.path, poses=reading.poses.path, unit_m=clouds.unit_m, intrinsics=stated)
     rig = Rig(carriers=carriers, sensors={name: sensor}, targets={OBJECT: ObjectTarget(type="object")})
     remarks: dict[KeyPath, str] = {("carriers", "poses"): remark}
     remarks["targets", OBJECT] = "anything that stood still in front of the sensor"
     head = "# Paths start from that folder.\n"
-    return first_rig_text("folder", folder.resolve().name, rig, remarks, head), tuple(notes)
+    text = first_rig_text("folder", folder.resolve().name, rig, remarks, head)
+    return CloudProposal(text, tuple(notes), registered)
+
+
+def _no_intrinsics(folder: Path, clouds: CloudFolder, size: tuple[int, int]) -> str:
+    """Words for depth images without intrinsics: the file that lacks, in the form of ROS."""
+    width, height = size
+    beside = clouds.files[0].parent.relative_to(folder)
+    return (
+        f"{folder}: depth images of {width} x {height} in {clouds.path}, and no file of intrinsics of this size. Write "
+        f"{(beside / 'depth.yaml').as_posix()} with the numbers of the depth camera: {{image_width: {width}, "
+        f"image_height: {height}, camera_matrix: {{rows: 3, cols: 3, data: [fx, 0, cx, 0, fy, cy, 0, 0, 1]}}, "
+        "distortion_model: plumb_bob, distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}, or put the "
+        "driver's camera_info there"
+    )
 
 
 def _near(folder: Path, clouds: CloudFolder) -> Iterator[Path]:
@@ -198,8 +227,10 @@ def _readings(folder: Path, clouds: CloudFolder, tables: Sequence[str]) -> Itera
         yield from (_Reading(poses, role) for poses in different)
 
 
-def _best(folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progress) -> tuple[_Reading, str, bool]:
-    """The reading that lets the clouds agree, with words, and whether it is sure.
+def _best(
+    folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progress
+) -> tuple[_Reading, str, bool, SeenObject | None]:
+    """The reading that lets the clouds agree, with words, whether it is sure, and the clouds registered under it.
 
     A start is searched for under one reading after the other, until one explains the clouds. With it they are
     registered, and all readings are compared by how they explain the registrations.
@@ -207,39 +238,45 @@ def _best(folder: Path, clouds: CloudFolder, tables: Sequence[str], tell: Progre
     readings = list(_readings(folder, clouds, tables))
     posed = np.flatnonzero(np.isfinite(readings[0].poses.T[:, 0, 0]))
     at = posed[np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).round().astype(int))]
-    seen = {int(i): cloud for i in at if (cloud := readable_cloud(clouds.files[i], clouds.unit_m)) is not None}
+    read = partial(readable_cloud, unit_m=clouds.unit_m, camera=clouds.camera)
+    seen = {int(i): cloud for i in at if (cloud := read(clouds.files[i])) is not None}
     at = np.array(list(seen))
-    spacing = spacing_of([cloud.points for cloud in seen.values()], len(seen))
-    surfaces = [surface_of(cloud, clouds.files[i].name, spacing) for i, cloud in seen.items()]
+    readings = [reading for reading in readings if np.isfinite(reading.poses.T[at]).all()]
+    named = (replace(cloud, source=clouds.files[i].relative_to(folder).as_posix()) for i, cloud in seen.items())
+    views, few = prepared(named, readings[0].A[at], ObjectOptions())
     misfits = []
     for number, reading in enumerate(readings, start=1):
         tell(f"reading the poses as {reading} ({number} of {len(readings)})")
-        start = first_poses(surfaces, reading.A[at], spacing.faces_m)[0]
+        under = views.posed(reading.A[at])
+        start, *others = first_poses(under.surfaces, under.A, under.spacing.faces_m)
         misfits.append(start.misfit)
         if start.misfit > AGREES:
             continue
-        registered = seen_object(seen.values(), reading.A[at], ObjectOptions(start=start.T_sensorcarrier_sensor))
+        registered = seen_from(under, few, reading.A[at], start.T_sensorcarrier_sensor)
         used = registered.used
-        residuals = [_residual(other.A[at][used], registered.T_sensor_object[used]) for other in readings]
-        products = np.array([spread.rotation_rad * spread.translation_m for spread in residuals])
-        best = int(np.argmin(products))
-        others = np.delete(products, best)
+        residuals = [_residual(other.A[at][used], registered.T_sensor_object[used], 1) for other in readings]
+        for k in sorted(range(len(readings)), key=lambda k: _product(residuals[k]))[:FITTED_WELL]:
+            residuals[k] = _residual(readings[k].A[at][used], registered.T_sensor_object[used])
+        best, *next_best = sorted(range(len(readings)), key=lambda k: _product(residuals[k]))
+        kept = None if others or readings[best] is not reading else registered
         words = (
             f"of {len(readings)} readings of the poses, {readings[best]}, lets the clouds agree: "
             f"{_figures(residuals[best])}"
         )
-        if not len(others):
-            return readings[best], words, True
-        second = int(np.argsort(products)[1])
+        if not next_best:
+            return reading, words, True, kept
+        second = next_best[0]
         words += f" (the next, {readings[second]}: {_figures(residuals[second])})"
-        return readings[best], words, bool(others.min() > AS_WELL * products[best])
+        return readings[best], words, _product(residuals[second]) > AS_WELL * _product(residuals[best]), kept
     best = int(np.argmin(misfits))
     words = (
         f"none of {len(readings)} readings of the poses lets the clouds agree; {readings[best]} is a guess. State "
         "euler, angles, length, and which frame carries the sensor; look whether the thing stood still, and whether "
         "neighbouring clouds share a third of what they see"
     )
-    return readings[best], words, False
+    if clouds.size is not None:
+        words += ", and whether one unit of the depth images is a millimetre (else state unit_m)"
+    return readings[best], words, False, None
 
 
 @dataclass(frozen=True)
@@ -282,10 +319,14 @@ def evidence_of_clouds(log: Log, topic: Topic, path: Trajectory, parent: str, ch
     return CloudEvidence(role, unit_m, {child: child_misfit, parent: parent_misfit})
 
 
-def _residual(A: Array, B: Array) -> Spread:
+def _residual(A: Array, B: Array, rounds: int = ROUNDS) -> Spread:
     """The residuals of a robust fit of registered clouds under a reading; infinite without an answer."""
-    fit = fitted(Problem(), {Pair(OBJECT, "sensor"): (A, B)})
+    fit = fitted(Problem(), {Pair(OBJECT, "sensor"): (A, B)}, rounds=rounds)
     return Spread(np.inf, np.inf) if fit is None else fit.residual
+
+
+def _product(spread: Spread) -> float:
+    return spread.rotation_rad * spread.translation_m
 
 
 def _figures(spread: Spread) -> str:

@@ -19,7 +19,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_files import read_cameras
 from gtsam_rwhec.clouds.cloud import CLOUD_FORMATS, Cloud
 from gtsam_rwhec.clouds.cloud_files import read_cloud
-from gtsam_rwhec.detect.images import Gray, decode_gray
+from gtsam_rwhec.detect.images import Gray, decode_gray, has_depths, stated_size
 from gtsam_rwhec.errors import CameraError, CloudError, FileFormatError, ImageError, LogError
 from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.files.whole_files import read_whole
@@ -33,8 +33,9 @@ from gtsam_rwhec.logs.pose_trees import TREES
 DEPTH = 4
 #: A folder of images has at least this number.
 LEAST_IMAGES = 2
-#: Endings of files that are clouds and nothing else.
+#: Endings of files that are clouds and nothing else, and of images that may be depths.
 ENDINGS = tuple(ending for ending in CLOUD_FORMATS if ending not in FORMATS)
+DEPTHS = tuple(ending for ending in CLOUD_FORMATS if ending in FORMATS)
 #: A folder of clouds has at least this number.
 LEAST_CLOUDS = 3
 #: Clouds of which the median point is farther away than this many units are in millimetres.
@@ -87,7 +88,11 @@ class CloudFolder:
 
     path: str  #: Or pattern, from the folder that was looked at
     files: tuple[Path, ...]  #: In natural order
-    unit_m: float  #: Metres of one unit, as far away as the points are
+    unit_m: float | None  #: Metres of one unit, as far away as the points are; None: as such files have it
+    size: tuple[int, int] | None = None  #: (int, int): Width and height of depth images, pixels
+    intrinsics: str = ""  #: Of depth images, as those of an `ImageFolder`
+    camera_name: str = ""
+    camera: Camera | None = None
 
 
 def is_folder_without_logs(path: Path) -> bool:
@@ -116,10 +121,34 @@ def read_folder(folder: Path) -> list[ImageFolder]:
 def read_gray(file: Path) -> Gray | None:
     """The pixels of an image; None if it cannot be read."""
     try:
-        data = read_whole(file, LARGEST_IMAGE, "An image was")
-        return decode_gray(ImageRecord(0, 0, "", "", FORMATS[file.suffix.lower()], data, None, None, None))
+        return decode_gray(_image(file))
     except (FileFormatError, ImageError):
         return None
+
+
+def _image(file: Path) -> ImageRecord:
+    data = read_whole(file, LARGEST_IMAGE, "An image was")
+    return ImageRecord(0, 0, "", "", FORMATS[file.suffix.lower()], data, None, None, None)
+
+
+def _depth_images(place: Path, names: Iterable[str]) -> tuple[list[str], str]:
+    """Those of a folder's images that are depths, in natural order, and a pattern for them.
+
+    Beside images in colour they are named so; their first image decides.
+    """
+    images = sorted((name for name in names if name.lower().endswith(DEPTHS)), key=natural_key)
+    named = [name for name in images if "depth" in name.lower()]
+    if not images:
+        return [], ""
+    first = Path((named or images)[0])
+    alike = [name for name in named or images if Path(name).suffix == first.suffix]
+    at = first.name.lower().find("depth")
+    word = f"{first.name[at : at + len('depth')]}*" if named else ""
+    try:
+        is_depth = has_depths(_image(place / first), is_named=bool(named) or "depth" in place.name.lower())
+    except FileFormatError:
+        is_depth = False
+    return (alike, f"*{word}{first.suffix}") if is_depth else ([], "")
 
 
 def _image_folders(folder: Path) -> Iterator[Path]:
@@ -127,6 +156,7 @@ def _image_folders(folder: Path) -> Iterator[Path]:
         depth = len(Path(place).relative_to(folder).parts)
         below[:] = [] if depth >= DEPTH else [name for name in below if not name.startswith(".")]
         images = [name for name in names if Path(name).suffix.lower() in FORMATS]
+        images = sorted(set(images) - set(_depth_images(Path(place), images)[0]))
         if len(images) >= LEAST_IMAGES and "depth" not in Path(place).name.lower():
             yield Path(place)
 
@@ -239,20 +269,28 @@ def cloud_folders(folder: Path) -> list[CloudFolder]:
     for place, below, names in os.walk(folder):
         inside = Path(place).relative_to(folder)
         below[:] = [] if len(inside.parts) >= DEPTH else [name for name in below if not name.startswith(".")]
-        for ending in ENDINGS:
-            of_ending = sorted((name for name in names if name.lower().endswith(ending)), key=natural_key)
-            if len(of_ending) >= LEAST_CLOUDS and (cloud := readable_cloud(Path(place) / of_ending[0])) is not None:
+        by_pattern = {f"*{ending}": [name for name in names if name.lower().endswith(ending)] for ending in ENDINGS}
+        depths, of_depths = _depth_images(Path(place), names)
+        for pattern, alike in {**by_pattern, of_depths: depths}.items():
+            files = tuple(Path(place) / name for name in sorted(alike, key=natural_key))
+            several = any(Path(name).suffix.lower() in CLOUD_FORMATS for name in names if name not in alike)
+            path = (inside / pattern if several else inside).as_posix()
+            if len(files) < LEAST_CLOUDS:
+                continue
+            if pattern == of_depths:
+                size = stated_size(_image(files[0]).data)
+                assert size is not None
+                intrinsics = _intrinsics(folder, Path(place), size, list(_image_folders(folder)))
+                found.append(CloudFolder(path, files, None, size, *intrinsics))
+            elif (cloud := readable_cloud(files[0])) is not None:
                 is_far = float(np.median(np.linalg.norm(cloud.points, axis=1))) > FAR_UNITS
-                files = tuple(Path(place) / name for name in of_ending)
-                several = any(Path(name).suffix.lower() in CLOUD_FORMATS for name in names if name not in of_ending)
-                path = inside.as_posix() if not several else (inside / f"*{ending}").as_posix()
-                found.append(CloudFolder(path, files, 1e-3 if is_far else 1.0))
+                found.append(CloudFolder(path, files, 1e-3 if is_far else None))
     return sorted(found, key=lambda each: natural_key(each.path))
 
 
-def readable_cloud(file: Path, unit_m: float = 1.0) -> Cloud | None:
+def readable_cloud(file: Path, unit_m: float | None = None, camera: Camera | None = None) -> Cloud | None:
     """The cloud of a file, with points in metres; None if it cannot be read."""
     try:
-        return read_cloud(file, unit_m=unit_m)
+        return read_cloud(file, unit_m=unit_m, camera=camera)
     except (CloudError, FileFormatError):
         return None

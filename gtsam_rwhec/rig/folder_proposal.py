@@ -67,9 +67,9 @@ def propose_folder_rig(
     if of_clouds and not read_folder(folder):
         from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig  # needs an extra that images do without
 
-        text, of_readings = propose_cloud_rig(folder, of_clouds, tell)
-        parse_rig(text, str(path))
-        return text, of_readings
+        proposal = propose_cloud_rig(folder, of_clouds, tell)
+        parse_rig(proposal.text, str(path))
+        return proposal.text, proposal.notes
     notes += [f"not used: {each.path}, {len(each.files)} clouds beside images" for each in of_clouds]
     cameras = _cameras(folder, notes)
     topics = []
@@ -92,7 +92,10 @@ def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPo
         raise RigError(f"{folder}: there is no such folder")
     found = [camera for camera in read_folder(folder) if is_text(camera.path)]
     if not found:
-        raise RigError(f"{folder}: no folder in it has two images or more that can be read")
+        raise RigError(
+            f"{folder}: no folder in it has two images or more that can be read (of depth images three, of 16 bits or "
+            "of floating point)"
+        )
     with_poses = [(camera, camera.poses) for camera in found if camera.poses is not None]
     if not with_poses:
         named = ", ".join(f"{camera.path} ({len(camera.files)} images)" for camera in found[:5])

@@ -31,6 +31,8 @@ from gtsam_rwhec.runs.sensor_detections import SensorDetections, message_count
 
 #: Points of a view that are kept, for people who look at the log and for the report.
 KEPT_POINTS = 2000
+#: Poses are the same if their matrices differ by no more than files and messages round, rad and m.
+SAME = 1e-9
 #: Two clouds slide along a direction that has less than this share of the information of the best known one.
 NOTHING = 1e-9
 
@@ -88,8 +90,11 @@ def detect_in_clouds(
     *,
     progress: Progress,
     kept: KeptDetections | None = None,
+    registered: SeenObject | None = None,
 ) -> CloudDetections:
     """Register the clouds of a sensor; what `kept` has of the same clouds and poses is not registered again.
+
+    Nor is `registered`, which is of clouds of this log, if it is of as many at the same poses.
 
     Raises
     ------
@@ -126,9 +131,11 @@ def detect_in_clouds(
     inputs = hashlib.sha256(stamps.tobytes() + A.tobytes()).hexdigest()
     found = None if kept is None else kept.known_object(sensor, inputs)
     if found is None:
-        progress(f"registering {int(known.sum())} clouds of {sensor}")
         wanted = dict.fromkeys(stamps[known].tolist())
-        seen = seen_object(_once(source, wanted), A[known])
+        seen = registered
+        if seen is None or len(seen.A) != len(wanted) or not np.allclose(seen.A, A[known], rtol=0.0, atol=SAME):
+            progress(f"registering {len(wanted)} clouds of {sensor}")
+            seen = seen_object(_once(source, wanted), A[known])
         found = (
             _records(seen, detections_topic(sensor), frame, target, list(wanted)),
             _report(seen, target, sensor, [source.name(stamp) for stamp in wanted]),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError, OptionError
@@ -33,6 +34,9 @@ from gtsam_rwhec.runs.sensor_intrinsics import (
 )
 from gtsam_rwhec.runs.topics_of_rig import check_topics
 from gtsam_rwhec.runs.unread_targets import blurred_images, likely_causes, no_detections
+
+if TYPE_CHECKING:
+    from gtsam_rwhec.clouds.object_views import SeenObject  # needs an extra that images do without
 
 
 def check_image_options(
@@ -122,10 +126,12 @@ def detected(
     draw: str | Path | None = None,
     progress: Progress | None = None,
     keep: Callable[[Mapping[str, Camera]], KeptOfLog] | None = None,
+    registered: SeenObject | None = None,
 ) -> RunLog:
     """The log with the detections, as `detect_log` writes it.
 
     `keep` is called with the cameras before anything is written. It returns what keeps the detections so far.
+    `registered` is what `detect_in_clouds` need not do again.
     """
     tell = progress or silent
     check_topics(log, rig)
@@ -144,16 +150,18 @@ def detected(
     for sensor, source in rig.sensors.items():
         if source.detections is not None:
             found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
-    registered = {}
+    in_clouds = {}
     for sensor in (name for name, source in rig.sensors.items() if source.clouds is not None):
         from gtsam_rwhec.runs.cloud_detections import detect_in_clouds  # needs an extra that images do without
 
         in_file = kept if isinstance(kept, KeptDetections) else None  # a session in memory has no clouds
         camera = cameras.pop(sensor, None)
-        registered[sensor] = detect_in_clouds(log, rig, sensor, camera, motion, progress=tell, kept=in_file)
-    found |= {sensor: of_clouds.seen for sensor, of_clouds in registered.items()}
+        in_clouds[sensor] = detect_in_clouds(
+            log, rig, sensor, camera, motion, progress=tell, kept=in_file, registered=registered
+        )
+    found |= {sensor: of_clouds.seen for sensor, of_clouds in in_clouds.items()}
     report = detection_report(log, rig, found)
-    report = report.model_copy(update={"objects": tuple(of_clouds.report for of_clouds in registered.values())})
+    report = report.model_copy(update={"objects": tuple(of_clouds.report for of_clouds in in_clouds.values())})
     has_sheet = False
     if sheet is not None:
         tell("drawing the contact sheet")
@@ -170,7 +178,7 @@ def detected(
         raise LogError(f"{no_detections(log, report)}{shown}")
     stages = LogMetadata(rig, cameras, report, image_names=image_names(log))
     records = {sensor: of.records for sensor, of in found.items()}
-    others: list[Sequence[CloudRecord] | Sequence[PoseRecord]] = [of_clouds.clouds for of_clouds in registered.values()]
+    others: list[Sequence[CloudRecord] | Sequence[PoseRecord]] = [of_clouds.clouds for of_clouds in in_clouds.values()]
     others += moving.values()
     return RunLog.with_detections(log, stages, records, others)
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from dataclasses import replace as replaced
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.errors import LogError, RigError
+from gtsam_rwhec.files.progress import Progress, Remark, silent
+from gtsam_rwhec.files.terminal_text import shown_path
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import Log, open_log
@@ -15,6 +18,8 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.results.result_file import result_json
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, export_all
+from gtsam_rwhec.rig.folder_contents import cloud_folders, is_folder_without_logs
+from gtsam_rwhec.rig.rig_file import parse_rig, todo_lines
 from gtsam_rwhec.runs.changed_rig import changes
 from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import check_image_options, detected
@@ -54,6 +59,9 @@ from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files
 from gtsam_rwhec.runs.solved_log import read_solved, write_solved
 from gtsam_rwhec.runs.solving_stage import Calibrated, Solved, solve_log
 
+if TYPE_CHECKING:
+    from gtsam_rwhec.clouds.object_views import SeenObject  # needs an extra that images do without
+
 #: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
 OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in WRITTEN), *FOLDERS]))
 
@@ -66,6 +74,8 @@ class _Choices:
     workers: int | None
     anyway: bool
     report_images: bool
+    #: Clouds of the input that were registered already.
+    registered: SeenObject | None = None
 
 
 @one_blas_thread()
@@ -99,7 +109,8 @@ def calibrate_log(
         As for ``open_log``; or, for a rig file with poses in files (``frames``), a folder of images, from which its
         paths then start, or a file of samples of a hand-eye tool.
     rig : Rig or None
-        None: the rig file embedded in a log that a stage wrote.
+        None: the rig file embedded in a log that a stage wrote; or, of a folder of clouds with poses beside them, the
+        one that ``gtsam-rwhec init`` proposes, if it leaves nothing to a person.
     out
         The folder; it is made if it does not exist.
     images : "copy" or "leave_out"
@@ -133,6 +144,9 @@ def calibrate_log(
         )
     check_is_no_other_folder(log_path, rig)
     choices = _Choices(images, workers, anyway, report_images)
+    if rig is None and isinstance(log_path, str | Path) and _is_folder_of_clouds(Path(log_path)):
+        rig, registered = _proposed(Path(log_path), progress or silent)
+        choices = replaced(choices, registered=registered)
     if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):
         source = Path(str(log_path))
         return _calibrate_files(source, rig, out, choices, replace=replace, progress=progress)
@@ -156,6 +170,25 @@ def calibrate_log(
         check_image_options(log, rig if is_raw else None, images=images, workers=workers)
         with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
             return _stages(log, rig, output, choices, progress=progress)
+
+
+def _is_folder_of_clouds(path: Path) -> bool:
+    return is_folder_without_logs(path) and bool(cloud_folders(path))
+
+
+def _proposed(folder: Path, tell: Progress) -> tuple[Rig, SeenObject | None]:
+    """The rig file that is proposed for a folder, where nothing in it is left to a person, and what was registered."""
+    from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig  # needs an extra that images do without
+
+    proposal = propose_cloud_rig(folder, cloud_folders(folder), tell)
+    for note in proposal.notes:
+        tell(Remark(note))
+    if todo_lines(proposal.text):
+        raise RigError(
+            f"{shown_path(folder)}: the folder does not tell how its poses are to be read. gtsam-rwhec init "
+            f"{shown_path(folder)} -o rig.yaml writes a rig file; complete it, and give it with --rig"
+        )
+    return parse_rig(proposal.text, f"the rig file that was made of {folder}", folder), proposal.registered
 
 
 def _calibrate_files(
@@ -205,6 +238,7 @@ def _stages(
             sheet=sheet,
             progress=progress,
             keep=lambda cameras: output.kept_detections(inputs_of(log, rig, cameras, folder), image_count(log, rig)),
+            registered=choices.registered,
         )
         if folder is not None:
             sources = sorted(path for path in folder.rglob("*") if path.is_file())

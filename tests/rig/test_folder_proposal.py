@@ -12,11 +12,12 @@ import pytest
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
+import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.targets import Tag
 from gtsam_rwhec.detect.detector import Detection
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.rig import CheckerboardTarget, Rig, parse_rig, propose_folder_rig
-from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, is_folder_without_logs, read_folder
+from gtsam_rwhec.rig.folder_contents import FolderPoses, ImageFolder, cloud_folders, is_folder_without_logs, read_folder
 from gtsam_rwhec.rig.folder_proposal import View, best_reading
 from gtsam_rwhec.rig.target_sections import CircleGridTarget
 
@@ -240,6 +241,34 @@ def test_logs_are_no_folders_of_images(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
     assert not is_folder_without_logs(tmp_path)
     assert not is_folder_without_logs(tmp_path / "run.mcap")
+
+
+def test_depth_images_are_clouds_and_their_intrinsics_are_asked_for(tmp_path: Path) -> None:
+    """Each of calibrate and init said to use the other."""
+    depths = np.full((40, 60), 500, np.uint16)
+    depths[:5] = 0
+    (tmp_path / "frames").mkdir()
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / "frames" / f"{number}.Depth.png"), depths)
+        cv2.imwrite(str(tmp_path / "frames" / f"{number}.color.png"), depths.astype(np.uint8))
+    (tmp_path / "poses.txt").write_text("0.1 0.2 0.3 0 0 0 1\n" * 3, encoding="utf-8")
+    (found,) = cloud_folders(tmp_path)
+    assert (found.path, found.size, len(found.files)) == ("frames/*Depth*.png", (60, 40), 3)
+    with pytest.raises(RigError, match=r"depth images of 60 x 40 in .*Write frames/depth.yaml") as refused:
+        rw.calibrate_log(tmp_path, None, tmp_path / "out")
+    text = re.sub(r"\b[fc][xy]\b", "50.0", re.findall(r": (\{image_width.*\}), or", str(refused.value))[0])
+    (tmp_path / "frames" / "depth.yaml").write_text(text, encoding="utf-8")
+    (found,) = cloud_folders(tmp_path)
+    assert found.camera is not None
+    assert (found.intrinsics, found.camera.K[0, 0]) == ("frames/depth.yaml", 50.0)
+
+
+def test_images_of_16_bits_that_see_something_everywhere_are_no_depths(tmp_path: Path) -> None:
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((40, 60), 500 + number, np.uint16))
+    assert not cloud_folders(tmp_path)
+    (found,) = read_folder(tmp_path)
+    assert found.size == (60, 40)
 
 
 def test_poses_that_are_more_than_the_clouds_are_said(tmp_path: Path) -> None:

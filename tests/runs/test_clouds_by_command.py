@@ -19,6 +19,9 @@ from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import seen_object
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig
+from gtsam_rwhec.rig.folder_contents import cloud_folders
 from gtsam_rwhec.runs import cloud_detections
 from gtsam_rwhec.runs.measured_pairs import problem_of, read_pairs
 from gtsam_rwhec.simulate.simulated_clouds import SimulatedClouds, clouds_of_thing
@@ -109,13 +112,16 @@ def test_a_folder_of_clouds_gives_the_truth(out: Path, made: SimulatedClouds) ->
     assert not (out / "detections.jsonl").exists()
 
 
-def test_how_poses_are_read_is_found_and_no_rig_file_is_needed(folder: Path, out: Path, tmp_path: Path) -> None:
-    alone = tmp_path / "alone"
+def test_how_poses_are_read_is_found_and_no_rig_file_is_needed(
+    folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone, said = tmp_path / "alone", list[str]()
     shutil.copytree(folder, alone)
     (alone / "rig.yaml").unlink()
-    said = run("calibrate", alone, "-o", tmp_path / "out")
-    assert "angles xyz in degrees, mm, the sensor on flange, lets the clouds agree" in said
-    np.testing.assert_allclose(sensor(tmp_path / "out"), sensor(out), atol=1e-4)
+    monkeypatch.setattr(cloud_detections, "seen_object", None)  # what let the clouds agree is not registered again
+    rw.calibrate_log(alone, None, tmp_path / "out", progress=said.append)
+    assert any("angles xyz in degrees, mm, the sensor on flange, lets the clouds agree" in words for words in said)
+    np.testing.assert_allclose(sensor(tmp_path / "out"), sensor(out), atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -264,17 +270,39 @@ def test_a_real_thing_by_one_command(thing: str, off_m: float, status: str, shar
     assert ("The sensors' poses do not need them" in " ".join(said.split())) == (thing == "Sphere")
 
 
+def write_depths(made: SimulatedClouds, views: int, focal: float, unit_m: float, folder: Path) -> None:
+    """Depth images of 16 bits, and poses beside them."""
+    (folder / "depth").mkdir()
+    size = round(2.0 * focal / 3.0)
+    for number, cloud in enumerate(made.clouds[:views]):
+        x, y, z = cloud.points.T
+        u, v = (np.rint(focal * axis / z + (size - 1) / 2.0).astype(int) for axis in (x, y))
+        image = np.zeros((size, size), np.uint16)
+        image[v, u] = np.rint(z / unit_m)
+        cv2.imwrite(str(folder / "depth" / f"{number}.png"), image)
+    write_poses(made.A[:views], folder / "poses.txt")
+
+
+def test_a_folder_of_depth_images_is_a_folder_of_clouds(made: SimulatedClouds, tmp_path: Path) -> None:
+    """calibrate said that images need a rig file, which init writes; and init that there are no images."""
+    write_depths(made, 4, 120.0, 0.001, tmp_path)
+    centre = {"rows": 3, "cols": 3, "data": [120.0, 0.0, 39.5, 0.0, 120.0, 39.5, 0.0, 0.0, 1.0]}
+    lens = {"distortion_model": "plumb_bob", "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5}}
+    intrinsics = {"image_width": 80, "image_height": 80, "camera_matrix": centre, **lens}
+    (tmp_path / "depth.yaml").write_text(json.dumps(intrinsics), encoding="utf-8")
+    found = propose_cloud_rig(tmp_path, cloud_folders(tmp_path), silent)
+    assert "4 depth images in depth, poses in poses.txt, intrinsics in depth.yaml" in found.notes[0]
+    assert not rw.rig.todo_lines(found.text)
+    assert found.registered is not None
+    degrees, mm = off(found.registered.T_sensorcarrier_sensor, made.T_sensorcarrier_sensor)
+    assert degrees < 1.0  # pixels are 3 mm wide
+    assert mm < 5.0
+
+
 @pytest.mark.slow
 def test_depth_images_are_clouds(made: SimulatedClouds, tmp_path: Path) -> None:
     """Images of 16 bits, in tenths of a millimetre."""
-    (tmp_path / "depth").mkdir()
-    for number, cloud in enumerate(made.clouds):
-        x, y, z = cloud.points.T
-        u, v = (np.rint(300.0 * axis / z + 99.5).astype(int) for axis in (x, y))
-        image = np.zeros((200, 200), np.uint16)
-        image[v, u] = np.rint(1e4 * z)
-        cv2.imwrite(str(tmp_path / "depth" / f"{number}.png"), image)
-    write_poses(made.A, tmp_path / "poses.txt")
+    write_depths(made, VIEWS, 300.0, 1e-4, tmp_path)
     intrinsics = "intrinsics: {K: [300.0, 300.0, 99.5, 99.5], size: [200, 200]}, unit_m: 0.0001"
     text = RIG.replace("clouds: clouds", f"clouds: depth, {intrinsics}")
     (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
