@@ -62,8 +62,10 @@ def poses_of_samples(
 def _least_squares(rows: Array, right: Array, root: Array) -> Array:
     """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right-hand sides (H, n, 3), weighted by root (H, n)."""
     H, n, _, k = rows.shape
-    inverse = np.linalg.pinv((rows * root[..., None, None]).reshape(H, 3 * n, k), rcond=NONE)
-    return np.asarray(np.einsum("hij,hj->hi", inverse, (right * root[..., None]).reshape(H, 3 * n)))
+    flat = (rows * root[..., None, None]).reshape(H, 3 * n, k)
+    of_rows = np.swapaxes(flat, 1, 2)
+    inverse = np.linalg.pinv(of_rows @ flat, rcond=NONE**2, hermitian=True)
+    return np.asarray((inverse @ (of_rows @ (right * root[..., None]).reshape(H, 3 * n, 1)))[..., 0])
 
 
 def _rotations(M: Array) -> Array:
