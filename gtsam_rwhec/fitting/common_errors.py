@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.corner_residuals import Places, Stack
 from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
@@ -25,6 +25,7 @@ class OfStack:
 
     stack: Stack
     columns: np.ndarray
+    places: Places
     of_unknowns: Array  #: (V, k, m)
     of_A: Array  #: (V, k, 6)
     of_residual: Array  #: (V, k)

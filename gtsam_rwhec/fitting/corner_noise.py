@@ -109,11 +109,12 @@ class Reduced:
                 (rows.residual - np.einsum("vni,vi->vn", by_A, off_A[stack.instant])) * root,
             )
             J_A = by_A * root[..., None]
-            sums.add(stack, where, of_stack, J_A)
+            places = stack.places(where, len(sums.squares))
+            sums.add(stack, places, of_stack, J_A)
             number += 2.0 * float(weights[stack.known].sum())
-            P = patterns(model, stack, point) * root[..., None]
+            P = patterns(model, stack, point, rows=rows) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
-            common.append(OfStack(stack, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
+            common.append(OfStack(stack, where, places, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
         prior = _prior(model, point, slots, len(sums.squares) - 1)
         return Reduced(slots, sums, number, *prior, CommonErrors(tuple(common)))
 
@@ -248,7 +249,7 @@ class Reduced:
         for of_stack, K in zip(of.stacks, inverses, strict=True):
             root = np.sqrt(K) / noise.corner_px  # R'P K P'R / s^2 is a sum of squares
             rows = Rows(root * of_stack.of_unknowns, None, root[..., 0] * of_stack.of_residual)
-            sums.add(of_stack.stack, of_stack.columns, rows, root * of_stack.of_A, sign=-1.0)
+            sums.add(of_stack.stack, of_stack.places, rows, root * of_stack.of_A, sign=-1.0)
         return replace(self, sums=sums), log_det
 
     def without_carriers(self, noise: Noise) -> WithoutCarriers:

@@ -5,7 +5,6 @@ Every file states its units and frame conventions itself; `gtsam_rwhec.results.s
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
+from pydantic_core import from_json as values_of
 from pydantic_core import to_json as json_of
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
@@ -349,7 +349,7 @@ def result_json(
         if log is not None:
             parts["log"] = log.model_dump(mode="json")
         content = encoded({**_heading(judgement), **poses, "conventions": CONVENTIONS, **parts})
-        checked_file(json.loads(content))
+        checked_file(values_of(content))
     except ValueError as error:
         raise FileFormatError(f"{path} was not written, because the result is not valid: {in_words(error)}") from error
     return content
