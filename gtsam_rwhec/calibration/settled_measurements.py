@@ -90,7 +90,7 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], Corners
     by, inliers = None, told.inliers
     if run.recording is not None:
         if options.sizes == "check" and problem.scale == "known":
-            sizes = _sizes_as_seen(run, told.inliers)
+            sizes = _sizes_as_seen(run, told.inliers, told.refined)
         better, by, inliers = with_estimated_intrinsics(run, told.refined, told.inliers)
         if better.times > run.times:
             again, other_sizes, other = settled_measurements(better)
@@ -101,7 +101,7 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], Corners
     return replace(run, agreed=_agreed(run, inliers)), sizes, by
 
 
-def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
+def _sizes_as_seen(run: Run, inliers: Inliers, near: Refined) -> tuple[TargetSize, ...]:
     """Sizes that count as known, estimated from the measurements that agree; empty if none is determined."""
     kept = agreeing(run.problem, inliers)
     free = with_free_sizes(kept, kept.targets)
@@ -109,7 +109,7 @@ def _sizes_as_seen(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # the answer takes the stated sizes
-            return tuple(sizes_in(refine(free, solve(free, options=run.options.solve), how)))
+            return tuple(sizes_in(refine(free, solve(free, options=run.options.solve), how, near=near)))
     except RwhecError:  # harmless: the stated sizes are compared with the answer then
         return ()
 
@@ -131,14 +131,14 @@ def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
             for _ in range(ROUNDS):
-                solution, inliers = _first(run, problem), Inliers()
+                solution, inliers, agree = _first(run, problem), Inliers(), None
                 if run.options.robust != "none":
                     # The offsets of a log are nearly known from cleaning; those of other problems may be large, and
                     # make outliers.
                     beside = () if run.recording is not None else asked
                     agree = refined_with_outliers(replace(run, problem=problem), solution, beside, noise)
                     solution, inliers = agree.solution, agree.inliers
-                refined = refined_by(agreeing(problem, inliers), solution, how, run.tell)
+                refined = refined_by(agreeing(problem, inliers), solution, how, run.tell, agree)
                 moved = refined.time_offsets_s
                 if path is None or max(map(abs, moved.values()), default=0.0) < SAME_S:
                     break

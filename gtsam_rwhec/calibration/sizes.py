@@ -258,11 +258,15 @@ def _marked(found: Sequence[TargetSize], problem: Problem) -> list[TargetSize]:
 
 
 def refined_by(
-    problem: Problem, start: Solution | None, options: RefineOptions, progress: Progress | None = None
+    problem: Problem,
+    start: Solution | None,
+    options: RefineOptions,
+    progress: Progress | None = None,
+    near: Refined | None = None,
 ) -> Refined:
     """The refinement by these options; without the noise that was stated for A where the residuals hold no such."""
     try:
-        return refine(problem, start, options, progress=progress)
+        return refine(problem, start, options, progress=progress, near=near)
     except NoiseError:
         if options.carrier_noise is None:
             raise

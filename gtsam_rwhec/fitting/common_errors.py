@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.corner_residuals import Places, Stack
 from gtsam_rwhec.fitting.joint_covariance import ArrowInverse
 from gtsam_rwhec.geometry.poses import Array
 
@@ -25,15 +25,19 @@ class OfStack:
 
     stack: Stack
     columns: np.ndarray
+    places: Places
     of_unknowns: Array  #: (V, k, m)
     of_A: Array  #: (V, k, 6)
     of_residual: Array  #: (V, k)
-    P: Array  #: (V, k, k)
+    P: Array  #: (V, k, k), or its diagonal (V, k) where an image's patterns are orthogonal
 
-    def first(self, number: int) -> OfStack:
-        """The products of the first patterns."""
-        of_unknowns, of_A, of_residual = (each[:, :number] for each in (self.of_unknowns, self.of_A, self.of_residual))
-        return replace(self, of_unknowns=of_unknowns, of_A=of_A, of_residual=of_residual, P=self.P[:, :number, :number])
+    def orthogonal(self, number: int) -> OfStack:
+        """The products of as many orthogonal patterns as the first ones span: turned, they are as independent."""
+        values, turn = np.linalg.eigh(self.P[:, :number, :number])
+        turn = turn.transpose(0, 2, 1)
+        of_residual = (turn @ self.of_residual[:, :number, None])[..., 0]
+        of_unknowns, of_A = turn @ self.of_unknowns[:, :number], turn @ self.of_A[:, :number]
+        return replace(self, of_unknowns=of_unknowns, of_A=of_A, of_residual=of_residual, P=np.maximum(values, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +46,14 @@ class CommonErrors:
 
     stacks: tuple[OfStack, ...]
 
-    def first(self, number: int) -> CommonErrors:
-        """Those of the first patterns."""
-        return CommonErrors(tuple(stack.first(number) for stack in self.stacks))
+    def orthogonal(self, number: int) -> CommonErrors:
+        """Those of as many orthogonal patterns as the first ones span."""
+        return CommonErrors(tuple(stack.orthogonal(number) for stack in self.stacks))
 
     def inverse(self, common_px: float, s2: float) -> tuple[list[Array], float]:
-        """K (V, k, k) of each stack, and the gain of the logarithm of the determinant."""
-        P = np.concatenate([stack.P for stack in self.stacks])
-        inner = np.eye(P.shape[1]) + P * (common_px**2 / s2)
-        K, ends = np.linalg.inv(inner) * common_px**2, np.cumsum([len(stack.P) for stack in self.stacks])[:-1]
-        return np.split(K, ends), float(np.linalg.slogdet(inner)[1].sum())
+        """The diagonals (V, k, 1) of K of each stack's orthogonal patterns, and the gain of log of the determinant."""
+        inner = [1.0 + stack.P * (common_px**2 / s2) for stack in self.stacks]
+        return [(common_px**2 / each)[..., None] for each in inner], sum(float(np.log(each).sum()) for each in inner)
 
     def twice_by_log(self, common_px: float, s2: float, found: Array, inverse: ArrowInverse, of: Carriers) -> float:
         """The derivative of -2 log L by log t: twice their number less their squares, as estimated and as uncertain.
@@ -63,12 +65,12 @@ class CommonErrors:
         of_a = inverse.at(of.places, of.places)
         for stack, K in zip(self.stacks, self.inverse(common_px, s2)[0], strict=True):
             at, own = stack.stack.instant, stack.columns
-            E, D = K @ stack.of_unknowns / s2, K @ (stack.of_A * of.deviations) / s2
-            e = (K @ stack.of_residual[..., None])[..., 0] / s2
+            E, D = K / s2 * stack.of_unknowns, K / s2 * (stack.of_A * of.deviations)
+            e = K[..., 0] / s2 * stack.of_residual
             of_theta = (E @ stack.stack.each(found[own])[..., None])[..., 0]
             c = -(e + of_theta + (D @ found[of.places[at]][..., None])[..., 0])
             with_a = inverse.between(stack.stack.each(own), of.places[at])  # (V, m, 6)
-            variance = np.diagonal(K, axis1=1, axis2=2) + ((D @ of_a[at]) * D).sum(axis=2)
+            variance = K[..., 0] + ((D @ of_a[at]) * D).sum(axis=2)
             variance = variance + ((E @ stack.stack.each(inverse.at(own, own))) * E).sum(axis=2)
             variance = variance + 2.0 * ((E @ with_a) * D).sum(axis=2)
             squares += float((c**2 + variance).sum())

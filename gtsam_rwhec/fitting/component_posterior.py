@@ -207,11 +207,12 @@ class Mixture:
             return FEWEST
         return float(fdtridfd(m, CONFIDENCE, found / m))
 
-    def share_of(self, rows: Array, added: Array, probability: float = 1.0) -> float:
+    def share_of(self, rows: Array, added: Array, probability: float = 1.0, least: float = 0.0) -> float:
         """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
 
         The posterior of a standard deviation that the data hardly show has a long tail. Its mean square would make the
-        ellipsoid far too large, its mode too small. ``probability`` is that of ``added`` being there at all.
+        ellipsoid far too large, its mode too small. ``probability`` is that of ``added`` being there at all. A share
+        that is less than ``least`` is not looked for.
         """
         samples, weights = self.draws(rows, added)
         if probability < 1.0:
@@ -221,11 +222,16 @@ class Mixture:
         plain = rows @ self.covariance @ rows.T
         mean = np.einsum("n,nij,nkj->ik", self.weights, added, added)
         wanted = chdtri(len(rows), 1.0 - CONFIDENCE)
+
+        def is_small(share: float) -> bool:
+            return _quantile(samples, weights, plain + share * mean) > wanted
+
+        if least and not is_small(least):
+            return least
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            is_small = _quantile(samples, weights, plain + middle * mean) > wanted
-            low, high = (middle, high) if is_small else (low, middle)
+            low, high = (middle, high) if is_small(middle) else (low, middle)
         return high
 
 

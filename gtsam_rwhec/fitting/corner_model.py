@@ -11,7 +11,7 @@ from rwhec_factors import se3
 from scipy.linalg.lapack import dpstrf
 
 from gtsam_rwhec.fitting.common_errors import whitened, whitener
-from gtsam_rwhec.fitting.corner_residuals import Linear, Seen, Stack, linearised, pixel_errors, seen
+from gtsam_rwhec.fitting.corner_residuals import Linear, Places, Seen, Stack, linearised, pixel_errors, seen
 from gtsam_rwhec.fitting.fit_options import About
 from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior
 from gtsam_rwhec.geometry.poses import Array
@@ -165,7 +165,8 @@ class Model:
             every = self._whitened(s, np.concatenate([J, _finite(rows.residual, root)[..., None]], axis=2))
             B = rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if stack.targets[0] in point.corners else None
             of_A = None if self.A_noise is None else every[..., -7:-1]
-            result.add(stack, self.columns(stack, slots), Rows(every[..., :-7], B, every[..., -1]), of_A)
+            places = stack.places(self.columns(stack, slots), len(result.squares))
+            result.add(stack, places, Rows(every[..., :-7], B, every[..., -1]), of_A)
         return result
 
     def slots(self, point: Point) -> dict[tuple[str, str], slice]:
@@ -272,15 +273,12 @@ class Sums:
         """The same sums, to add to."""
         return Sums(self.squares.copy(), self.of_A.copy(), self.M.copy())
 
-    def add(self, stack: Stack, columns: np.ndarray, rows: Rows, J_A: Array | None, sign: float = 1.0) -> None:
-        """Add a stack's rows, whose unknowns are in columns (T, m), with those by A, J_A (V, 2n, 6), or without."""
-        at = np.pad(columns, ((0, 0), (0, 1)), constant_values=len(self.squares) - 1)
-        _add(self.squares, (at[:, :, None], at[:, None, :]), sign * rows.squares(stack))
-        if J_A is None:
-            return
-        instant = stack.instant[:, None, None]
-        _add(self.of_A, (instant, np.arange(6)[:, None], stack.each(at)[:, None]), sign * rows.times(J_A))
-        _add(self.M, (instant, np.arange(6)[:, None], np.arange(6)), sign * (J_A.transpose(0, 2, 1) @ J_A))
+    def add(self, stack: Stack, places: Places, rows: Rows, J_A: Array | None, sign: float = 1.0) -> None:
+        """Add a stack's rows, with those by A, J_A (V, 2n, 6), or without."""
+        _add(self.squares, places.squares, sign * rows.squares(stack))
+        if J_A is not None:
+            _add(self.of_A, places.of_A, sign * rows.times(J_A))
+            _add(self.M, places.M, sign * (J_A.transpose(0, 2, 1) @ J_A))
 
     def few_rows(self) -> tuple[Array, Array, Array]:
         """Rows with these sums: Q'[J, r] (I, 6, d + 1) and Q'J_A (I, 6, 6) of each instant, and one triangle for all.
@@ -303,10 +301,9 @@ class Sums:
         return of_A, R, together * size
 
 
-def _add(sums: Array, at: tuple[np.ndarray, ...], values: Array) -> None:
-    """Add values to sums at indices that may be there twice."""
-    flat = np.ravel_multi_index(np.broadcast_arrays(*at), sums.shape)
-    sums += np.bincount(np.broadcast_to(flat, values.shape).ravel(), values.ravel(), sums.size).reshape(sums.shape)
+def _add(sums: Array, places: np.ndarray, values: Array) -> None:
+    """Add values to sums at places of their flat form, which may be there twice."""
+    sums += np.bincount(places.ravel(), values.ravel(), sums.size).reshape(sums.shape)
 
 
 def _by_corner(rows: Array, n: int) -> Array:

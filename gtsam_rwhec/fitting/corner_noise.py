@@ -109,11 +109,12 @@ class Reduced:
                 (rows.residual - np.einsum("vni,vi->vn", by_A, off_A[stack.instant])) * root,
             )
             J_A = by_A * root[..., None]
-            sums.add(stack, where, of_stack, J_A)
+            places = stack.places(where, len(sums.squares))
+            sums.add(stack, places, of_stack, J_A)
             number += 2.0 * float(weights[stack.known].sum())
-            P = patterns(model, stack, point) * root[..., None]
+            P = patterns(model, stack, point, rows=rows) * root[..., None]
             of_P, Pt = of_stack.times(P), P.transpose(0, 2, 1)
-            common.append(OfStack(stack, where, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
+            common.append(OfStack(stack, where, places, of_P[..., :-1], Pt @ J_A, of_P[..., -1], Pt @ P))
         prior = _prior(model, point, slots, len(sums.squares) - 1)
         return Reduced(slots, sums, number, *prior, CommonErrors(tuple(common)))
 
@@ -202,11 +203,14 @@ class Reduced:
         All of it is of the information of (theta, a): `joint`. The derivative by a component's log variance is its
         number less its squares, as estimated and as uncertain, over its variance (Patterson and Thompson's equations).
         """
-        s2, d = noise.corner_px**2, len(self.G)
         try:
-            sums, inverse, log_det = self.joint(noise)
+            return self.of_joint(noise, *self.joint(noise))
         except np.linalg.LinAlgError:
             return np.inf, np.zeros(4)
+
+    def of_joint(self, noise: Noise, sums: Reduced, inverse: ArrowInverse, log_det: float) -> tuple[float, Array]:
+        """The same, of what `joint` gave."""
+        s2, d = noise.corner_px**2, len(self.G)
         pull, found = self.estimate(noise, sums, inverse)
         places = np.arange(d, len(found)).reshape(-1, 6)
         theta, variances = found[:d], inverse.diagonal[places]
@@ -233,7 +237,7 @@ class Reduced:
     @cached_property
     def common(self) -> CommonErrors:
         """Of what an image's corners share."""
-        return self.patterns.first(OF_AN_IMAGE)
+        return self.patterns.orthogonal(OF_AN_IMAGE)
 
     def without_common(self, noise: Noise) -> tuple[Reduced, float]:
         """The sums without what images' corners share, and the gain of the logarithm of the determinant."""
@@ -243,10 +247,9 @@ class Reduced:
         inverses, log_det = of.inverse(noise.common_px, s2)
         sums = self.sums.copy()
         for of_stack, K in zip(of.stacks, inverses, strict=True):
-            root = np.linalg.cholesky(K).transpose(0, 2, 1) / noise.corner_px  # R'P K P'R / s^2 is a sum of squares
-            r = (root @ of_stack.of_residual[..., None])[..., 0]
-            rows = Rows(root @ of_stack.of_unknowns, None, r)
-            sums.add(of_stack.stack, of_stack.columns, rows, root @ of_stack.of_A, sign=-1.0)
+            root = np.sqrt(K) / noise.corner_px  # R'P K P'R / s^2 is a sum of squares
+            rows = Rows(root * of_stack.of_unknowns, None, root[..., 0] * of_stack.of_residual)
+            sums.add(of_stack.stack, of_stack.places, rows, root * of_stack.of_A, sign=-1.0)
         return replace(self, sums=sums), log_det
 
     def without_carriers(self, noise: Noise) -> WithoutCarriers:
@@ -272,7 +275,7 @@ class Reduced:
         # steps of equal length are about as likely: by how many errors tell each deviation
         t = TYPICAL * start.corner_px
         K = np.concatenate(self.common.inverse(t, start.corner_px**2)[0])
-        shared = float(((1.0 - np.einsum("vkk->vk", K) / t**2) ** 2).sum())
+        shared = float(((1.0 - K / t**2) ** 2).sum())
         told = np.array([self.count, 3 * len(self.M), 3 * len(self.M), shared])[free]
         unit = 1.0 / np.sqrt(np.maximum(told, 1.0))
         begin = np.log(np.maximum(deviations, [0.0, 1e-5, 1e-5, LEAST_COMMON * start.corner_px]))[free] / unit
@@ -339,31 +342,28 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     deviations = deviations_of(noise)
     free = [i for i in reduced.free(noise, carrier=carrier) if i == 0 or deviations[i] > NOTHING]
 
-    def at(step: Array) -> Noise:
+    def at(step: Array) -> tuple[ArrowInverse, Array]:
         moved = deviations.copy()
         moved[free] *= np.exp(step)
-        return Noise(*moved.tolist())
+        of_step = Noise(*moved.tolist())
+        joint = reduced.joint(of_step)
+        return joint[1], reduced.of_joint(of_step, *joint)[1][free]
 
-    steps = STEP * np.eye(len(free))
-    gradients = [
-        (reduced.minus_two_log_likelihood(at(step))[1] - reduced.minus_two_log_likelihood(at(-step))[1])[free]
-        for step in steps
-    ]
+    above, below = ([at(step) for step in sign * STEP * np.eye(len(free))] for sign in (1.0, -1.0))
     # by log v = 2 log s
-    hessian = np.array(gradients) / (2.0 * STEP) / 4.0
+    hessian = np.array([up - down for (_, up), (_, down) in zip(above, below, strict=True)]) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
     V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
-    above, below = ([reduced.joint(at(sign * step))[1] for step in steps] for sign in (1.0, -1.0))
     result = {}
-    for name, rows in reduced.slots.items():
-        own = np.arange(rows.start, rows.stop)
-        w = np.array([
-            (np.linalg.slogdet(up.at(own, own))[1] - np.linalg.slogdet(down.at(own, own))[1]) / (4.0 * STEP) / len(own)
-            for up, down in zip(above, below, strict=True)
-        ])  # fmt: skip
-        variance = float(w @ V @ w)
-        result[name] = max(2.0 / variance, FEWEST) if variance > 0.0 else float("inf")
-    return result
+    widths = {name: rows.stop - rows.start for name, rows in reduced.slots.items()}
+    for width in set(widths.values()):
+        names = [name for name in widths if widths[name] == width]
+        own = np.array([reduced.slots[name].start for name in names])[:, None] + np.arange(width)
+        up, down = ([np.linalg.slogdet(of.at(own, own))[1] for of, _ in every] for every in (above, below))
+        w = (np.array(up) - np.array(down)) / (4.0 * STEP) / width
+        variances = np.einsum("in,ij,jn->n", w, V, w).tolist()
+        result |= {n: max(2.0 / v, FEWEST) if v > 0.0 else float("inf") for n, v in zip(names, variances, strict=True)}
+    return {name: result[name] for name in reduced.slots}
 
 
 #: A corner with an error of more deviations is left out: of good ones, whose errors are Rayleigh's, 1 in 10,000.

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gtsam_rwhec.fitting.corner_model import Model, Point
-from gtsam_rwhec.fitting.corner_residuals import Stack
+from gtsam_rwhec.fitting.corner_residuals import Linear, Stack
 from gtsam_rwhec.geometry.poses import Array
 
 #: A pattern (V, n, 2) of a stack: its pixels, and directions (V, n, 2) along the target's x, its y, and away.
@@ -29,18 +29,19 @@ PATTERNS: dict[str, Pattern] = {
 OF_AN_IMAGE = 4
 
 
-def patterns(model: Model, stack: Stack, point: Point, number: int = len(PATTERNS)) -> Array:
-    """One pixel of each of the first patterns (V, 2n, k), of the corners that were seen."""
-    directions = _directions(model, stack, point)
+def patterns(
+    model: Model, stack: Stack, point: Point, number: int = len(PATTERNS), *, rows: Linear | None = None
+) -> Array:
+    """One pixel of each of the first patterns (V, 2n, k), of the corners that were seen; ``rows`` if they are known."""
+    directions = _directions(rows or model.linearised(stack, point))
     first = list(PATTERNS.values())[:number]
     every = [np.where(stack.known[..., None], pattern(stack.pixels, *directions), 0.0) for pattern in first]
     V, n = stack.known.shape
     return np.stack(every, axis=-1).reshape(V, 2 * n, number)
 
 
-def _directions(model: Model, stack: Stack, point: Point) -> tuple[Array, Array, Array]:
+def _directions(rows: Linear) -> tuple[Array, Array, Array]:
     """Unit vectors (V, n, 2) in the image along the target's x, its y, and to where the target is farther away."""
-    rows = model.linearised(stack, point)
     by_place = rows.by_corners  # by a corner's place in the target's frame, (V, n, 2, 3)
     slope = rows.B[:, None, 2:3, :2].transpose(0, 1, 3, 2)  # of the depth by the target's x and y
     along = by_place[..., 0], by_place[..., 1], (by_place[..., :2] @ slope)[..., 0]

@@ -78,6 +78,22 @@ class Stack:
         """Sums (T, ...) by target of values of the images (V, ...)."""
         return np.add.reduceat(values, self.first)
 
+    def places(self, columns: np.ndarray, size: int) -> Places:
+        """Of its products by the unknowns in ``columns`` (T, m), and the residual's, which is the last of ``size``."""
+        at = np.pad(columns, ((0, 0), (0, 1)), constant_values=size - 1)
+        by_A = 6 * self.instant[:, None] + np.arange(6)
+        of_A = by_A[:, :, None] * size + self.each(at)[:, None]
+        return Places(at[:, :, None] * size + at[:, None], of_A, 6 * by_A[:, :, None] + np.arange(6))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where products are in the flat forms of sums by all unknowns and by A (`corner_model.Sums`)."""
+
+    squares: np.ndarray  #: (T, m + 1, m + 1)
+    of_A: np.ndarray  #: (V, 6, m + 1)
+    M: np.ndarray  #: (V, 6, 6)
+
 
 @dataclass(frozen=True, eq=False)
 class Linear:

@@ -357,13 +357,13 @@ def constant_variances(task: Task, found: Settled, state: State, mixture: Mixtur
     probability = _probability(task, found)
 
     def of(poses: dict[str, gtsam.Pose3]) -> Array:
-        shift, shares = _shifts(task, poses), [0.0]
+        shift, most = _shifts(task, poses), 0.0
         for name in poses:
             rows = task.layout.slots.get(Unknown(UnknownKind.FRAME, name))
             if rows is not None and shift[rows].any() and not task.layout.free[rows].any():
                 roots = shift[rows] * deviations[:, None, :]
-                shares.append(mixture.share_of(found.model.basis[rows], roots, probability))
-        variances: Array = max(shares) * (mixture.weights @ deviations**2)
+                most = mixture.share_of(found.model.basis[rows], roots, probability, most)
+        variances: Array = most * (mixture.weights @ deviations**2)
         return variances
 
     return of(state.X), of(state.Y)

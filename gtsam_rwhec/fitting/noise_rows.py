@@ -478,4 +478,5 @@ def prior_terms(problem: Problem, variables: Variables, state: State, basis: Arr
         information[place, place] += RATE**-2
         gradient[place] += rate / RATE**2
         cost += 0.5 * (rate / RATE) ** 2
-    return basis.T @ information @ basis, basis.T @ gradient, cost
+    known = np.flatnonzero(information.any(axis=0))  # few have priors
+    return basis[known].T @ information[np.ix_(known, known)] @ basis[known], basis.T @ gradient, cost

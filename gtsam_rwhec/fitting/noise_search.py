@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -81,7 +82,7 @@ class Task:
     noisy: Array | None = None
     _known: list[tuple[State, Rows]] = field(default_factory=list, init=False, repr=False, compare=False)
 
-    @property
+    @cached_property
     def basis(self) -> Array:
         """(d, p): the determined directions of the unknowns."""
         free, unit = self.layout.free, self.layout.unit

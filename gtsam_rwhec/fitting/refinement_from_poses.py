@@ -22,9 +22,9 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.fitting.admission import inlier_threshold
-from gtsam_rwhec.fitting.fit_options import RefineOptions
+from gtsam_rwhec.fitting.fit_options import NoiseGroups, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import FreeSpace, JointCovariance, free_space_of
-from gtsam_rwhec.fitting.pair_data import FactorsByPair, PairData, group_of, local_paths, residual_covariance
+from gtsam_rwhec.fitting.pair_data import FactorsByPair, Group, PairData, group_of, local_paths, residual_covariance
 from gtsam_rwhec.fitting.pose_fit import ChordalModel, GeodesicModel, Model, SettledFit, fit, linearized
 from gtsam_rwhec.fitting.refined import FactorGraph, Movement, PairNoise, Refined
 from gtsam_rwhec.fitting.robust_solution import Inliers, robust_solution
@@ -35,7 +35,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import WINDOW_S
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import AS_STATED, aligned_at, selected
+from gtsam_rwhec.problem.selection import AS_STATED, VarianceFactors, aligned_at, selected
 from gtsam_rwhec.solver.answers import parts_about
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.solution import Solution, contradicted_by, solve
@@ -52,9 +52,11 @@ def refine(
     options: RefineOptions | None = None,
     *,
     progress: Progress | None = None,
+    near: Refined | None = None,
 ) -> Refined:
     """The part of ``rw.refine`` that is from poses: `gtsam_rwhec.fitting.refinement.refine` describes it.
 
+    Where the noise is estimated, that of ``near``, an answer of nearly the same measurements, is the start.
     Warnings point to the caller of that function, one frame above this one's.
     """
     options = RefineOptions() if options is None else options
@@ -97,6 +99,8 @@ def refine(
     variables = _variables(whole, problem, options)
     kept = _kept(problem, data, inliers)
     model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts_of(problem), variables)
+    if near is not None and estimates and not factors:
+        factors = _factors_of(near, model, options.noise_groups)
     tell("refining")
     settled = fit(problem, model, variables, variables.start(start), options, estimates, tell, factors)
     state = variables.state(settled.optimum.values)
@@ -135,6 +139,17 @@ def refine(
         options=options,
         joint=joint,
     )
+
+
+def _factors_of(near: Refined, model: Model, groups: NoiseGroups) -> FactorsByPair:
+    """The variance factors of an answer's noise, one of each group of pairs."""
+    given, found = model.given_noise, dict[Group, VarianceFactors]()
+    for pair in filter(near.noise.__contains__, given):
+        of, (rotation, translation) = near.noise[pair], given[pair]
+        if rotation and translation:
+            factors = VarianceFactors((of.rotation_rad / rotation) ** 2, (of.translation_m / translation) ** 2)
+            found.setdefault(group_of(pair, groups), factors)
+    return {pair: found[group] for pair in given if (group := group_of(pair, groups)) in found}
 
 
 def _variables(whole: Problem, problem: Problem, options: RefineOptions) -> Variables:

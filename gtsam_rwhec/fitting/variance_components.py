@@ -148,7 +148,7 @@ def _step(group: Group, total: _Sums, consistency: float) -> Array:
     if not 0.5 < common < 2.0:
         return np.full(2, max(common, 1e-12))
     information = total.fisher * (total.expected.sum() / total.fisher.sum())
-    step: Array = np.exp(np.clip(np.linalg.solve(information, found - total.expected), -0.5, 0.5))
+    step: Array = np.exp(np.clip(np.linalg.solve(information, found - total.expected), -1.0, 0.5))
     return step
 
 

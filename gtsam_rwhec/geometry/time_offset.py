@@ -54,7 +54,7 @@ class _At:
     """Residuals and derivatives at one estimate, in the target's or in the sensor's axes."""
 
     r: Array  # (N, 3)
-    J: Array  # (N, 3, 1 + 3 + 3 tracks): by the offset, R_Y, each R_X
+    J: Array  # (N, 3, 7): by the offset, R_Y, the track's R_X
     rate_variance: Array  # (N,) of the carrier's turning rate, all axes
     known: np.ndarray  # (N,)
 
@@ -133,11 +133,10 @@ class RotationProblem:
         predicted = R_Y.T @ pose[:, :3, :3] @ X
         r = se3.so3_logmap(self.R_B.transpose(0, 2, 1) @ predicted)
         # R_A Exp(omega d) R_X, R_Y Exp(d) and R_X Exp(d) turn the prediction by R_X' omega d, -P' d and d.
-        J = np.zeros((len(r), 3, 4 + 3 * len(R_X)))
+        J = np.zeros((len(r), 3, 7))
         J[:, :, 0] = np.einsum("nji,nj->ni", X, velocity[:, :3])
         J[:, :, 1:4] = -predicted.transpose(0, 2, 1)
-        for k in range(len(R_X)):
-            J[self.track == k, :, 4 + 3 * k : 7 + 3 * k] = np.eye(3)
+        J[:, :, 4:] = np.eye(3)
         if in_sensor:
             r, J = np.einsum("nij,nj->ni", self.R_B, r), self.R_B @ J
         return _At(r, J, variance[:, :3].sum(axis=1), self.carrier.gaps(stamps) <= self.max_gap_s)
@@ -148,13 +147,18 @@ class RotationProblem:
         return own, (self.stamps_ns[own] - self.stamps_ns[0]) * 1e-9, self.track[own]
 
     def _normal(self, at: _At, good: np.ndarray, noise: CorrelatedNoise) -> tuple[Array, Array, Array]:
-        """J' W J, J' W r and W J (N, 3, p) over the good detections."""
-        p = at.J.shape[2]
-        weighted = np.zeros_like(at.J)
+        """J' W J (p, p) and J' W r (p,) by the offset, R_Y and all R_X, and W J (N, 3, 7), over the good detections."""
+        weighted, tracks = np.zeros_like(at.J), int(self.track.max()) + 1
         own, seconds, track = self._good(good)
-        weighted[own] = noise.weighted(seconds, at.J[own].reshape(-1, 3 * p), track)[0].reshape(-1, 3, p)
-        flat = weighted.reshape(-1, p)
-        return at.J.reshape(-1, p).T @ flat, flat.T @ np.where(good[:, None], at.r, 0.0).ravel(), weighted
+        weighted[own] = noise.weighted(seconds, at.J[own].reshape(-1, 21), track)[0].reshape(-1, 3, 7)
+        by_track = np.zeros((tracks, 7, 8))
+        both = np.concatenate([at.J, np.where(good[:, None], at.r, 0.0)[:, :, None]], axis=2)
+        np.add.at(by_track, self.track, weighted.transpose(0, 2, 1) @ both)
+        H, right = np.zeros((4 + 3 * tracks, 4 + 3 * tracks)), np.zeros(4 + 3 * tracks)
+        places = _places(np.arange(tracks))
+        np.add.at(H, (places[:, :, None], places[:, None]), by_track[:, :, :7])
+        np.add.at(right, places, by_track[:, :, 7])
+        return H, right, weighted
 
     def _agreeing(self, at: _At, drifts: bool) -> np.ndarray:
         """Detections that are not gross errors; where residuals drift, those near their neighbours' median."""
@@ -185,7 +189,8 @@ class RotationProblem:
         H, _, weighted = self._normal(at, good, noise)
         others = np.linalg.pinv(H[1:, 1:], rcond=1e-9, hermitian=True) @ H[1:, 0]
         direction = np.r_[1.0, -others]  # the offset with all else following
-        g, Wg = at.J @ direction, weighted @ direction
+        along = direction[_places(self.track)][:, :, None]
+        g, Wg = (at.J @ along)[:, :, 0], (weighted @ along)[:, :, 0]
         information = float((g * Wg).sum())
         g_square = np.where(good, (g**2).sum(axis=1), 0.0)
         noise_share = float(at.rate_variance[good].sum() / max(g_square.sum(), 1e-300))
@@ -207,6 +212,11 @@ class RotationProblem:
         return RotationFit(
             offset_s, float(sigma), noise_share, rms, int(good.sum()), squares, _blocks(share, BLOCKS), noise
         )
+
+
+def _places(track: np.ndarray) -> np.ndarray:
+    """Where the offset, R_Y and each track's R_X are among all unknowns (n, 7)."""
+    return np.hstack([np.broadcast_to(np.arange(4), (len(track), 4)), 4 + 3 * track[:, None] + np.arange(3)])
 
 
 def _blocks(share: Array, count: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from gtsam_rwhec.results import Evidence
 from gtsam_rwhec.results.derived import derived_of
 from gtsam_rwhec.results.evidence import evidence_json
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.result_file import Result, has_no_answer, parse_result, parse_tree, result_json
+from gtsam_rwhec.results.result_file import Result, has_no_answer, parse_tree, result_json, result_of
 from gtsam_rwhec.results.result_judgement import judge
 from gtsam_rwhec.solver.solution import Solution
 
@@ -40,7 +40,7 @@ class ShownResult:
     def of(content: bytes, evidence: Evidence | None, name: str = "result.json", *, images: bool = True) -> ShownResult:
         """From a result file's content; raises as `read_result`. A result without an answer is shown too."""
         tree = parse_tree(content, name)
-        return ShownResult(tree, None if has_no_answer(tree) else parse_result(content, name), evidence, name, images)
+        return ShownResult(tree, None if has_no_answer(tree) else result_of(tree, name), evidence, name, images)
 
     @staticmethod
     def of_answer(

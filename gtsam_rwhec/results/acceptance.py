@@ -9,7 +9,6 @@ First the touched points, which a sensor measured, and their CSV file.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ from gtsam_rwhec.results.equivalence_test import ErrorFit, TouchRows, VolumeTest
 from gtsam_rwhec.results.evidence import checksum, evidence_path, read_evidence, write_evidence
 from gtsam_rwhec.results.file_record import triple
 from gtsam_rwhec.results.json_tree import MOST_BYTES, to_json
-from gtsam_rwhec.results.result_file import Result, parse_result, parse_tree, result_path
+from gtsam_rwhec.results.result_file import Result, encoded, parse_result, parse_tree, result_of, result_path
 
 #: The columns of a file of touches; the last seven may be left out.
 POINTS = ("sensor_x_m", "sensor_y_m", "sensor_z_m", "known_x_m", "known_y_m", "known_z_m")
@@ -409,10 +408,10 @@ def write_acceptance(found: Acceptance, path: str | Path) -> None:
     path = result_path(path)
     content = read_whole(path, MOST_BYTES, "A result was")
     tree = parse_tree(content, path)
-    parse_result(content, path)
+    result_of(tree, path)
     kept = [one for one in tree.get("acceptance", []) if one["sensor"] != found.sensor]
     tree["acceptance"] = [*kept, to_json(found, "$.acceptance")]
-    new = (json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+    new = encoded(tree)
     parse_result(new, path)
     beside = evidence_path(path)
     evidence = read_evidence(beside) if beside.exists() else None

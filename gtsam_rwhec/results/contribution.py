@@ -10,6 +10,7 @@ import heapq
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
 from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
@@ -22,6 +23,8 @@ MOST_CHOSEN_FROM = 125
 BEGIN = 1e-6
 #: A parameter of which all but this share is along free directions has no deviation.
 FREE_SHARE = 1e-6
+#: Of a direction that only one image tells, this share at least is left without it.
+LOST = 1e-9
 #: How much larger the worst standard deviation may be.
 GROWTHS = (0.05, 0.1, 0.25, 0.5)
 #: So many measurements are looked at together.
@@ -136,12 +139,9 @@ def _alike(
     spread = spread.reshape(n, len(covariance), 6 * k)
     there = np.take_along_axis(spread, places.reshape(n, -1, 1), axis=1).reshape(n, k, OWN, 6 * k)
     hat = np.einsum("nkip,nkpj->nkij", derivative, there).reshape(n, 6 * k, 6 * k)
-    # Where only this image tells something, a direction is lost without it: its eigenvalue is zero up to rounding.
-    values, vectors = np.linalg.eigh(np.eye(6 * k) - hat)
-    values = np.maximum(values, 1e-9)
-    half = spread @ (vectors / np.sqrt(values)[:, None, :])
-    turned = np.einsum("nij,ni->nj", vectors, r[rows].reshape(n, 6 * k)) / np.sqrt(values)
-    step = -np.einsum("ndj,nj->nd", half, turned)
+    root = np.array([_inverse_root(each) for each in np.eye(6 * k) - hat])
+    half = spread @ root.transpose(0, 2, 1)
+    step = -(half @ (root @ r[rows].reshape(n, 6 * k, 1)))[:, :, 0]
     variance = np.diagonal(covariance)
     known = variance > 0.0
     ratio = (half**2).sum(axis=2)[:, known] / variance[known]
@@ -164,6 +164,21 @@ def _alike(
             moved_mm=1e3 * float(np.linalg.norm(by_frame[i, frame, 3:])),
             growth=float(growth[i]),
         )
+
+
+def _inverse_root(matrix: Array) -> Array:
+    """W (m, m) with W' W = matrix^-1.
+
+    Where only this image tells something, a direction is lost without it: its eigenvalue is zero up to rounding.
+    """
+    try:
+        root: Array = dtrtri(np.linalg.cholesky(matrix), lower=1)[0]
+        if (root**2).sum() * LOST < 1.0:  # then no eigenvalue is smaller
+            return root
+    except np.linalg.LinAlgError:
+        pass
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, LOST))).T)
 
 
 def _chosen(model: LinearModel, J: Array, covariance: Array, images: list[np.ndarray]) -> list[float]:

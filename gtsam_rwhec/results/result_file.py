@@ -5,7 +5,6 @@ Every file states its units and frame conventions itself; `gtsam_rwhec.results.s
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
@@ -14,6 +13,8 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
+from pydantic_core import from_json as values_of
+from pydantic_core import to_json as json_of
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
@@ -141,12 +142,16 @@ def result_path(path: str | Path) -> Path:
 
 def parse_result(content: bytes, path: str | Path) -> Result:
     """Read the content of a file; messages name `path`. Raises as `read_solution` does."""
-    raw = parse_tree(content, path)
-    if has_no_answer(raw):
-        why = shown(str(raw.get("verdict_reason")))
+    return result_of(parse_tree(content, path), path)
+
+
+def result_of(tree: dict[str, Any], path: str | Path) -> Result:
+    """What the JSON values of a file hold; messages name `path`. Raises as `read_solution` does."""
+    if has_no_answer(tree):
+        why = shown(str(tree.get("verdict_reason")))
         raise FileFormatError(f"{path} has no poses, because the calibration has no answer: {why}")
     try:
-        file = checked_file(raw)
+        file = checked_file(tree)
         solution, refined = _of_class(Solution, file.certified), None
         if file.refined is not None:
             refined = _of_class(RefinedPoses, file.refined)
@@ -204,7 +209,8 @@ def checked_file(tree: dict[str, Any]) -> ResultFile:
     """
     owner = "refined" if isinstance(tree.get("refined"), dict) else "certified"
     try:
-        file = ResultFile.model_validate_json(json.dumps(_with_what_follows(from_json(tree), owner)))
+        content = json_of(_with_what_follows(from_json(tree), owner), inf_nan_mode="constants")
+        file = ResultFile.model_validate_json(content)
     except ValueError as error:
         raise ValueError(in_words(error, owner).removesuffix(".")) from error
     check_certificates(file.certified)
@@ -318,7 +324,7 @@ def result_json(
         record = CalibrationFields.of(answer)
         if answer.solution is None:
             none = {"sensors": [], "targets": [], "conventions": CONVENTIONS}
-            return _encoded({**_heading(answer.judgement), **none, "calibration": to_json(record, "$.calibration")})
+            return encoded({**_heading(answer.judgement), **none, "calibration": to_json(record, "$.calibration")})
         solution, refined = answer.solution, answer.refined
         targets, sensors = answer.carriers.targets or targets, answer.carriers.sensors or sensors
     elif isinstance(answer, Refined):
@@ -342,16 +348,16 @@ def result_json(
             parts["calibration"] = to_json(record, "$.calibration")
         if log is not None:
             parts["log"] = log.model_dump(mode="json")
-        content = _encoded({**_heading(judgement), **poses, "conventions": CONVENTIONS, **parts})
-        checked_file(json.loads(content))
+        content = encoded({**_heading(judgement), **poses, "conventions": CONVENTIONS, **parts})
+        checked_file(values_of(content))
     except ValueError as error:
         raise FileFormatError(f"{path} was not written, because the result is not valid: {in_words(error)}") from error
     return content
 
 
-def _encoded(tree: dict[str, Any]) -> bytes:
+def encoded(tree: dict[str, Any]) -> bytes:
     """JSON in UTF-8. Raises `ValueError` if a name has a lone surrogate."""
-    return (json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+    return json_of(tree, indent=2, inf_nan_mode="constants") + b"\n"
 
 
 def _heading(judgement: Judgement) -> dict[str, Any]:

@@ -39,8 +39,9 @@ def poses_of_samples(
     # R_Y = R_A R_X R_B': vec over rows, K[(i, j), (k, l)] = sum R_A[i, k] R_B[j, l]
     flat = (R_A * root[..., None, None] ** 2).reshape(H, n, 9)
     K = (np.swapaxes(flat, 1, 2) @ R_B.reshape(H, n, 9)).reshape(H, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4)
-    U, _, Vt = np.linalg.svd(K.reshape(H, 9, 9))
-    R_X, R_Y = _rotations(Vt[:, 0].reshape(H, 3, 3)), _rotations(U[:, :, 0].reshape(H, 3, 3))
+    K = K.reshape(H, 9, 9)
+    first = np.linalg.eigh(np.swapaxes(K, 1, 2) @ K)[1][:, :, -1:]  # of K's singular vectors; half the time of an SVD
+    R_X, R_Y = _rotations(first.reshape(H, 3, 3)), _rotations((K @ first).reshape(H, 3, 3))
     seen = np.einsum("hij,hnj->hni", R_Y, B[..., :3, 3])
     columns = [R_A, np.broadcast_to(-np.eye(3), (H, n, 3, 3))]
     scale: Array = np.ones(H)
@@ -61,8 +62,10 @@ def poses_of_samples(
 def _least_squares(rows: Array, right: Array, root: Array) -> Array:
     """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right-hand sides (H, n, 3), weighted by root (H, n)."""
     H, n, _, k = rows.shape
-    inverse = np.linalg.pinv((rows * root[..., None, None]).reshape(H, 3 * n, k), rcond=NONE)
-    return np.asarray(np.einsum("hij,hj->hi", inverse, (right * root[..., None]).reshape(H, 3 * n)))
+    flat = (rows * root[..., None, None]).reshape(H, 3 * n, k)
+    of_rows = np.swapaxes(flat, 1, 2)
+    inverse = np.linalg.pinv(of_rows @ flat, rcond=NONE**2, hermitian=True)
+    return np.asarray((inverse @ (of_rows @ (right * root[..., None]).reshape(H, 3 * n, 1)))[..., 0])
 
 
 def _rotations(M: Array) -> Array:
