@@ -1,6 +1,9 @@
 from .cloud import Cloud as Cloud
 from .cloud_odometry import CloudTrack as CloudTrack
 from .cloud_odometry import odometry as odometry
+from .lidars_together import LidarPath as LidarPath
+from .lidars_together import LidarsTogether as LidarsTogether
+from .lidars_together import lidars_together as lidars_together
 from .cloud_files import read_cloud as read_cloud
 from .registered_views import ObjectOptions as ObjectOptions
 from .object_views import SeenObject as SeenObject

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rwhec_factors import se3
@@ -15,9 +18,10 @@ from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.odometry.odometry_outcome import calibration_of
 from gtsam_rwhec.odometry.odometry_record import OdometryCalibration
-from gtsam_rwhec.odometry.prior_knowledge import Given, GivenRows, up_direction
+from gtsam_rwhec.odometry.prior_knowledge import Given, GivenRows, KnownPose, up_direction
 from gtsam_rwhec.odometry.track_comparison import (
     Clock,
     OdometryOptions,
@@ -38,12 +42,17 @@ from gtsam_rwhec.odometry.window_solution import FEWEST, Answer, Task, solve_win
 from gtsam_rwhec.results.log_history import RemovalReason, Removed
 from gtsam_rwhec.runs.odometry_cleaning import Gated, gated
 
+if TYPE_CHECKING:
+    from gtsam_rwhec.clouds import Cloud, LidarsTogether
+
 #: If the drive does not determine a time offset, it stays within about this many seconds of the first guess.
 CLOCK_SIGMA_S = 0.05
 #: The windows are made again with new offsets until these change by less than this, s, and so often at most. What is
 #: left is in the residuals to first order.
 SAME_CLOCK_S = 2e-3
 CLOCK_ROUNDS = 4
+#: LiDARs whose clouds are registered are looked for within about this distance, m.
+NEAR_M = 3.0
 #: A start for the translation's noise: this part of the median way of a second, in metres a root of a second.
 WAY_SHARE = 0.01
 #: The mean square turn about an axis is less than this, in units of its noise: it did not turn. The noise is that of
@@ -62,6 +71,7 @@ def calibrate_odometries(
     reference: str,
     given: Given | None = None,
     options: OdometryOptions | None = None,
+    maps: Mapping[str, Sequence[Cloud]] | None = None,
     progress: Progress | None = None,
 ) -> OdometryCalibration:
     """Find where sensors are on a vehicle, each of which knows only its own motion.
@@ -78,6 +88,9 @@ def calibrate_odometries(
     given : Given, optional
         What is known beside the tracks.
     options : OdometryOptions, optional
+    maps : mapping of sensor to clouds, optional
+        What LiDARs saw along their ways, ``CloudTrack.maps``: where those of two overlap they are registered with each
+        other, which tells heights on a plane too. `OdometryCalibration.together` says what came of it.
     progress : callable, optional
         Takes the name of each stage.
 
@@ -111,7 +124,13 @@ def calibrate_odometries(
     drive = _Drive(tuple(tracks), tuple(gates), tuple(clocks), reference, given, options, tell)
     tell("choosing windows")
     first = drive.calibrated(options.window_s)
-    return _narrowed(first) if options.window_s else _agreeing(drive, first)
+    together = _together(drive, first, maps or {})
+    known = _known_poses(together)
+    if known:
+        drive = replace(drive, given=replace(given, poses=(*given.poses, *known)))
+        first = drive.calibrated(options.window_s)
+    found = _narrowed(first) if options.window_s else _agreeing(drive, first)
+    return replace(found, together=together, remarks=(*found.remarks, *map(str, together)))
 
 
 @dataclass(frozen=True)
@@ -167,6 +186,52 @@ class _Drive:
         }
         self.tell("gathering")
         return calibration_of(answer, task, tracks, self.reference, offsets, clocks, removed, origin)
+
+
+def _together(
+    drive: _Drive, found: OdometryCalibration, maps: Mapping[str, Sequence[Cloud]]
+) -> tuple[LidarsTogether, ...]:
+    """What the maps of every two LiDARs say of their poses, from an answer by the motions."""
+    if not maps:
+        return ()
+    from gtsam_rwhec.clouds import LidarPath, lidars_together  # needs an extra that motions do without
+
+    named = [track.sensor for track in drive.tracks]
+    if lost := [sensor for sensor in maps if sensor not in named]:
+        raise FrameError(f"maps are of {lost[0]!r}, and no track is of it; the sensors are {', '.join(named)}")
+    paths, start = [], {found.reference: np.eye(4)}
+    for sensor in found.order:  # a place that the motions hardly tell is near, as vehicles are small
+        T, covariance = found.T_reference_sensor[sensor].copy(), found.covariance_of(sensor)[3:, 3:]
+        if np.isfinite(covariance).all():
+            turned = T[:3, :3] @ covariance @ T[:3, :3].T
+            T[:3, 3] -= turned @ np.linalg.solve(turned + NEAR_M**2 * np.eye(3), T[:3, 3])
+        start[sensor] = T
+    for gate in drive.gates:
+        sensor, after_ns = gate.track.sensor, round(1e9 * found.time_offsets_s.get(gate.track.sensor, 0.0))
+        if maps.get(sensor):
+            clouds = [replace(each, stamp_ns=(each.stamp_ns or 0) + after_ns) for each in maps[sensor]]
+            path = Trajectory(np.asarray(gate.track.stamps_ns) + after_ns, np.asarray(gate.track.T_start_sensor))
+            paths.append(LidarPath(sensor, clouds, path, found.time_offset_sigmas_s.get(sensor, 0.0)))
+    drive.tell("registering the clouds of LiDARs with each other")
+    return tuple(
+        lidars_together(one, other, se3.inverse(start[one.sensor][None])[0] @ start[other.sensor])
+        for one, other in combinations(paths, 2)
+    )
+
+
+def _known_poses(together: Sequence[LidarsTogether]) -> list[KnownPose]:
+    """The poses that are used. The errors of a LiDAR's maps are in all of its pairs, so that each counts as less."""
+    used = [each for each in together if not each.why_not]
+    pairs_of = Counter(name for each in used for name in (each.first, each.second))
+    return [
+        KnownPose(
+            each.first,
+            each.second,
+            each.T_first_second,
+            each.information * 4.0 / (pairs_of[each.first] + pairs_of[each.second] + 2),
+        )
+        for each in used
+    ]
 
 
 #: The answer is compared with those of windows of these lengths, s: an error that is no random walk (white noise of a

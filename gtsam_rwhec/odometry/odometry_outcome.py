@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from gtsam_rwhec.calibration.known_frames import MOST_M, MOST_RAD, VERTICAL_RAD, deviations_of
 from gtsam_rwhec.calibration.verdict import Finding, Ground
@@ -84,7 +84,11 @@ def calibration_of(
         residuals=sizes,
         influences=_influences(answer, task, change, order),
         others=others,
-        findings=(*_findings(answer, task, tracks, clocks, sigmas, sizes), *_of_blocks(worst)),
+        findings=(
+            *_findings(answer, task, tracks, clocks, sigmas, sizes),
+            *_of_poses(answer, 1.0 if worst is None else worst.ratio),
+            *_of_blocks(worst),
+        ),
         remarks=(*_remarks(task), *answer.errors.in_words(names)),
         possible=_at_most(scatter),
     )
@@ -132,6 +136,34 @@ def _of_blocks(worst: Scatter | None) -> tuple[Finding, ...]:
     if worst is None or not worst.is_by_far:
         return ()
     return (Finding(Ground.CORRELATED, f"{worst}: its errors are no random walk, and last for long"),)
+
+
+#: What is known of a pose disagrees with the motions where chance makes such a difference in fewer drives than this,
+#: and tells what the motions do not where less than this share of its variance is left.
+BY_CHANCE, TELLS_ALONE = 1e-3, 1e-3
+
+
+def _of_poses(answer: Answer, ratio: float) -> Iterator[Finding]:
+    """Known poses that the motions contradict; the covariance by these alone is larger by a ratio.
+
+    With r the whitened residuals of a pose at the answer, of covariance S, the motions alone are S^-1 r from it.
+    """
+    rows, widening = answer.fit.rows, answer.errors.widening
+    for what in dict.fromkeys(number.what for number in rows.numbers if number.what and not number.unit):
+        at = [i for i, number in enumerate(rows.numbers) if number.what == what]
+        J = rows.J[at]
+        left, along = np.linalg.eigh(np.eye(len(at)) - J @ answer.freedom.covariance() @ J.T)
+        along = along[:, left > TELLS_ALONE] / left[left > TELLS_ALONE]
+        apart = along.T @ rows.r[at]
+        by_motions = along.T @ along * left[left > TELLS_ALONE] - np.eye(len(apart))
+        covariance = np.eye(len(apart)) + ratio * by_motions + along.T @ J @ widening @ J.T @ along
+        square = float(apart @ np.linalg.solve(covariance, apart))
+        if chdtrc(len(apart), square) < BY_CHANCE:
+            words = (
+                f"{what} by their clouds, or as it is given, is {np.sqrt(square / len(apart)):.2g} times as far from that by "
+                "the motions as both claim"
+            )
+            yield Finding(Ground.CONTRADICTED, words)
 
 
 def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tuple[str, ...]]:
@@ -191,7 +223,7 @@ def _influences(answer: Answer, task: Task, change: Array, order: tuple[str, ...
     result = []
     inverse, C = answer.freedom.inverse(), answer.freedom.covariance()
     for r, row, number in zip(rows.r, rows.J, rows.numbers, strict=True):
-        if not number.what:
+        if not (number.what and number.unit):
             continue
         moved = (change @ inverse @ row / number.sigma)[: 6 * len(order)].reshape(-1, 6)
         spare = 1.0 - float(row @ C @ row)

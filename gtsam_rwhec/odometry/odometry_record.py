@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.log_history import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
+
+if TYPE_CHECKING:
+    from gtsam_rwhec.clouds import LidarsTogether
 
 #: The data contradict a given number that is more than this many standard deviations away: by chance one of 2,000.
 CONTRADICTED = 3.5
@@ -156,6 +160,8 @@ class OdometryCalibration:
     others: tuple[OtherAnswer, ...] = ()  #: Other answers that fit alike
     #: CONTRADICTED: a whole track looks wrong, or contradicts a given distance; COVARIANCE_DOUBTED: doubtful results
     findings: tuple[Finding, ...] = ()
+    #: What came of the clouds of every two LiDARs: used in the answer, or why not
+    together: tuple[LidarsTogether, ...] = ()
     remarks: tuple[str, ...] = ()  #: What was assumed, in sentences
     #: The largest factor of the covariance that blocks of windows leave possible, 1 at most
     possible: float = 1.0

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.clouds import Cloud
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive
+from gtsam_rwhec.simulate.drives import DriveShape
 
 #: T_vehicle_sensor: one looks ahead, one back and down.
 MOUNTS = {
@@ -41,10 +42,21 @@ def yard(driven: Drive, seed: int) -> Boxes:
     return Boxes(centres, sizes, rng.uniform(0.0, np.pi, len(centres)))
 
 
-def sweep(boxes: Boxes, T: np.ndarray, twist: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of one turn that begins at T_world_sensor, and the seconds (n,) after its beginning."""
+def sweep(
+    boxes: Boxes,
+    T: np.ndarray,
+    twist: np.ndarray,
+    rng: np.random.Generator,
+    aside_rad: float = np.pi,
+    bias_m: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of one turn that begins at T_world_sensor, and the seconds (n,) after its beginning.
+
+    It sees up to an angle to both sides, and measures all ranges too far by a bias.
+    """
     azimuths = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
-    elevations, steps = np.meshgrid(np.radians(np.linspace(-15.0, 15.0, BEAMS)), np.arange(STEPS), indexing="ij")
+    seen_at = np.flatnonzero(np.abs(azimuths) <= aside_rad)
+    elevations, steps = np.meshgrid(np.radians(np.linspace(-15.0, 15.0, BEAMS)), seen_at, indexing="ij")
     up, steps = elevations.ravel(), steps.ravel()
     around, times = azimuths[steps], steps / STEPS * TURN_S
     rays = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -62,20 +74,24 @@ def sweep(boxes: Boxes, T: np.ndarray, twist: np.ndarray, rng: np.random.Generat
             near, far = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
             ranges = np.where((near < far) & (near > 0.0) & (near < ranges), near, ranges)
     hit = ranges < REACH_M
-    measured = ranges[hit] + rng.normal(0.0, NOISE_M, int(hit.sum()))
+    measured = ranges[hit] + bias_m + rng.normal(0.0, NOISE_M, int(hit.sum()))
     return measured[:, None] * rays[hit], times[hit]
 
 
-def driven(seconds: float, seed: int) -> Drive:
-    """A drive on the ground whose sensors are `MOUNTS`."""
-    return drive({name: SimulatedOdometry(T) for name, T in MOUNTS.items()}, "planar", seconds=seconds, seed=seed)
+def driven(seconds: float, seed: int, shape: DriveShape = "planar") -> Drive:
+    """A drive on the ground, or above it, whose sensors are `MOUNTS`."""
+    made = drive({name: SimulatedOdometry(T) for name, T in MOUNTS.items()}, shape, seconds=seconds, seed=seed)
+    made.T_world_vehicle[:, 2, 3] -= made.T_world_vehicle[:, 2, 3].min()
+    return made
 
 
-def sweeps(of: Drive, boxes: Boxes, sensor: str, seed: int) -> Iterator[Cloud]:
+def sweeps(
+    of: Drive, boxes: Boxes, sensor: str, seed: int, *, aside_rad: float = np.pi, bias_m: float = 0.0
+) -> Iterator[Cloud]:
     """The sweeps of a sensor, one for each pose of the drive but the last."""
     rng = np.random.default_rng(seed)
     poses = of.T_world_vehicle @ MOUNTS[sensor]
     twists = se3.logmap(se3.inverse(poses[:-1]) @ poses[1:]) / TURN_S
     for T, twist, stamp in zip(poses, twists, of.stamps_ns.tolist(), strict=False):
-        points, times = sweep(boxes, T, twist, rng)
+        points, times = sweep(boxes, T, twist, rng, aside_rad, bias_m)
         yield Cloud.of(points, times_s=times, stamp_ns=stamp)
