@@ -81,7 +81,9 @@ def rows(runs: int, workers: int) -> list[bars.Row]:
             table.append(bars.Row(f"{kind}: clouds used and 'use'", f"{wrong} of {runs}", "0", wrong == 0))
             table.append(bars.Row(f"{kind}: clouds not used", f"{(~used).sum()} of {runs}"))
             continue
-        table.append(bars.Row(f"{kind}: clouds used, and 'use'", f"{used.sum()}, {(verdicts == 'use').sum()} of {runs}"))
+        table.append(
+            bars.Row(f"{kind}: clouds used, and 'use'", f"{used.sum()}, {(verdicts == 'use').sum()} of {runs}")
+        )
         off = f"{np.median(mm[used]):.2g} mm, {np.median(degrees[used]):.2g} deg; most {mm[used].max():.2g} mm"
         table.append(bars.Row(f"{kind}: off by, median", off))
         held = bars.Share.of((chance[used] > 1.0 - LEVEL).tolist())

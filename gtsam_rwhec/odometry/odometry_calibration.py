@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,10 +16,10 @@ from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.trajectory import Trajectory
-from gtsam_rwhec.odometry.odometry_outcome import calibration_of
+from gtsam_rwhec.odometry.clouds_of_lidars import near_poses, pose_of, poses_of, registered_maps
+from gtsam_rwhec.odometry.odometry_outcome import calibration_of, contradiction
 from gtsam_rwhec.odometry.odometry_record import OdometryCalibration
-from gtsam_rwhec.odometry.prior_knowledge import Given, GivenRows, KnownPose, up_direction
+from gtsam_rwhec.odometry.prior_knowledge import Given, GivenRows, up_direction
 from gtsam_rwhec.odometry.track_comparison import (
     Clock,
     OdometryOptions,
@@ -51,8 +49,6 @@ CLOCK_SIGMA_S = 0.05
 #: left is in the residuals to first order.
 SAME_CLOCK_S = 2e-3
 CLOCK_ROUNDS = 4
-#: LiDARs whose clouds are registered are looked for within about this distance, m.
-NEAR_M = 3.0
 #: A start for the translation's noise: this part of the median way of a second, in metres a root of a second.
 WAY_SHARE = 0.01
 #: The mean square turn about an axis is less than this, in units of its noise: it did not turn. The noise is that of
@@ -123,14 +119,38 @@ def calibrate_odometries(
     ]
     drive = _Drive(tuple(tracks), tuple(gates), tuple(clocks), reference, given, options, tell)
     tell("choosing windows")
+    together, findings = _beside_the_motions(drive, maps or {})
+    drive = replace(drive, given=replace(given, poses=(*given.poses, *poses_of(together))))
     first = drive.calibrated(options.window_s)
-    together = _together(drive, first, maps or {})
-    known = _known_poses(together)
-    if known:
-        drive = replace(drive, given=replace(given, poses=(*given.poses, *known)))
-        first = drive.calibrated(options.window_s)
     found = _narrowed(first) if options.window_s else _agreeing(drive, first)
-    return replace(found, together=together, remarks=(*found.remarks, *map(str, together)))
+    remarks = (*found.remarks, *map(str, together))
+    return replace(found, together=together, findings=(*found.findings, *findings), remarks=remarks)
+
+
+def _beside_the_motions(
+    drive: _Drive, maps: Mapping[str, Sequence[Cloud]]
+) -> tuple[tuple[LidarsTogether, ...], list[Finding]]:
+    """What the maps of every two LiDARs tell, and which known poses the motions alone contradict."""
+    names = [track.sensor for track in drive.tracks]
+    if lost := [sensor for sensor in maps if sensor not in names]:
+        raise FrameError(f"maps are of {lost[0]!r}, and no track is of it; the sensors are {', '.join(names)}")
+    if not maps and not drive.given.poses:
+        return (), []
+    answer, task, offsets, _ = replace(drive, given=replace(drive.given, poses=())).solved(drive.options.window_s)
+    T = near_poses(answer, task)
+    found = registered_maps(answer, task, T, [gate.track for gate in drive.gates], offsets, maps, drive.tell)
+    together = tuple(
+        each if each.why_not else replace(each, why_not=contradiction(answer, task, T, pose_of(each))) for each in found
+    )
+    off = [
+        (f"by their clouds, {pose_of(one)}", two.why_not)
+        for one, two in zip(found, together, strict=True)
+        if one.why_not != two.why_not
+    ]
+    off += [(str(pose), contradiction(answer, task, T, pose)) for pose in drive.given.poses]
+    return together, [
+        Finding(Ground.CONTRADICTED, f"{what} contradicts the motions: {words}") for what, words in off if words
+    ]
 
 
 @dataclass(frozen=True)
@@ -147,6 +167,17 @@ class _Drive:
 
     def calibrated(self, seconds: float | None) -> OdometryCalibration:
         """The calibration with windows of about this length; None: of that with the most information."""
+        answer, task, offsets, begins_ns = self.solved(seconds)
+        removed = {
+            name: gate.removed + _outlying(begins_ns, left_out)
+            for name, gate, left_out in zip(task.names, self.gates, answer.left_out, strict=True)
+        }
+        self.tell("gathering")
+        origin = int(self.tracks[0].stamps_ns[0])
+        return calibration_of(answer, task, self.tracks, self.reference, offsets, self.clocks, removed, origin)
+
+    def solved(self, seconds: float | None) -> tuple[Answer, Task, Array, np.ndarray]:
+        """The answer and its task, the time offsets (m,), s, and when all windows begin, those of outliers too, ns."""
         tracks, gates, clocks, given, options = self.tracks, self.gates, self.clocks, self.given, self.options
         names = tuple(track.sensor for track in tracks)
         origin = int(tracks[0].stamps_ns[0])
@@ -179,59 +210,7 @@ class _Drive:
                 break
         assert answer is not None
         _check_agreement(answer, names)
-        begins = origin + np.round(windows.start * 1e9).astype(np.int64)
-        removed = {
-            name: gate.removed + _outlying(begins, left_out)
-            for name, gate, left_out in zip(names, gates, answer.left_out, strict=True)
-        }
-        self.tell("gathering")
-        return calibration_of(answer, task, tracks, self.reference, offsets, clocks, removed, origin)
-
-
-def _together(
-    drive: _Drive, found: OdometryCalibration, maps: Mapping[str, Sequence[Cloud]]
-) -> tuple[LidarsTogether, ...]:
-    """What the maps of every two LiDARs say of their poses, from an answer by the motions."""
-    if not maps:
-        return ()
-    from gtsam_rwhec.clouds import LidarPath, lidars_together  # needs an extra that motions do without
-
-    named = [track.sensor for track in drive.tracks]
-    if lost := [sensor for sensor in maps if sensor not in named]:
-        raise FrameError(f"maps are of {lost[0]!r}, and no track is of it; the sensors are {', '.join(named)}")
-    paths, start = [], {found.reference: np.eye(4)}
-    for sensor in found.order:  # a place that the motions hardly tell is near, as vehicles are small
-        T, covariance = found.T_reference_sensor[sensor].copy(), found.covariance_of(sensor)[3:, 3:]
-        if np.isfinite(covariance).all():
-            turned = T[:3, :3] @ covariance @ T[:3, :3].T
-            T[:3, 3] -= turned @ np.linalg.solve(turned + NEAR_M**2 * np.eye(3), T[:3, 3])
-        start[sensor] = T
-    for gate in drive.gates:
-        sensor, after_ns = gate.track.sensor, round(1e9 * found.time_offsets_s.get(gate.track.sensor, 0.0))
-        if maps.get(sensor):
-            clouds = [replace(each, stamp_ns=(each.stamp_ns or 0) + after_ns) for each in maps[sensor]]
-            path = Trajectory(np.asarray(gate.track.stamps_ns) + after_ns, np.asarray(gate.track.T_start_sensor))
-            paths.append(LidarPath(sensor, clouds, path, found.time_offset_sigmas_s.get(sensor, 0.0)))
-    drive.tell("registering the clouds of LiDARs with each other")
-    return tuple(
-        lidars_together(one, other, se3.inverse(start[one.sensor][None])[0] @ start[other.sensor])
-        for one, other in combinations(paths, 2)
-    )
-
-
-def _known_poses(together: Sequence[LidarsTogether]) -> list[KnownPose]:
-    """The poses that are used. The errors of a LiDAR's maps are in all of its pairs, so that each counts as less."""
-    used = [each for each in together if not each.why_not]
-    pairs_of = Counter(name for each in used for name in (each.first, each.second))
-    return [
-        KnownPose(
-            each.first,
-            each.second,
-            each.T_first_second,
-            each.information * 4.0 / (pairs_of[each.first] + pairs_of[each.second] + 2),
-        )
-        for each in used
-    ]
+        return answer, task, offsets, origin + np.round(windows.start * 1e9).astype(np.int64)
 
 
 #: The answer is compared with those of windows of these lengths, s: an error that is no random walk (white noise of a

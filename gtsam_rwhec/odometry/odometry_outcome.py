@@ -15,7 +15,7 @@ from gtsam_rwhec.fitting.block_agreement import Scatter, most_beyond_chance, sca
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
-from gtsam_rwhec.odometry.prior_knowledge import upside_down
+from gtsam_rwhec.odometry.prior_knowledge import Given, KnownPose, upside_down
 from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
 from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE, Linear, eliminated
 from gtsam_rwhec.odometry.window_motions import axes_turned
@@ -84,11 +84,7 @@ def calibration_of(
         residuals=sizes,
         influences=_influences(answer, task, change, order),
         others=others,
-        findings=(
-            *_findings(answer, task, tracks, clocks, sigmas, sizes),
-            *_of_poses(answer, 1.0 if worst is None else worst.ratio),
-            *_of_blocks(worst),
-        ),
+        findings=(*_findings(answer, task, tracks, clocks, sigmas, sizes), *_of_blocks(worst)),
         remarks=(*_remarks(task), *answer.errors.in_words(names)),
         possible=_at_most(scatter),
     )
@@ -138,32 +134,27 @@ def _of_blocks(worst: Scatter | None) -> tuple[Finding, ...]:
     return (Finding(Ground.CORRELATED, f"{worst}: its errors are no random walk, and last for long"),)
 
 
-#: What is known of a pose disagrees with the motions where chance makes such a difference in fewer drives than this,
-#: and tells what the motions do not where less than this share of its variance is left.
-BY_CHANCE, TELLS_ALONE = 1e-3, 1e-3
+#: A pose that is known otherwise contradicts the motions where chance makes such a difference in fewer drives than this.
+BY_CHANCE = 1e-3
 
 
-def _of_poses(answer: Answer, ratio: float) -> Iterator[Finding]:
-    """Known poses that the motions contradict; the covariance by these alone is larger by a ratio.
+def contradiction(answer: Answer, task: Task, T: Array, pose: KnownPose) -> str:
+    """How a known pose contradicts the motions, which did without it, in words; empty where it does not.
 
-    With r the whitened residuals of a pose at the answer, of covariance S, the motions alone are S^-1 r from it.
+    ``T`` (m, 4, 4) are the motions' poses, in the frame of the first sensor; along what they leave free it may be any.
     """
-    rows, widening = answer.fit.rows, answer.errors.widening
-    for what in dict.fromkeys(number.what for number in rows.numbers if number.what and not number.unit):
-        at = [i for i, number in enumerate(rows.numbers) if number.what == what]
-        J = rows.J[at]
-        left, along = np.linalg.eigh(np.eye(len(at)) - J @ answer.freedom.covariance() @ J.T)
-        along = along[:, left > TELLS_ALONE] / left[left > TELLS_ALONE]
-        apart = along.T @ rows.r[at]
-        by_motions = along.T @ along * left[left > TELLS_ALONE] - np.eye(len(apart))
-        covariance = np.eye(len(apart)) + ratio * by_motions + along.T @ J @ widening @ J.T @ along
-        square = float(apart @ np.linalg.solve(covariance, apart))
-        if chdtrc(len(apart), square) < BY_CHANCE:
-            words = (
-                f"{what} by their clouds, or as it is given, is {np.sqrt(square / len(apart)):.2g} times as far from that by "
-                "the motions as both claim"
-            )
-            yield Finding(Ground.CONTRADICTED, words)
+    rows = replace(task.given, given=Given(poses=(pose,))).rows(replace(answer.fit.state, T=T), task.layout)
+    at = [i for i, number in enumerate(rows.numbers) if not number.unit]
+    change, _, order = _in_frame_of(task.names[0], task, answer.fit.state.T)
+    worst = too_much(_scatter_of_blocks(answer, task, change, order))
+    covariance = answer.freedom.covariance() * (1.0 if worst is None else worst.ratio) + answer.errors.widening
+    along, sizes, _ = np.linalg.svd(rows.J[at] @ answer.freedom.left)
+    told = along[:, int((sizes > REACHES * sizes.max(initial=0.0)).sum()) :].T
+    off, J = told @ rows.r[at], told @ rows.J[at]
+    square = float(off @ np.linalg.solve(np.eye(len(off)) + J @ covariance @ J.T, off))
+    if not len(off) or chdtrc(len(off), square) > BY_CHANCE:
+        return ""
+    return f"it is {np.sqrt(square / len(off)):.2g} times as far from where the motions put the two as both claim"
 
 
 def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tuple[str, ...]]:

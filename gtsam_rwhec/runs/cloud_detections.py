@@ -146,9 +146,7 @@ def detect_in_clouds(
     return CloudDetections(of_sensor, report, list(drawn.values()))
 
 
-def motion_by_clouds(
-    log: Log, rig: Rig, sensor: str, progress: Progress
-) -> tuple[list[PoseRecord], list[CloudRecord]]:
+def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> tuple[list[PoseRecord], list[CloudRecord]]:
     """The poses of a LiDAR that knows its motion by its own sweeps, on its `odometry_topic`, and maps that these make.
 
     Raises
@@ -191,7 +189,9 @@ def motion_by_clouds(
         warnings.warn(said, LogWarning, stacklevel=3)
     topic, frame = odometry_topic(sensor), f"{rig.frame_of(sensor)}{START}"
     poses = zip(track.stamps_ns.tolist(), track.T_start_sensor, strict=True)
-    maps = [record_of_cloud(each, clouds_topic(sensor), each.stamp_ns or 0, rig.frame_of(sensor)) for each in track.maps]
+    maps = [
+        record_of_cloud(each, clouds_topic(sensor), each.stamp_ns or 0, rig.frame_of(sensor)) for each in track.maps
+    ]
     return [PoseRecord(stamp, stamp, topic, frame, "", T) for stamp, T in poses], maps
 
 

@@ -175,9 +175,7 @@ def detected(
     return RunLog.with_detections(log, stages, records, others)
 
 
-def _motions_made(
-    log: Log, rig: Rig, tell: Progress
-) -> tuple[dict[str, list[PoseRecord]], list[list[CloudRecord]]]:
+def _motions_made(log: Log, rig: Rig, tell: Progress) -> tuple[dict[str, list[PoseRecord]], list[list[CloudRecord]]]:
     """The poses of sensors whose odometry is in a file or in their clouds, by topic, and maps of clouds; what the log
     has is there."""
     there = {topic.name for topic in log.topics()}
