@@ -3,7 +3,7 @@ from .cloud_odometry import CloudTrack as CloudTrack
 from .cloud_odometry import odometry as odometry
 from .lidars_together import LidarPath as LidarPath
 from .lidars_together import LidarsTogether as LidarsTogether
-from .lidars_together import lidars_together as lidars_together
+from .lidars_together import register_lidars as register_lidars
 from .cloud_files import read_cloud as read_cloud
 from .registered_views import ObjectOptions as ObjectOptions
 from .object_views import SeenObject as SeenObject

@@ -62,7 +62,7 @@ class CloudTrack:
         Why the motion during a sweep is not taken off: points have no times, or none that can be; empty if it is.
     maps : tuple of Cloud
         What was seen around some of the stamps, in the sensor's frame then: sweeps of the seconds before and after, put
-        there by the poses. ``times_s`` are those of the sweeps. `lidars_together` registers those of two LiDARs.
+        there by the poses. ``times_s`` are those of the sweeps. `register_lidars` registers those of two LiDARs.
     """
 
     stamps_ns: np.ndarray

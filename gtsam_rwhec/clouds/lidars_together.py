@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.cloud_odometry import LOST_S, MAP_HALF_S, MAPS_S, NEIGHBOURS, SPACING, moved_on
-from gtsam_rwhec.clouds.point_to_plane import Known, Matches, known, matches, sigmas, units
+from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_VIEWS, Known, Matches, known, matches, sigmas, units
 from gtsam_rwhec.clouds.surfaces import Features, Surface
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.geometry.poses import Array
@@ -30,10 +30,14 @@ SETTLED = 1e-3
 AROUND_S = 0.2
 #: Maps overlap if they share at least this part of the points of one.
 OVERLAP = 0.15
-#: Fewer places, or fewer numbers that they have to spare, do not tell how well they agree.
-FEWEST_PLACES, FEWEST_SPARE = 3, 6
+#: Fewer places do not tell how well they agree.
+FEWEST_PLACES = 3
+#: Freedom of the distribution of places about their pose, and rounds in which their weights settle.
+FREEDOM, ROUNDS = 4.0, 10
 #: Places that scatter by more than so many times what each claims do not show one pose.
-MOST_SCATTER = 25.0
+MOST_SCATTER = 400.0
+#: Information below this share of the largest is rounding.
+ROUNDING = 1e-12
 #: All ranges of a LiDAR are off alike by this, m, one standard deviation.
 RANGE_BIAS_M = 0.01
 
@@ -69,8 +73,9 @@ class LidarsTogether:
         The median share of the points of the second's maps that lie on the first's.
     noise_m : float
         Standard deviation of a distance between both.
-    scatter : float
-        How the places disagree, over what each claims (mean square); where above 1 the information is less by it.
+    scatter : (float, float)
+        How turns and shifts of places disagree, over what each claims (mean squares); where above 1 the information is
+        less by it.
     why_not : str
         Why it is not to be used; empty if it is.
     clock_sigma_s : float
@@ -85,16 +90,16 @@ class LidarsTogether:
     half_s: float = 0.0
     overlap: float = 0.0
     noise_m: float = 0.0
-    scatter: float = 0.0
+    scatter: tuple[float, float] = (0.0, 0.0)
     why_not: str = ""
     clock_sigma_s: float = 0.0
 
     def __str__(self) -> str:
         pair = f"the clouds of {self.first} and {self.second}"
         if self.why_not:
-            return f"{pair} are not registered with each other: {self.why_not}"
-        values, along = np.linalg.eigh(self.information)
-        told = values > 0.0
+            return f"{pair} do not tell their pose: {self.why_not}"
+        values = np.linalg.eigvalsh(self.information)
+        told = values > ROUNDING * values[-1]
         free = "" if told.all() else f"; {int((~told).sum())} directions slide, and are left to the motions"
         spread = np.linalg.pinv(self.information, hermitian=True)
         deg, mm = np.degrees(np.sqrt(np.trace(spread[:3, :3]))), 1e3 * np.sqrt(np.trace(spread[3:, 3:]))
@@ -104,7 +109,7 @@ class LidarsTogether:
         )
 
 
-def lidars_together(first: LidarPath, second: LidarPath, T_first_second: Array) -> LidarsTogether:
+def register_lidars(first: LidarPath, second: LidarPath, T_first_second: Array) -> LidarsTogether:
     """Register the maps of two LiDARs at all places with one pose of the second in the frame of the first.
 
     ``T_first_second`` (4, 4) is the start. Each place tells the pose by points to planes (`point_to_plane.known`), and
@@ -128,12 +133,13 @@ def lidars_together(first: LidarPath, second: LidarPath, T_first_second: Array) 
 
 @dataclass(frozen=True)
 class _Place:
-    """What both saw at one time, in the frames of both then, the points' spacing, and the second's motion in a second."""
+    """What both saw at one time, in the frames of both then."""
 
     first: Surface
     second: Surface
+    rays: tuple[Array, Array]  #: (n, 3): the directions in which the points of each were seen
     spacing_m: float
-    velocity: Array
+    velocity: Array  #: (6,): the second's motion in a second
 
 
 def _places(first: LidarPath, second: LidarPath, half_s: float) -> Iterator[_Place]:
@@ -152,29 +158,42 @@ def _places(first: LidarPath, second: LidarPath, half_s: float) -> Iterator[_Pla
         if last and (stamp - last[0] < 1.98e9 * half_s or not moved_on(last[1], at[0][0], reach)):
             continue
         shift = se3.inverse(at[1][:1])[0] @ at[1][1]
-        clouds = [_cut(first.maps[k], np.eye(4), 0.0, half_s), _cut(second.maps[j], shift, late_s, half_s)]
-        if min(map(len, clouds)) < NEIGHBOURS:
+        both = [
+            _cut(first.maps[k], first.path, 0.0, half_s, np.eye(4)),
+            _cut(second.maps[j], second.path, late_s, half_s, shift),
+        ]
+        if min(len(points) for points, _ in both) < NEIGHBOURS:
             continue
-        spacing_m = SPACING * max(float(np.median(np.linalg.norm(points, axis=1))) for points in clouds)
+        spacing_m = SPACING * max(float(np.median(np.linalg.norm(points, axis=1))) for points, _ in both)
         last = stamp, at[0][0]
         around, _ = second.path.at(np.array([stamp - round(1e9 * AROUND_S), stamp + round(1e9 * AROUND_S)]))
         velocity = se3.logmap(se3.inverse(around[:1]) @ around[1:])[0] / (2.0 * AROUND_S)
-        yield _Place(*(_surface(points, spacing_m) for points in clouds), spacing_m, velocity)
+        (one, its), (other, others) = (_surface(*each, spacing_m) for each in both)
+        yield _Place(one, other, (its, others), spacing_m, velocity)
 
 
-def _cut(cloud: Cloud, T: Array, late_s: float, half_s: float) -> Array:
-    """The points of sweeps of some seconds before and after, moved by T."""
+def _cut(cloud: Cloud, path: Trajectory, late_s: float, half_s: float, T: Array) -> tuple[Array, Array]:
+    """The points of sweeps of some seconds before and after, and the rays to them (n, 3); both moved by T."""
     assert cloud.times_s is not None
-    points = cloud.points[np.abs(cloud.times_s + late_s) <= half_s]
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+    assert cloud.stamp_ns is not None
+    kept = np.abs(cloud.times_s + late_s) <= half_s
+    times, sweep = np.unique(cloud.times_s[kept], return_inverse=True)
+    stamps = cloud.stamp_ns + np.round(1e9 * np.r_[0.0, times]).astype(np.int64)
+    poses = path.at(stamps)[0]
+    from_where = (se3.inverse(poses[:1]) @ poses[1:])[:, :3, 3]
+    points = cloud.points[kept]
+    rays = points - from_where[sweep]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3]), np.asarray(rays @ T[:3, :3].T)
 
 
-def _surface(points: Array, spacing_m: float) -> Surface:
-    """A map thinned to a spacing. It has no edges: those of beams are none of things."""
+def _surface(points: Array, rays: Array, spacing_m: float) -> tuple[Surface, Array]:
+    """A map thinned to a spacing, and its rays. It has no edges: those of beams are none of things."""
     native, tree = small_gicp.preprocess_points(points, spacing_m, NEIGHBOURS)
     thin = native.points()[:, :3]
     none = Features(np.zeros((0, 3)), np.zeros((0, 3)), cKDTree(np.zeros((0, 3))))
-    return Surface("", Features(thin, native.normals()[:, :3], cKDTree(thin)), none, native, tree)
+    surface = Surface("", Features(thin, native.normals()[:, :3], cKDTree(thin)), none, native, tree)
+    return surface, rays[cKDTree(points).query(thin)[1]]
 
 
 def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float) -> LidarsTogether:
@@ -193,25 +212,26 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
     if overlap < OVERLAP:
         words = f"they overlap by {overlap:.0%} where the motions put the two, and {OVERLAP:.0%} are needed"
         return replace(nothing, why_not=words)
-    those = [(*each, tell) for *each, tell in zip(places, several, tells, strict=True) if tell]
-    ranks = [np.linalg.matrix_rank(tell.information, hermitian=True) for *_, tell in those]
-    spare = sum(ranks) - np.linalg.matrix_rank(total, hermitian=True)
-    squares = sum(float(tell.step @ tell.information @ tell.step) for *_, tell in those)
-    if spare < FEWEST_SPARE:
-        return replace(nothing, why_not="too few places tell the same of the pose to compare them")
-    scatter = float(squares / (spare - 2.0))
-    if scatter > MOST_SCATTER:
-        words = f"places disagree by {np.sqrt(scatter):.2g} times what each claims: maps lie wrongly on each other"
+    told_by = [(place, each, tell) for place, each, tell in zip(places, several, tells, strict=True) if tell]
+    if len(told_by) < FEWEST_PLACES:
+        return replace(nothing, why_not=f"they overlap at {len(told_by)} places, and {FEWEST_PLACES} are needed")
+    step, inverse, scatter = _agreed([tell for *_, tell in told_by])
+    if max(scatter) > MOST_SCATTER:
+        words = f"places disagree by {np.sqrt(max(scatter)):.2g} times what each claims: both did not see the same"
         return replace(nothing, why_not=words)
-    inverse = np.linalg.pinv(total, 1e-12, hermitian=True)
-    alike = inverse @ sum((_alike(*each, T, sigma_m) for each in those), np.zeros((6, 3)))
+    T = T @ se3.expmap(step[None])[0]
+    pulls = [_alike(*each, T, sigma_m) for each in told_by]
+    alike = inverse @ np.sum(pulls, axis=0)
     alike *= (RANGE_BIAS_M, RANGE_BIAS_M, nothing.clock_sigma_s)
-    covariance = max(scatter, 1.0) * inverse + alike @ alike.T
+    # What points of all places are off by together does not average out; what slides stays without weight.
+    told = total @ np.linalg.pinv(total, ROUNDING, hermitian=True)
+    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * told @ units(np.concatenate([each.points for each in several]))[0]
+    covariance = inverse + alike @ alike.T + shared @ shared.T
     return replace(
         nothing,
         T_first_second=T,
-        information=np.linalg.pinv(covariance, 1e-12, hermitian=True),
-        places=len(those),
+        information=np.linalg.pinv(covariance, ROUNDING, hermitian=True),
+        places=len(told_by),
         half_s=half_s,
         overlap=overlap,
         noise_m=float(sigma_m[0]),
@@ -220,24 +240,51 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
     )
 
 
+def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
+    """The step (6,) that most places agree to, its covariance, and how turns and shifts scatter over what places claim.
+
+    Places count less where they are far from the others (Student's t): an odometry that just began, or a moved thing.
+    """
+    information, steps = np.array([each.information for each in tells]), np.array([each.step for each in tells])
+    parts = (slice(0, 3), slice(3, 6))
+    inverses = np.linalg.pinv(information, ROUNDING, hermitian=True)
+    rank = np.array([np.linalg.matrix_rank(each, hermitian=True) for each in information])
+    expected = [float(np.einsum("nij,nji->", information[:, at, at], inverses[:, at, at])) for at in parts]
+    scatter, step = np.ones(2), np.zeros(6)
+    # Of three numbers a place, those of the pose are none to compare, and two less as the scatter is itself found.
+    spare = 1.0 - 5.0 / (3.0 * len(tells))
+    for _ in range(ROUNDS):
+        unit = np.repeat(np.maximum(scatter, 1.0) ** -0.5, 3)
+        scaled = information * unit[:, None] * unit
+        off = steps - step
+        weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
+        weighted = weights[:, None, None] * scaled
+        inverse = np.linalg.pinv(weighted.sum(axis=0), ROUNDING, hermitian=True)
+        step = inverse @ np.einsum("nij,nj->i", weighted, steps)
+        off = steps - step
+        squares = [
+            float(np.einsum("n,ni,nij,nj->", weights, off[:, at], information[:, at, at], off[:, at])) for at in parts
+        ]
+        scatter = np.array(
+            [one / (other * spare) if other else 0.0 for one, other in zip(squares, expected, strict=True)]
+        )
+    return step, inverse, (float(scatter[0]), float(scatter[1]))
+
+
 def _together(tells: Sequence[Known]) -> tuple[Array, Array]:
     """The information (6, 6) of all places, and the step (6,) that they give."""
     total = sum((each.information for each in tells), np.zeros((6, 6)))
     right = sum((each.information @ each.step for each in tells), np.zeros(6))
-    return total, np.linalg.pinv(total, 1e-12, hermitian=True) @ right
+    return total, np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
 
 
 def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> Array:
     """How one place pulls (6, 3) at the pose if the ranges of the first, or of the second, are off, or their clocks."""
     moved = found.points @ T[:3, :3].T + T[:3, 3]
-    rays = (-_unit(moved) @ T[:3, :3], _unit(found.points))
+    rays = -place.rays[0][place.first.faces.nearest(moved)[1]] @ T[:3, :3], place.rays[1][found.at]
     pulls, little = [], 1e-3 * float(sigma_m[0])
     for each in rays:
         off = found.residuals + little * np.einsum("ni,ni->n", found.rows[:, 3:], each)
         other = known(replace(found, residuals=off), sigma_m)
         pulls.append((other.information @ other.step - tell.information @ tell.step) / little)
     return np.column_stack([*pulls, tell.information @ place.velocity])
-
-
-def _unit(points: Array) -> Array:
-    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))

@@ -51,7 +51,7 @@ def registered_maps(
     """What the maps of every two LiDARs tell of their pose, from poses (m, 4, 4) and time offsets (m,)."""
     if not any(maps.values()):
         return []
-    from gtsam_rwhec.clouds import LidarPath, lidars_together  # needs an extra that motions do without
+    from gtsam_rwhec.clouds import LidarPath, register_lidars  # needs an extra that motions do without
 
     tell("registering the clouds of LiDARs with each other")
     C = np.pad(answer.freedom.covariance(), ((0, 1), (0, 1)))
@@ -63,7 +63,7 @@ def registered_maps(
             path = Trajectory(np.asarray(track.stamps_ns) + after_ns, np.asarray(track.T_start_sensor))
             paths.append((LidarPath(track.sensor, clouds, path, float(np.sqrt(C[clock, clock]))), T[k]))
     return [
-        lidars_together(one, other, se3.inverse(T_one[None])[0] @ T_other)
+        register_lidars(one, other, se3.inverse(T_one[None])[0] @ T_other)
         for (one, T_one), (other, T_other) in combinations(paths, 2)
     ]
 

@@ -139,18 +139,14 @@ def _beside_the_motions(
     answer, task, offsets, _ = replace(drive, given=replace(drive.given, poses=())).solved(drive.options.window_s)
     T = near_poses(answer, task)
     found = registered_maps(answer, task, T, [gate.track for gate in drive.gates], offsets, maps, drive.tell)
-    together = tuple(
-        each if each.why_not else replace(each, why_not=contradiction(answer, task, T, pose_of(each))) for each in found
-    )
-    off = [
-        (f"by their clouds, {pose_of(one)}", two.why_not)
-        for one, two in zip(found, together, strict=True)
-        if one.why_not != two.why_not
-    ]
-    off += [(str(pose), contradiction(answer, task, T, pose)) for pose in drive.given.poses]
-    return together, [
-        Finding(Ground.CONTRADICTED, f"{what} contradicts the motions: {words}") for what, words in off if words
-    ]
+    off = {str(pose): contradiction(answer, task, T, pose) for pose in drive.given.poses}
+    together = []
+    for each in found:
+        words = "" if each.why_not else contradiction(answer, task, T, pose_of(each))
+        off[f"by their clouds, {pose_of(each)}"] = words
+        together.append(replace(each, why_not=words) if words else each)
+    findings = [f"{what} contradicts the motions: {words}" for what, words in off.items() if words]
+    return tuple(together), [Finding(Ground.CONTRADICTED, words) for words in findings]
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def _of_blocks(worst: Scatter | None) -> tuple[Finding, ...]:
     return (Finding(Ground.CORRELATED, f"{worst}: its errors are no random walk, and last for long"),)
 
 
-#: A pose that is known otherwise contradicts the motions where chance makes such a difference in fewer drives than this.
+#: A pose contradicts the motions where chance makes such a difference in fewer drives than this.
 BY_CHANCE = 1e-3
 
 

@@ -127,12 +127,12 @@ class Given:
                 raise FrameError(f"a distance of {first!r} to itself is given; name two sensors")
             if value <= 0.0:
                 raise OptionError(f"the distance of {first} and {second} is {value:g} m; give a positive number")
-        for known in self.poses:
-            T, information = np.asarray(known.T_first_second), np.asarray(known.information)
-            if known.first == known.second or T.shape != (4, 4) or information.shape != (6, 6):
-                raise OptionError(f"{known} is no pose (4, 4) of two sensors with an information (6, 6)")
+        for pose in self.poses:
+            T, information = np.asarray(pose.T_first_second), np.asarray(pose.information)
+            if pose.first == pose.second or T.shape != (4, 4) or information.shape != (6, 6):
+                raise OptionError(f"{pose} is no pose (4, 4) of two sensors with an information (6, 6)")
             if not (np.isfinite(T).all() and np.isfinite(information).all() and np.trace(information) > 0.0):
-                raise NoiseError(f"{known} is not finite, or its information is zero; leave it out")
+                raise NoiseError(f"{pose} is not finite, or its information is zero; leave it out")
         others = [name for name in self.heights_m if name != reference]
         if others and reference not in self.heights_m and self.ground is None:
             raise FrameError(
@@ -319,7 +319,7 @@ class GivenRows:
         return np.array(rows).reshape(-1, d)
 
     def _of_pose(self, pose: KnownPose, state: State, d: int) -> Array:
-        """Whitened rows (q, d) of a known pose: its difference from y's in the axes that the second has at the state."""
+        """Whitened rows (q, d): how y's pose differs from a known one, in the axes of the second at the state."""
         K, (j, k) = len(state.T) - 1, (self.place[pose.first], self.place[pose.second])
 
         def parts(sensor: int) -> tuple[Array, Array]:

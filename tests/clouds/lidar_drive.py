@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.clouds import Cloud
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive
-from gtsam_rwhec.simulate.drives import DriveShape
 
 #: T_vehicle_sensor: one looks ahead, one back and down.
 MOUNTS = {
     "front": se3.pose(np.eye(3), np.array([1.5, 0.0, 1.8])),
     "rear": se3.pose(Rotation.from_euler("zyx", [170, 5, -8], degrees=True).as_matrix(), np.array([-1.8, 0.3, 2.0])),
 }
+#: Of roll and pitch.
+SWAYS_RAD_PER_S = np.array([0.9, 0.7])
 BEAMS, STEPS, TURN_S, NOISE_M, REACH_M = 16, 240, 0.1, 0.015, 40.0
 
 
@@ -78,10 +79,12 @@ def sweep(
     return measured[:, None] * rays[hit], times[hit]
 
 
-def driven(seconds: float, seed: int, shape: DriveShape = "planar") -> Drive:
-    """A drive on the ground, or above it, whose sensors are `MOUNTS`."""
-    made = drive({name: SimulatedOdometry(T) for name, T in MOUNTS.items()}, shape, seconds=seconds, seed=seed)
-    made.T_world_vehicle[:, 2, 3] -= made.T_world_vehicle[:, 2, 3].min()
+def driven(seconds: float, seed: int, sway: float = 0.0) -> Drive:
+    """A drive on the ground whose sensors are `MOUNTS`; with a sway, rad, it pitches and rolls so much, slowly."""
+    made = drive({name: SimulatedOdometry(T) for name, T in MOUNTS.items()}, "planar", seconds=seconds, seed=seed)
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 2)
+    turns = sway * np.sin(1e-9 * made.stamps_ns[:, None] * SWAYS_RAD_PER_S + phases)
+    made.T_world_vehicle[:] = made.T_world_vehicle @ se3.expmap(np.pad(turns, ((0, 0), (0, 4))))
     return made
 
 
