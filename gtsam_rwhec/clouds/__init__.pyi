@@ -2,7 +2,7 @@ from .cloud import Cloud as Cloud
 from .cloud_odometry import CloudTrack as CloudTrack
 from .cloud_odometry import odometry as odometry
 from .lidars_together import LidarPath as LidarPath
-from .lidars_together import LidarsTogether as LidarsTogether
+from .lidar_pair import LidarsTogether as LidarsTogether
 from .lidars_together import register_lidars as register_lidars
 from .cloud_files import read_cloud as read_cloud
 from .registered_views import ObjectOptions as ObjectOptions

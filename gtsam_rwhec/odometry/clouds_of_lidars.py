@@ -6,11 +6,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.lidar_pair import LidarsTogether
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
@@ -18,9 +19,6 @@ from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.odometry.prior_knowledge import KnownPose
 from gtsam_rwhec.odometry.window_likelihood import OFFSET
 from gtsam_rwhec.odometry.window_solution import Answer, Task
-
-if TYPE_CHECKING:
-    from gtsam_rwhec.clouds import Cloud, LidarsTogether
 
 #: LiDARs whose clouds are registered are looked for within about this distance of each other, m.
 NEAR_M = 3.0

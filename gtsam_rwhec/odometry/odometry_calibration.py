@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rwhec_factors import se3
 from scipy.special import chdtrc
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.lidar_pair import LidarsTogether
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -39,9 +40,6 @@ from gtsam_rwhec.odometry.window_motions import (
 from gtsam_rwhec.odometry.window_solution import FEWEST, Answer, Task, solve_windows, too_few
 from gtsam_rwhec.results.log_history import RemovalReason, Removed
 from gtsam_rwhec.runs.odometry_cleaning import Gated, gated
-
-if TYPE_CHECKING:
-    from gtsam_rwhec.clouds import Cloud, LidarsTogether
 
 #: If the drive does not determine a time offset, it stays within about this many seconds of the first guess.
 CLOCK_SIGMA_S = 0.05

@@ -95,7 +95,7 @@ def solve_odometries(
         if metadata.cleaning is None:
             raise LogError(f"{clean_path} was not cleaned: gtsam-rwhec clean {clean_path} -o cleaned.mcap")
         tracks = [_on_reference_clock(read_odometry(log, rig, name), rig) for name in rig.odometries]
-        maps = {name: _maps_of(log, rig, name) for name, one in rig.odometries.items() if one.odometry.together}
+        maps = {name: _maps_of(log, rig, name) for name, one in rig.odometries.items() if one.odometry.registers}
     assert rig.reference is not None
     options = options_of(rig)
     found = calibrate_odometries(
@@ -121,7 +121,8 @@ def _on_reference_clock(track: OdometryTrack, rig: Rig) -> OdometryTrack:
 
 def _maps_of(log: Log, rig: Rig, sensor: str) -> list[Cloud]:
     """What detection kept of a LiDAR's clouds, on the reference's clock as its track is."""
-    records = [each for each in log.records([clouds_topic(sensor)]) if isinstance(each, CloudRecord)]
+    there = {clouds_topic(sensor)} & {topic.name for topic in log.topics()}  # a log of an earlier version has none
+    records = [each for each in log.records(there) if isinstance(each, CloudRecord)] if there else []
     return [replace(cloud_of_record(each), stamp_ns=each.stamp_ns + _stated_ns(rig, sensor)) for each in records]
 
 

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement
+from gtsam_rwhec.clouds.lidar_pair import LidarsTogether
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.log_history import Removed
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
-
-if TYPE_CHECKING:
-    from gtsam_rwhec.clouds import LidarsTogether
 
 #: The data contradict a given number that is more than this many standard deviations away: by chance one of 2,000.
 CONTRADICTED = 3.5

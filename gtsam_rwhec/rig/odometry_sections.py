@@ -100,6 +100,11 @@ class OdometrySource(Section):
         return self
 
     @property
+    def registers(self) -> bool:
+        """Whether there are clouds, which may be registered with those of other LiDARs."""
+        return self.clouds is not None and self.together
+
+    @property
     def place(self) -> str:
         """Where the poses are, for messages."""
         if self.tf is not None:

@@ -93,7 +93,7 @@ def _for_detection(sensor: Sensor) -> Sensor:
 
 
 def _before_solving(sensor: OdometrySensor | None) -> OdometrySensor | None:
-    """The sensor's section without `odometry.together`, which only solving uses."""
+    """The sensor's section without ``together``, which only solving uses."""
     if sensor is None:
         return None
     return sensor.model_copy(update={"odometry": sensor.odometry.model_copy(update={"together": True})})
