@@ -243,7 +243,7 @@ def _agreeing(drive: _Drive, first: OdometryCalibration) -> OdometryCalibration:
 
 def _narrowed(found: OdometryCalibration) -> OdometryCalibration:
     """Blocks of windows that scatter less than expected make the covariance smaller, after all comparisons."""
-    return replace(found, covariance=found.covariance * found.possible)
+    return replace(found, covariance=found.narrowed)
 
 
 def _disagreement(one: OdometryCalibration, other: OdometryCalibration) -> str:

@@ -40,15 +40,20 @@ def calibration_of(
     sensors = (reference, *(name for name in names if name != reference))
     change, T, order = _in_frame_of(reference, task, state.T)
     scaled = [name for k, name in enumerate(names) if task.scaled[k]]
-    C = answer.freedom.covariance() + answer.errors.widening
     scatter = _scatter_of_blocks(answer, task, change, order)
     worst = too_much(scatter)
-    covariance = change @ C @ change.T * (1.0 if worst is None else worst.ratio)
+    ratio = 1.0 if worst is None else worst.ratio
+    C, covariance, narrowed = (
+        answer.freedom.covariance(times) + times * answer.errors.widening
+        for times in (1.0, ratio, ratio * _at_most(scatter))
+    )
+    covariance, narrowed = change @ covariance @ change.T, change @ narrowed @ change.T
     left = change @ answer.freedom.left
     if left.shape[1]:
         reached = (np.abs(left) > REACHES * np.abs(left).max(axis=0)).any(axis=1)
-        covariance[reached], covariance[:, reached] = 0.0, 0.0
-        covariance[reached, reached] = np.inf
+        for each in (covariance, narrowed):
+            each[reached], each[:, reached] = 0.0, 0.0
+            each[reached, reached] = np.inf
     free = _free_directions(answer, task)
     certificate = answer.certificate
     others = other_answers(
@@ -86,7 +91,7 @@ def calibration_of(
         others=others,
         findings=(*_findings(answer, task, tracks, clocks, sigmas, sizes), *_of_blocks(worst)),
         remarks=(*_remarks(task), *answer.errors.in_words(names)),
-        possible=_at_most(scatter),
+        narrowed=narrowed,
     )
 
 
@@ -147,7 +152,7 @@ def contradiction(answer: Answer, task: Task, T: Array, pose: KnownPose) -> str:
     at = [i for i, number in enumerate(rows.numbers) if not number.unit]
     change, _, order = _in_frame_of(task.names[0], task, answer.fit.state.T)
     worst = too_much(_scatter_of_blocks(answer, task, change, order))
-    covariance = answer.freedom.covariance() * (1.0 if worst is None else worst.ratio) + answer.errors.widening
+    covariance = answer.freedom.covariance(1.0 if worst is None else worst.ratio) + answer.errors.widening
     along, sizes, _ = np.linalg.svd(rows.J[at] @ answer.freedom.left)
     told = along[:, int((sizes > REACHES * sizes.max(initial=0.0)).sum()) :].T
     off, J = told @ rows.r[at], told @ rows.J[at]

@@ -160,8 +160,8 @@ class OdometryCalibration:
     #: What came of the clouds of every two LiDARs: used in the answer, or why not
     together: tuple[LidarsTogether, ...] = ()
     remarks: tuple[str, ...] = ()  #: What was assumed, in sentences
-    #: The largest factor of the covariance that blocks of windows leave possible, 1 at most
-    possible: float = 1.0
+    #: (d, d): ``covariance`` with as little of the motions' part as blocks of windows leave possible
+    narrowed: Array = field(default_factory=lambda: np.zeros((0, 0)), hash=False)
 
     @property
     def status(self) -> Status:
