@@ -1,6 +1,9 @@
 from .cloud import Cloud as Cloud
 from .cloud_odometry import CloudTrack as CloudTrack
 from .cloud_odometry import odometry as odometry
+from .lidars_together import LidarPath as LidarPath
+from .lidar_pair import LidarsTogether as LidarsTogether
+from .lidars_together import register_lidars as register_lidars
 from .cloud_files import read_cloud as read_cloud
 from .registered_views import ObjectOptions as ObjectOptions
 from .object_views import SeenObject as SeenObject

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 
@@ -38,6 +38,9 @@ TOLD = 0.02
 FEWEST, FEWEST_POINTS = 3, 100
 #: The spacing is found on so many sweeps. A point that is farther than this, m, is none.
 SPACED, FARTHEST_M = 9, 1e4
+#: Maps are kept of times so far apart, s, or doubled until there are no more than so many; each of so much time on both
+#: sides. So the maps of two sensors are of about the same times.
+MAPS_S, MOST_MAPS, MAP_HALF_S = 2.0, 16, 4.0
 #: The points of a sweep are taken over at least and at most these shares of the time between two sweeps.
 SHORTEST, LONGEST = 0.1, 2.0
 
@@ -57,12 +60,16 @@ class CloudTrack:
         Sweeps that are not used, and why.
     why_no_times : str
         Why the motion during a sweep is not taken off: points have no times, or none that can be; empty if it is.
+    maps : tuple of Cloud
+        What was seen around some of the stamps, in the sensor's frame then: sweeps of the seconds before and after, put
+        there by the poses. ``times_s`` are those of the sweeps. `register_lidars` registers those of two LiDARs.
     """
 
     stamps_ns: np.ndarray
     T_start_sensor: Array
     left_out: tuple[str, ...]
     why_no_times: str
+    maps: tuple[Cloud, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,12 @@ class _Sweep:
         """The same with the stamp of its middle, and times from that; times count so many times as much."""
         middle = times * 0.5 * float(self.times_s.min() + self.times_s.max())
         return replace(self, times_s=times * self.times_s - middle, stamp_ns=self.stamp_ns + round(1e9 * middle))
+
+    def held(self, velocity: Array) -> Array:
+        """The points (n, 3) as seen at the middle, without the motion (6,) in a second."""
+        turned = se3.expmap(np.outer(self.times_s, velocity))
+        still: Array = np.einsum("nij,nj->ni", turned[:, :3, :3], self.points) + turned[:, :3, 3]
+        return still
 
 
 def odometry(clouds: Iterable[Cloud], *, progress: Progress | None = None) -> CloudTrack:
@@ -114,7 +127,9 @@ def odometry(clouds: Iterable[Cloud], *, progress: Progress | None = None) -> Cl
         raise CloudError(f"of {total} sweeps {len(found)} can be registered, and motions need {FEWEST}{reasons}")
     at = np.array(sorted(found))
     stamps = np.array([sweeps[k].stamp_ns for k in at], dtype=np.int64)
-    return CloudTrack(stamps, np.array([found[k] for k in at]), tuple(left_out), why_no_times)
+    poses = np.array([found[k] for k in at])
+    maps = _maps([sweeps[k] for k in at], stamps, poses, steps[at], spacing_m / SPACING)
+    return CloudTrack(stamps, poses, tuple(left_out), why_no_times, tuple(maps))
 
 
 def _thinned(clouds: Iterable[Cloud]) -> tuple[list[_Sweep], float, list[str], str]:
@@ -176,8 +191,7 @@ def _registered(
         tell(Counted(words, k + 1, len(sweeps)))
         # The first round knows the motion before a sweep only.
         moving = velocities[k] if before else velocity
-        turned = se3.expmap(np.outer(sweep.times_s, moving))
-        points = np.einsum("nij,nj->ni", turned[:, :3, :3], sweep.points) + turned[:, :3, 3]
+        points = sweep.held(moving)
         cloud, _ = small_gicp.preprocess_points(points, spacing_m, NEIGHBOURS)
         last = max(found, default=None)
         seconds = 0.0 if last is None else 1e-9 * (sweep.stamp_ns - sweeps[last].stamp_ns)
@@ -203,15 +217,41 @@ def _registered(
             assert last is not None
             velocity = se3.logmap((se3.inverse(found[last]) @ T)[None])[0] / seconds
         found[k] = T
-        moved = se3.logmap((se3.inverse(keys[-1][1]) @ T)[None])[0] if keys else np.full(6, np.inf)
-        far = np.linalg.norm(moved[3:]) > MOVED * reach or np.linalg.norm(moved[:3]) > TURNED
-        if target is None or far:
+        if target is None or moved_on(keys[-1][1], T, reach):
             keys.append((points, T))
             if target is None:  # what was before a loss is elsewhere
                 keys = deque(list(keys)[-1:], maxlen=KEPT)
             together = np.concatenate([p @ M[:3, :3].T + M[:3, 3] for p, M in keys])
             target = small_gicp.preprocess_points(together, spacing_m, NEIGHBOURS)
     return found, why
+
+
+def moved_on(before: Array, T: Array, reach: float) -> bool:
+    """Whether a pose is so far from one before it that what is seen is new."""
+    moved = se3.logmap((se3.inverse(before) @ T)[None])[0]
+    return bool(np.linalg.norm(moved[3:]) > MOVED * reach or np.linalg.norm(moved[:3]) > TURNED)
+
+
+def _maps(
+    sweeps: Sequence[_Sweep], stamps: np.ndarray, poses: Array, velocities: Array, reach: float
+) -> Iterator[Cloud]:
+    """Maps around some of the stamps (N,), of sweeps that moved on; none over a gap, over which no motion is known."""
+    step = round(1e9 * MAPS_S)
+    while stamps[-1] - stamps[0] > MOST_MAPS * step:
+        step *= 2
+    piece = np.cumsum(np.r_[0, np.diff(stamps) > 1e9 * LOST_S])
+    for middle in range(int(stamps[0] // step) * step + step // 2, int(stamps[-1]), step):
+        k = int(np.abs(stamps - middle).argmin())
+        near = (np.abs(stamps - stamps[k]) <= 1e9 * MAP_HALF_S) & (piece == piece[k])
+        kept: list[int] = []
+        for i in np.flatnonzero(near).tolist():
+            if i == k or not kept or moved_on(poses[kept[-1]], poses[i], reach):
+                kept.append(i)
+        T = se3.inverse(poses[k][None])[0] @ poses[kept]
+        each = [sweeps[i].held(velocities[i]) @ M[:3, :3].T + M[:3, 3] for i, M in zip(kept, T, strict=True)]
+        times = np.repeat(1e-9 * (stamps[kept] - stamps[k]), [len(points) for points in each])
+        points = np.concatenate(each).astype(np.float32).astype(np.float64)
+        yield Cloud.of(points, times_s=times, stamp_ns=int(stamps[k]))
 
 
 def _fault(

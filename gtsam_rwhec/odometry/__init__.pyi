@@ -2,6 +2,7 @@
 from .prior_knowledge import Given as Given
 from .prior_knowledge import Ground as Ground
 from .prior_knowledge import KnownDirection as KnownDirection
+from .prior_knowledge import KnownPose as KnownPose
 from .track_comparison import OdometryNoise as OdometryNoise
 from .track_comparison import OdometryOptions as OdometryOptions
 from .track_comparison import OdometryTrack as OdometryTrack

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,12 +10,15 @@ from rwhec_factors import se3
 from scipy.special import chdtrc
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.lidar_pair import LidarsTogether
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.odometry_track import OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.odometry.odometry_outcome import calibration_of
+from gtsam_rwhec.odometry.clouds_of_lidars import near_poses, pose_of, poses_of, registered_maps
+from gtsam_rwhec.odometry.odometry_outcome import calibration_of, contradiction
 from gtsam_rwhec.odometry.odometry_record import OdometryCalibration
 from gtsam_rwhec.odometry.prior_knowledge import Given, GivenRows, up_direction
 from gtsam_rwhec.odometry.track_comparison import (
@@ -62,6 +65,7 @@ def calibrate_odometries(
     reference: str,
     given: Given | None = None,
     options: OdometryOptions | None = None,
+    maps: Mapping[str, Sequence[Cloud]] | None = None,
     progress: Progress | None = None,
 ) -> OdometryCalibration:
     """Find where sensors are on a vehicle, each of which knows only its own motion.
@@ -78,6 +82,9 @@ def calibrate_odometries(
     given : Given, optional
         What is known beside the tracks.
     options : OdometryOptions, optional
+    maps : mapping of sensor to clouds, optional
+        What LiDARs saw along their ways, ``CloudTrack.maps``: where those of two overlap they are registered with each
+        other, which tells heights on a plane too. `OdometryCalibration.together` says what came of it.
     progress : callable, optional
         Takes the name of each stage.
 
@@ -110,8 +117,34 @@ def calibrate_odometries(
     ]
     drive = _Drive(tuple(tracks), tuple(gates), tuple(clocks), reference, given, options, tell)
     tell("choosing windows")
+    together, findings = _beside_the_motions(drive, maps or {})
+    drive = replace(drive, given=replace(given, poses=(*given.poses, *poses_of(together))))
     first = drive.calibrated(options.window_s)
-    return _narrowed(first) if options.window_s else _agreeing(drive, first)
+    found = _narrowed(first) if options.window_s else _agreeing(drive, first)
+    remarks = (*found.remarks, *map(str, together))
+    return replace(found, together=together, findings=(*found.findings, *findings), remarks=remarks)
+
+
+def _beside_the_motions(
+    drive: _Drive, maps: Mapping[str, Sequence[Cloud]]
+) -> tuple[tuple[LidarsTogether, ...], list[Finding]]:
+    """What the maps of every two LiDARs tell, and which known poses the motions alone contradict."""
+    names = [track.sensor for track in drive.tracks]
+    if lost := [sensor for sensor in maps if sensor not in names]:
+        raise FrameError(f"maps are of {lost[0]!r}, and no track is of it; the sensors are {', '.join(names)}")
+    if not maps and not drive.given.poses:
+        return (), []
+    answer, task, offsets, _ = replace(drive, given=replace(drive.given, poses=())).solved(drive.options.window_s)
+    T = near_poses(answer, task)
+    found = registered_maps(answer, task, T, [gate.track for gate in drive.gates], offsets, maps, drive.tell)
+    off = {str(pose): contradiction(answer, task, T, pose) for pose in drive.given.poses}
+    together = []
+    for each in found:
+        words = "" if each.why_not else contradiction(answer, task, T, pose_of(each))
+        off[f"by their clouds, {pose_of(each)}"] = words
+        together.append(replace(each, why_not=words) if words else each)
+    findings = [f"{what} contradicts the motions: {words}" for what, words in off.items() if words]
+    return tuple(together), [Finding(Ground.CONTRADICTED, words) for words in findings]
 
 
 @dataclass(frozen=True)
@@ -128,6 +161,17 @@ class _Drive:
 
     def calibrated(self, seconds: float | None) -> OdometryCalibration:
         """The calibration with windows of about this length; None: of that with the most information."""
+        answer, task, offsets, begins_ns = self.solved(seconds)
+        removed = {
+            name: gate.removed + _outlying(begins_ns, left_out)
+            for name, gate, left_out in zip(task.names, self.gates, answer.left_out, strict=True)
+        }
+        self.tell("gathering")
+        origin = int(self.tracks[0].stamps_ns[0])
+        return calibration_of(answer, task, self.tracks, self.reference, offsets, self.clocks, removed, origin)
+
+    def solved(self, seconds: float | None) -> tuple[Answer, Task, Array, np.ndarray]:
+        """The answer and its task, the time offsets (m,), s, and when all windows begin, those of outliers too, ns."""
         tracks, gates, clocks, given, options = self.tracks, self.gates, self.clocks, self.given, self.options
         names = tuple(track.sensor for track in tracks)
         origin = int(tracks[0].stamps_ns[0])
@@ -160,13 +204,7 @@ class _Drive:
                 break
         assert answer is not None
         _check_agreement(answer, names)
-        begins = origin + np.round(windows.start * 1e9).astype(np.int64)
-        removed = {
-            name: gate.removed + _outlying(begins, left_out)
-            for name, gate, left_out in zip(names, gates, answer.left_out, strict=True)
-        }
-        self.tell("gathering")
-        return calibration_of(answer, task, tracks, self.reference, offsets, clocks, removed, origin)
+        return answer, task, offsets, origin + np.round(windows.start * 1e9).astype(np.int64)
 
 
 #: The answer is compared with those of windows of these lengths, s: an error that is no random walk (white noise of a
@@ -205,7 +243,7 @@ def _agreeing(drive: _Drive, first: OdometryCalibration) -> OdometryCalibration:
 
 def _narrowed(found: OdometryCalibration) -> OdometryCalibration:
     """Blocks of windows that scatter less than expected make the covariance smaller, after all comparisons."""
-    return replace(found, covariance=found.covariance * found.possible)
+    return replace(found, covariance=found.narrowed)
 
 
 def _disagreement(one: OdometryCalibration, other: OdometryCalibration) -> str:

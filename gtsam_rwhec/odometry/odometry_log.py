@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.named_fields import cloud_of_record
 from gtsam_rwhec.errors import LogError, OptionError, RwhecError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.logs import CloudRecord, Log, LogWriter, open_log
 from gtsam_rwhec.odometry import (
     Given,
     Ground,
@@ -50,10 +52,12 @@ from gtsam_rwhec.runs.output_folder import (
 from gtsam_rwhec.runs.run_log import (
     CALIBRATION_LOG,
     CLEANING_METADATA,
+    OF_DETECTION,
     RECORDED_LOG,
     REPORT_FILE,
     RESULT_FILE,
     SOLUTION_TOPIC,
+    clouds_topic,
     is_from_stage,
     read_embedded_rig,
     read_metadata,
@@ -91,9 +95,11 @@ def solve_odometries(
         if metadata.cleaning is None:
             raise LogError(f"{clean_path} was not cleaned: gtsam-rwhec clean {clean_path} -o cleaned.mcap")
         tracks = [_on_reference_clock(read_odometry(log, rig, name), rig) for name in rig.odometries]
+        maps = {name: _maps_of(log, rig, name) for name, one in rig.odometries.items() if one.odometry.registers}
     assert rig.reference is not None
+    options = options_of(rig)
     found = calibrate_odometries(
-        tracks, reference=rig.reference, given=given_of(rig), options=options_of(rig), progress=progress
+        tracks, reference=rig.reference, given=given_of(rig), options=options, maps=maps, progress=progress
     )
     stated = {name: float(one.time_offset) for name, one in rig.odometries.items() if one.time_offset != "estimate"}
     offsets = {name: value + stated.get(name, 0.0) for name, value in found.time_offsets_s.items()}
@@ -102,12 +108,22 @@ def solve_odometries(
     return OdometrySolved(result_of(found, frames, metadata.detection.sources), rig, metadata.cleaning, found)
 
 
+def _stated_ns(rig: Rig, sensor: str) -> int:
+    """The stated time offset, which is added to stamps; none where it is estimated."""
+    offset = rig.odometries[sensor].time_offset
+    return 0 if offset == "estimate" else round(1e9 * float(offset))
+
+
 def _on_reference_clock(track: OdometryTrack, rig: Rig) -> OdometryTrack:
-    """The track with its stated time offset added to the stamps; a track whose offset is estimated does not change."""
-    offset = rig.odometries[track.sensor].time_offset
-    if offset == "estimate" or offset == 0.0:
-        return track
-    return replace(track, stamps_ns=np.asarray(track.stamps_ns) + round(1e9 * float(offset)))
+    """The track with its stated time offset added to the stamps."""
+    return replace(track, stamps_ns=np.asarray(track.stamps_ns) + _stated_ns(rig, track.sensor))
+
+
+def _maps_of(log: Log, rig: Rig, sensor: str) -> list[Cloud]:
+    """What detection kept of a LiDAR's clouds, on the reference's clock as its track is."""
+    there = {clouds_topic(sensor)} & {topic.name for topic in log.topics()}  # a log of an earlier version has none
+    records = [each for each in log.records(there) if isinstance(each, CloudRecord)] if there else []
+    return [replace(cloud_of_record(each), stamp_ns=each.stamp_ns + _stated_ns(rig, sensor)) for each in records]
 
 
 def given_of(rig: Rig) -> Given:
@@ -148,7 +164,7 @@ def solve_odometries_into(
     write_odometry_result(solved.result, out / RESULT_FILE)
     write_odometry_page(solved.result, out / REPORT_FILE)
     with open_log(clean_path) as log, LogWriter(out / CALIBRATION_LOG) as writer:
-        writer.copy(log, topics_up_to_detection(log), "leave_out")
+        writer.copy(log, topics_up_to_detection(log), "leave_out", of_stages=OF_DETECTION)
         pairs = read_pairs(log, solved.rig)
         write_pairs(writer, pairs.values())
         replace(read_metadata(log), rig=solved.rig).write(writer)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from gtsam_rwhec.calibration.known_frames import MOST_M, MOST_RAD, VERTICAL_RAD, deviations_of
 from gtsam_rwhec.calibration.verdict import Finding, Ground
@@ -15,7 +15,7 @@ from gtsam_rwhec.fitting.block_agreement import Scatter, most_beyond_chance, sca
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise, OdometryTrack
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.odometry_record import Influence, OdometryCalibration, OtherAnswer, Windows
-from gtsam_rwhec.odometry.prior_knowledge import upside_down
+from gtsam_rwhec.odometry.prior_knowledge import Given, KnownPose, upside_down
 from gtsam_rwhec.odometry.track_comparison import Clock, inverted_in_words
 from gtsam_rwhec.odometry.window_likelihood import OFFSET, SCALE, Linear, eliminated
 from gtsam_rwhec.odometry.window_motions import axes_turned
@@ -40,15 +40,20 @@ def calibration_of(
     sensors = (reference, *(name for name in names if name != reference))
     change, T, order = _in_frame_of(reference, task, state.T)
     scaled = [name for k, name in enumerate(names) if task.scaled[k]]
-    C = answer.freedom.covariance() + answer.errors.widening
     scatter = _scatter_of_blocks(answer, task, change, order)
     worst = too_much(scatter)
-    covariance = change @ C @ change.T * (1.0 if worst is None else worst.ratio)
+    ratio = 1.0 if worst is None else worst.ratio
+    C, covariance, narrowed = (
+        answer.freedom.covariance(times) + times * answer.errors.widening
+        for times in (1.0, ratio, ratio * _at_most(scatter))
+    )
+    covariance, narrowed = change @ covariance @ change.T, change @ narrowed @ change.T
     left = change @ answer.freedom.left
     if left.shape[1]:
         reached = (np.abs(left) > REACHES * np.abs(left).max(axis=0)).any(axis=1)
-        covariance[reached], covariance[:, reached] = 0.0, 0.0
-        covariance[reached, reached] = np.inf
+        for each in (covariance, narrowed):
+            each[reached], each[:, reached] = 0.0, 0.0
+            each[reached, reached] = np.inf
     free = _free_directions(answer, task)
     certificate = answer.certificate
     others = other_answers(
@@ -86,7 +91,7 @@ def calibration_of(
         others=others,
         findings=(*_findings(answer, task, tracks, clocks, sigmas, sizes), *_of_blocks(worst)),
         remarks=(*_remarks(task), *answer.errors.in_words(names)),
-        possible=_at_most(scatter),
+        narrowed=narrowed,
     )
 
 
@@ -132,6 +137,29 @@ def _of_blocks(worst: Scatter | None) -> tuple[Finding, ...]:
     if worst is None or not worst.is_by_far:
         return ()
     return (Finding(Ground.CORRELATED, f"{worst}: its errors are no random walk, and last for long"),)
+
+
+#: A pose contradicts the motions where chance makes such a difference in fewer drives than this.
+BY_CHANCE = 1e-3
+
+
+def contradiction(answer: Answer, task: Task, T: Array, pose: KnownPose) -> str:
+    """How a known pose contradicts the motions, which did without it, in words; empty where it does not.
+
+    ``T`` (m, 4, 4) are the motions' poses, in the frame of the first sensor; along what they leave free it may be any.
+    """
+    rows = replace(task.given, given=Given(poses=(pose,))).rows(replace(answer.fit.state, T=T), task.layout)
+    at = [i for i, number in enumerate(rows.numbers) if not number.unit]
+    change, _, order = _in_frame_of(task.names[0], task, answer.fit.state.T)
+    worst = too_much(_scatter_of_blocks(answer, task, change, order))
+    covariance = answer.freedom.covariance(1.0 if worst is None else worst.ratio) + answer.errors.widening
+    along, sizes, _ = np.linalg.svd(rows.J[at] @ answer.freedom.left)
+    told = along[:, int((sizes > REACHES * sizes.max(initial=0.0)).sum()) :].T
+    off, J = told @ rows.r[at], told @ rows.J[at]
+    square = float(off @ np.linalg.solve(np.eye(len(off)) + J @ covariance @ J.T, off))
+    if not len(off) or chdtrc(len(off), square) > BY_CHANCE:
+        return ""
+    return f"it is {np.sqrt(square / len(off)):.2g} times as far from where the motions put the two as both claim"
 
 
 def _in_frame_of(reference: str, task: Task, T: Array) -> tuple[Array, Array, tuple[str, ...]]:
@@ -191,7 +219,7 @@ def _influences(answer: Answer, task: Task, change: Array, order: tuple[str, ...
     result = []
     inverse, C = answer.freedom.inverse(), answer.freedom.covariance()
     for r, row, number in zip(rows.r, rows.J, rows.numbers, strict=True):
-        if not number.what:
+        if not (number.what and number.unit):
             continue
         moved = (change @ inverse @ row / number.sigma)[: 6 * len(order)].reshape(-1, 6)
         spare = 1.0 - float(row @ C @ row)

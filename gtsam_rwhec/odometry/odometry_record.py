@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement
+from gtsam_rwhec.clouds.lidar_pair import LidarsTogether
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.log_history import Removed
@@ -156,9 +157,11 @@ class OdometryCalibration:
     others: tuple[OtherAnswer, ...] = ()  #: Other answers that fit alike
     #: CONTRADICTED: a whole track looks wrong, or contradicts a given distance; COVARIANCE_DOUBTED: doubtful results
     findings: tuple[Finding, ...] = ()
+    #: What came of the clouds of every two LiDARs: used in the answer, or why not
+    together: tuple[LidarsTogether, ...] = ()
     remarks: tuple[str, ...] = ()  #: What was assumed, in sentences
-    #: The largest factor of the covariance that blocks of windows leave possible, 1 at most
-    possible: float = 1.0
+    #: (d, d): ``covariance`` with as little of the motions' part as blocks of windows leave possible
+    narrowed: Array = field(default_factory=lambda: np.zeros((0, 0)), hash=False)
 
     @property
     def status(self) -> Status:

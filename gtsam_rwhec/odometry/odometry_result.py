@@ -101,6 +101,24 @@ class GivenRecord(_Record):
     turned_deg_per_sigma: dict[str, float]
 
 
+class TogetherRecord(_Record):
+    """What the clouds of two LiDARs tell of their pose to each other."""
+
+    first: str
+    second: str
+    used: bool
+    T_first_second: tuple[Row4, Row4, Row4, Row4]
+    information: tuple[tuple[float, ...], ...] = Field(
+        description="of a right perturbation, rotation first; zero: slides"
+    )
+    places: int
+    map_s: float = Field(description="seconds of sweeps in a map")
+    overlap: float
+    noise_mm: float = Field(description="standard deviation of a distance between both")
+    scatter: tuple[float, float] = Field(description="of turns and shifts of places, over what each claims")
+    sentence: str
+
+
 class OtherRecord(_Record):
     """Another answer that fits as well."""
 
@@ -139,6 +157,7 @@ class OdometryResult(_Record):
     free_directions: tuple[FreeRecord, ...]
     given: tuple[GivenRecord, ...]
     other_answers: tuple[OtherRecord, ...]
+    together: tuple[TogetherRecord, ...] = ()
     findings: tuple[str, ...]
     remarks: tuple[str, ...]
     certificate: CertificateRecord
@@ -207,6 +226,22 @@ def result_of(
                 T_reference_sensor={name: _rows(T) for name, T in one.T_reference_sensor.items()},  # type: ignore[misc]
             )
             for one in found.others
+        ),
+        together=tuple(
+            TogetherRecord(
+                first=one.first,
+                second=one.second,
+                used=not one.why_not,
+                T_first_second=_rows(one.T_first_second),  # type: ignore[arg-type]
+                information=_rows(one.information),
+                places=one.places,
+                map_s=2.0 * one.half_s,
+                overlap=one.overlap,
+                noise_mm=1e3 * one.noise_m,
+                scatter=one.scatter,
+                sentence=str(one),
+            )
+            for one in found.together
         ),
         findings=tuple(finding.words for finding in found.findings),
         remarks=found.remarks,

@@ -1,9 +1,10 @@
-"""What a person knows of sensors that know only their own motion: heights, the ground, directions, distances."""
+"""What is known of sensors beside their own motion: heights, the ground, directions, distances, poses."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -42,6 +43,26 @@ class KnownDirection:
     sigma_rad: float  #: Standard deviation about each axis across it, radians
 
 
+@dataclass(frozen=True, eq=False)
+class KnownPose:
+    """The pose of one sensor in the frame of another, as another measurement has it."""
+
+    first: str
+    second: str
+    T_first_second: Array  #: (4, 4)
+    information: Array  #: (6, 6): of a right perturbation, rotation first; zero along what is not known
+
+    def __str__(self) -> str:
+        return f"the pose of {self.second} in {self.first}"
+
+    @cached_property
+    def root(self) -> Array:
+        """(q, 6): root' root is the information."""
+        values, along = np.linalg.eigh(self.information)
+        told = values > ROUNDING * values[-1]
+        return np.asarray(np.sqrt(values[told])[:, None] * along[:, told].T)
+
+
 @dataclass(frozen=True)
 class Given:
     """What a person knows; nothing by default."""
@@ -54,6 +75,7 @@ class Given:
     directions: tuple[KnownDirection, ...] = ()
     #: by (sensor, sensor): measured distances between two sensors' origins, metres; only the refinement uses them
     distances_m: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict, hash=False)
+    poses: tuple[KnownPose, ...] = ()  #: Of two sensors; `LidarsTogether` has them by clouds
 
     def checked(self, sensors: Collection[str], reference: str) -> None:
         """Raise an error for what does not fit these sensors or is not a valid number.
@@ -105,6 +127,12 @@ class Given:
                 raise FrameError(f"a distance of {first!r} to itself is given; name two sensors")
             if value <= 0.0:
                 raise OptionError(f"the distance of {first} and {second} is {value:g} m; give a positive number")
+        for pose in self.poses:
+            T, information = np.asarray(pose.T_first_second), np.asarray(pose.information)
+            if pose.first == pose.second or T.shape != (4, 4) or information.shape != (6, 6):
+                raise OptionError(f"{pose} is no pose (4, 4) of two sensors with an information (6, 6)")
+            if not (np.isfinite(T).all() and np.isfinite(information).all() and np.trace(information) > 0.0):
+                raise NoiseError(f"{pose} is not finite, or its information is zero; leave it out")
         others = [name for name in self.heights_m if name != reference]
         if others and reference not in self.heights_m and self.ground is None:
             raise FrameError(
@@ -116,6 +144,7 @@ class Given:
         yield from (("a height", name) for name in self.heights_m)
         yield from (("a direction", known.sensor) for known in self.directions)
         yield from (("a distance", name) for pair in self.distances_m for name in pair)
+        yield from (("a pose", name) for known in self.poses for name in (known.first, known.second))
 
     def _numbers(self) -> Iterator[tuple[str, tuple[float, float]]]:
         yield from ((f"the height of {name}", number) for name, number in self.heights_m.items())
@@ -132,18 +161,20 @@ class Given:
 
 
 _AXES = {"x": 0, "y": 1, "z": 2}  # columns of a rotation
+#: Information below this share of the largest is rounding.
+ROUNDING = 1e-12
 #: The least length of a lever arm, metres: a shorter one has no direction.
 LEAST_ARM_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Number:
-    """One given number: what it is, its value, standard deviation and unit ("m" or "rad")."""
+    """One given number: what it is, its value and its standard deviation."""
 
     what: str
     value: float
     sigma: float
-    unit: str
+    unit: str  #: "m" or "rad"; empty for a part of a known pose, which has both
 
 
 @dataclass(frozen=True)
@@ -237,6 +268,13 @@ class GivenRows:
             u = (t[k] - t[j]) / length
             number = Number(f"distance of {first} and {second}", value, sigma, "m")
             add(number, length - value, (layout.at[k, 3:6], u @ R[k]), (layout.at[j, 3:6], -u @ R[j]))
+        for pose in self.given.poses:
+            j, k = self.place[pose.first], self.place[pose.second]
+            T = se3.inverse(state.T[j][None])[0] @ state.T[k]
+            off = pose.root @ se3.logmap((np.linalg.inv(pose.T_first_second) @ T)[None])[0]
+            by_first = -pose.root @ se3.adjoint(se3.inverse(T[None]))[0]
+            for value, one, other in zip(off, by_first, pose.root, strict=True):
+                add(Number(str(pose), 0.0, 1.0, ""), value, (layout.at[j, :6], one), (layout.at[k, :6], other))
         for k in np.flatnonzero(layout.open[:, 7]).tolist():
             add(Number("", 0.0, self.clock_sigma_s, "s"), float(state.offset[k]), (int(layout.at[k, 7]), 1.0))
         return Rows(np.array(r), np.array(J).reshape(-1, layout.size), tuple(numbers))
@@ -276,7 +314,35 @@ class GivenRows:
                     row = np.zeros(d)
                     row[at : at + 3], row[-1] = along, -1.0
                     rows.append(row)
+        for pose in self.given.poses:
+            rows += list(self._of_pose(pose, state, d))
         return np.array(rows).reshape(-1, d)
+
+    def _of_pose(self, pose: KnownPose, state: State, d: int) -> Array:
+        """Whitened rows (q, d): how y's pose differs from a known one, in the axes of the second at the state."""
+        K, (j, k) = len(state.T) - 1, (self.place[pose.first], self.place[pose.second])
+
+        def parts(sensor: int) -> tuple[Array, Array]:
+            rotation, translation = np.zeros((9, d)), np.zeros((3, d))
+            if sensor:
+                rotation[:, 9 * sensor - 9 : 9 * sensor] = np.eye(9)
+                at = 9 * K + 3 * sensor - 3
+                translation[:, at : at + 3] = np.eye(3) / state.scale[sensor]
+            else:
+                rotation[:, -1] = np.eye(3).ravel()
+            return rotation, translation
+
+        (R_j, t_j), (R_k, t_k) = parts(j), parts(k)
+        R, t = pose.T_first_second[:3, :3], pose.T_first_second[:3, 3]
+        back = (state.T[j, :3, :3] @ R).T
+        # I + hat(turn) by columns, less the part that is symmetric, which is small to second order.
+        off = np.kron(np.eye(3), back) @ (R_k - np.kron(R.T, np.eye(3)) @ R_j)
+        turn = 0.5 * (off[[5, 6, 1]] - off[[7, 2, 3]])
+        shift = back @ (t_k - t_j - np.kron(t, np.eye(3)) @ R_j)
+        rows = pose.root @ np.concatenate([turn, shift])
+        # Half a turn has no such part either; the whole difference excludes it.
+        turns_known = np.linalg.eigvalsh(pose.information[:3, :3])[0] > 1.0
+        return np.concatenate([rows, off]) if turns_known else np.asarray(rows)
 
     @property
     def _reference_sigma(self) -> float:

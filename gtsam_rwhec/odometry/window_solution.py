@@ -57,6 +57,7 @@ class Freedom:
     left: Array  #: (p, l): directions that prior knowledge leaves free too
     information: Array  #: (p, p): H - N along determined directions, plus that of prior knowledge
     score: Array  #: (p, p): H plus that of prior knowledge: the covariance of the gradient
+    given: Array  #: (p, p): that of prior knowledge alone
 
     def complement(self) -> Array:
         """An orthonormal basis (p, p - l) of the directions that are determined."""
@@ -74,10 +75,10 @@ class Freedom:
         inner = Z.T @ matrix @ Z
         return Z @ np.linalg.inv(inner + RIDGE * np.diag(np.diagonal(inner))) @ Z.T
 
-    def covariance(self) -> Array:
-        """(p, p), zero along the directions that are left free."""
+    def covariance(self, ratio: float = 1.0) -> Array:
+        """(p, p), zero along the directions that are left free; the motions' part of it larger by a ratio."""
         inverse = self.inverse()
-        return inverse @ self.score @ inverse
+        return inverse @ (ratio * (self.score - self.given) + self.given) @ inverse
 
 
 def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, squares: float, spare: float) -> Freedom:
@@ -112,7 +113,7 @@ def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, s
     by_data = np.zeros((layout.size, int(is_free.sum())))
     by_data[data] = V[:, is_free] * unit[:, None]
     by_data = np.linalg.qr(by_data)[0] if by_data.size else by_data
-    return Freedom(by_data, _left(by_data, given, layout), informed + given, H + given)
+    return Freedom(by_data, _left(by_data, given, layout), informed + given, H + given, given)
 
 
 def _left(by_data: Array, given: Array, layout: Layout) -> Array:

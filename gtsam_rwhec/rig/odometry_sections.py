@@ -61,6 +61,12 @@ class OdometrySource(Section):
         "after another; points with times let the motion during a sweep be taken off",
         "/lidar_front/points",
     )
+    together: bool = optional(
+        "whether its clouds are registered with those of other LiDARs, where both saw the same: false, if each should "
+        "be calibrated by the motions alone",
+        False,
+        default=True,
+    )
     scale: Literal["known", "estimate"] = optional(
         "known: lengths are metres. estimate: they are metres times one unknown factor, as those of visual "
         "odometry with one camera",
@@ -92,6 +98,11 @@ class OdometrySource(Section):
         given = self._given("topic", "tf", "file", "clouds")
         self._need_one(given, "topic (of Odometry or PoseStamped), tf: [start, sensor], file (TUM), clouds (a topic)")
         return self
+
+    @property
+    def registers(self) -> bool:
+        """Whether there are clouds, which may be registered with those of other LiDARs."""
+        return self.clouds is not None and self.together
 
     @property
     def place(self) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.odometry_sections import OdometrySensor
 from gtsam_rwhec.rig.sections import Sensor
 from gtsam_rwhec.runs.run_log import read_embedded_rig
 
@@ -91,6 +92,13 @@ def _for_detection(sensor: Sensor) -> Sensor:
     return sensor.model_copy(update={"intrinsics": sensor.intrinsics.model_copy(update={"stated": None})})
 
 
+def _before_solving(sensor: OdometrySensor | None) -> OdometrySensor | None:
+    """The sensor's section without ``together``, which only solving uses."""
+    if sensor is None:
+        return None
+    return sensor.model_copy(update={"odometry": sensor.odometry.model_copy(update={"together": True})})
+
+
 def _of_cleaning(made_with: Rig, rig: Rig) -> Iterator[str]:
     old, new = made_with.carriers, rig.carriers
     yield from (f"carriers.{key}" for key in CLEANED_BY if getattr(old, key) != getattr(new, key))
@@ -98,7 +106,7 @@ def _of_cleaning(made_with: Rig, rig: Rig) -> Iterator[str]:
         if name in made_with.sensors and made_with.sensors[name].time_offset != sensor.time_offset:
             yield f"sensors.{name}.time_offset"
     for name, odometry in rig.odometries.items():
-        if made_with.odometries.get(name) != odometry:
+        if _before_solving(made_with.odometries.get(name)) != _before_solving(odometry):
             yield f"sensors.{name}"
     if made_with.reference != rig.reference:
         yield "reference"

@@ -153,8 +153,8 @@ def detect_in_clouds(
     return CloudDetections(of_sensor, report, list(drawn.values()))
 
 
-def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> list[PoseRecord]:
-    """The poses of a LiDAR that knows its motion by its own sweeps, on its `odometry_topic`.
+def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> tuple[list[PoseRecord], list[CloudRecord]]:
+    """The poses of a LiDAR that knows its motion by its own sweeps, on its `odometry_topic`, and maps that these make.
 
     Raises
     ------
@@ -196,7 +196,10 @@ def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> lis
         warnings.warn(said, LogWarning, stacklevel=3)
     topic, frame = odometry_topic(sensor), f"{rig.frame_of(sensor)}{START}"
     poses = zip(track.stamps_ns.tolist(), track.T_start_sensor, strict=True)
-    return [PoseRecord(stamp, stamp, topic, frame, "", T) for stamp, T in poses]
+    maps = [
+        record_of_cloud(each, clouds_topic(sensor), each.stamp_ns or 0, rig.frame_of(sensor)) for each in track.maps
+    ]
+    return [PoseRecord(stamp, stamp, topic, frame, "", T) for stamp, T in poses], maps
 
 
 def _once(source: _Source, wanted: dict[int, None]) -> Iterator[Cloud]:

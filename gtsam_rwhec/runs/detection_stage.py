@@ -137,7 +137,7 @@ def detected(
     check_topics(log, rig)
     cameras = read_intrinsics(log, rig)
     tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
-    moving = _motions_made(log, rig, tell)
+    moving, maps = _motions_made(log, rig, tell)
     motion = read_carrier_motion(log, rig, moving)
     estimated, failed = estimate_intrinsics(log, rig, workers=workers, progress=tell)
     if failed:
@@ -179,20 +179,23 @@ def detected(
     stages = LogMetadata(rig, cameras, report, image_names=image_names(log))
     records = {sensor: of.records for sensor, of in found.items()}
     others: list[Sequence[CloudRecord] | Sequence[PoseRecord]] = [of_clouds.clouds for of_clouds in in_clouds.values()]
-    others += moving.values()
+    others += [*moving.values(), *maps]
     return RunLog.with_detections(log, stages, records, others)
 
 
-def _motions_made(log: Log, rig: Rig, tell: Progress) -> dict[str, list[PoseRecord]]:
-    """The poses of sensors whose odometry is in a file or in their clouds, by topic; what the log has is there."""
+def _motions_made(log: Log, rig: Rig, tell: Progress) -> tuple[dict[str, list[PoseRecord]], list[list[CloudRecord]]]:
+    """The poses of sensors whose odometry is in a file or in their clouds, by topic, and maps of clouds; what the log
+    has is there."""
     there = {topic.name for topic in log.topics()}
     made = {topic: records for topic, records in records_of_files(rig).items() if topic not in there}
+    maps = []
     for sensor in (name for name, each in rig.odometries.items() if each.odometry.clouds is not None):
         if odometry_topic(sensor) not in there:
             from gtsam_rwhec.runs.cloud_detections import motion_by_clouds
 
-            made[odometry_topic(sensor)] = motion_by_clouds(log, rig, sensor, tell)
-    return made
+            made[odometry_topic(sensor)], of_sensor = motion_by_clouds(log, rig, sensor, tell)
+            maps.append(of_sensor)
+    return made, maps
 
 
 def sheet_beside(out_path: str | Path) -> Path:

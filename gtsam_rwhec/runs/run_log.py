@@ -35,7 +35,7 @@ Report = TypeVar("Report", bound=BaseModel)
 #: This topic has the calibrated frames as static transforms, which viewers show at any time.
 SOLUTION_TOPIC = "/calibration/tf_static"
 #: Detection writes topics with these names.
-_OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses|clouds|odometry)")
+OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses|clouds|odometry)")
 #: Cleaning and solving write topics with these names.
 _OF_CLEANING_AND_SOLVING = re.compile(r"/calibration/(.+/pairs|tf_static)")
 
@@ -109,7 +109,7 @@ def raw_topics(log: Log) -> list[str]:
     """The topics that no stage wrote."""
     if not is_from_stage(log):
         return [topic.name for topic in log.topics()]
-    return [name for name in topics_up_to_detection(log) if not _OF_DETECTION.fullmatch(name)]
+    return [name for name in topics_up_to_detection(log) if not OF_DETECTION.fullmatch(name)]
 
 
 def topics_up_to_detection(log: Log) -> list[str]:
@@ -266,9 +266,9 @@ class RunLog(Log):
 def write_up_to_detection(log: Log, out: LogWriter, images: Images) -> None:
     """Write what was recorded, and what was found in it."""
     if not isinstance(log, RunLog):
-        out.copy(log, topics_up_to_detection(log), images, of_stages=_OF_DETECTION)
+        out.copy(log, topics_up_to_detection(log), images, of_stages=OF_DETECTION)
         return
-    out.copy(log.recorded, log.kept, images, of_stages=_OF_DETECTION)
+    out.copy(log.recorded, log.kept, images, of_stages=OF_DETECTION)
     for cloud in records_of(log, log.found, CloudRecord):
         out.point_cloud(cloud)
     for pose in records_of(log, log.found, PoseRecord):

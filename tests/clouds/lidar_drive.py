@@ -17,6 +17,8 @@ MOUNTS = {
     "front": se3.pose(np.eye(3), np.array([1.5, 0.0, 1.8])),
     "rear": se3.pose(Rotation.from_euler("zyx", [170, 5, -8], degrees=True).as_matrix(), np.array([-1.8, 0.3, 2.0])),
 }
+#: Of roll and pitch.
+SWAYS_RAD_PER_S = np.array([0.9, 0.7])
 BEAMS, STEPS, TURN_S, NOISE_M, REACH_M = 16, 240, 0.1, 0.015, 40.0
 
 
@@ -41,10 +43,21 @@ def yard(driven: Drive, seed: int) -> Boxes:
     return Boxes(centres, sizes, rng.uniform(0.0, np.pi, len(centres)))
 
 
-def sweep(boxes: Boxes, T: np.ndarray, twist: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of one turn that begins at T_world_sensor, and the seconds (n,) after its beginning."""
+def sweep(
+    boxes: Boxes,
+    T: np.ndarray,
+    twist: np.ndarray,
+    rng: np.random.Generator,
+    aside_rad: float = np.pi,
+    bias_m: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of one turn that begins at T_world_sensor, and the seconds (n,) after its beginning.
+
+    It sees up to an angle to both sides, and measures all ranges too far by a bias.
+    """
     azimuths = np.linspace(-np.pi, np.pi, STEPS, endpoint=False)
-    elevations, steps = np.meshgrid(np.radians(np.linspace(-15.0, 15.0, BEAMS)), np.arange(STEPS), indexing="ij")
+    seen_at = np.flatnonzero(np.abs(azimuths) <= aside_rad)
+    elevations, steps = np.meshgrid(np.radians(np.linspace(-15.0, 15.0, BEAMS)), seen_at, indexing="ij")
     up, steps = elevations.ravel(), steps.ravel()
     around, times = azimuths[steps], steps / STEPS * TURN_S
     rays = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -62,20 +75,26 @@ def sweep(boxes: Boxes, T: np.ndarray, twist: np.ndarray, rng: np.random.Generat
             near, far = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
             ranges = np.where((near < far) & (near > 0.0) & (near < ranges), near, ranges)
     hit = ranges < REACH_M
-    measured = ranges[hit] + rng.normal(0.0, NOISE_M, int(hit.sum()))
+    measured = ranges[hit] + bias_m + rng.normal(0.0, NOISE_M, int(hit.sum()))
     return measured[:, None] * rays[hit], times[hit]
 
 
-def driven(seconds: float, seed: int) -> Drive:
-    """A drive on the ground whose sensors are `MOUNTS`."""
-    return drive({name: SimulatedOdometry(T) for name, T in MOUNTS.items()}, "planar", seconds=seconds, seed=seed)
+def driven(seconds: float, seed: int, sway: float = 0.0) -> Drive:
+    """A drive on the ground whose sensors are `MOUNTS`; with a sway, rad, it pitches and rolls so much, slowly."""
+    made = drive({name: SimulatedOdometry(T) for name, T in MOUNTS.items()}, "planar", seconds=seconds, seed=seed)
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 2)
+    turns = sway * np.sin(1e-9 * made.stamps_ns[:, None] * SWAYS_RAD_PER_S + phases)
+    made.T_world_vehicle[:] = made.T_world_vehicle @ se3.expmap(np.pad(turns, ((0, 0), (0, 4))))
+    return made
 
 
-def sweeps(of: Drive, boxes: Boxes, sensor: str, seed: int) -> Iterator[Cloud]:
+def sweeps(
+    of: Drive, boxes: Boxes, sensor: str, seed: int, *, aside_rad: float = np.pi, bias_m: float = 0.0
+) -> Iterator[Cloud]:
     """The sweeps of a sensor, one for each pose of the drive but the last."""
     rng = np.random.default_rng(seed)
     poses = of.T_world_vehicle @ MOUNTS[sensor]
     twists = se3.logmap(se3.inverse(poses[:-1]) @ poses[1:]) / TURN_S
     for T, twist, stamp in zip(poses, twists, of.stamps_ns.tolist(), strict=False):
-        points, times = sweep(boxes, T, twist, rng)
+        points, times = sweep(boxes, T, twist, rng, aside_rad, bias_m)
         yield Cloud.of(points, times_s=times, stamp_ns=stamp)

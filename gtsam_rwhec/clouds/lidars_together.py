@@ -1,0 +1,236 @@
+"""Where two LiDARs of one vehicle are to each other, by what both saw: maps of each, registered at many places."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rwhec_factors import se3
+from scipy.spatial import cKDTree
+
+from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.cloud_odometry import LOST_S, MAP_HALF_S, MAPS_S, NEIGHBOURS, SPACING, moved_on
+from gtsam_rwhec.clouds.lidar_pair import ROUNDING, LidarsTogether
+from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_VIEWS, Known, Matches, known, matches, sigmas, units
+from gtsam_rwhec.clouds.surfaces import Features, Surface
+from gtsam_rwhec.files.optional_packages import extra_named
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.trajectory import Trajectory
+
+with extra_named():
+    import small_gicp
+
+#: Seconds of sweeps before and after, of which maps are: the shortest with which the maps overlap.
+HALVES_S = (0.5 * MAPS_S, MAP_HALF_S)
+#: Gates, in spacings, from wide to narrow, and the steps in each.
+GATES, STEPS = (8.0, 4.0, 2.0), 6
+#: A step is the last of a gate if it moves points by less than this share of the spacing.
+SETTLED = 1e-3
+#: Velocities are over so many seconds before and after.
+AROUND_S = 0.2
+#: Maps overlap if they share at least this part of the points of one.
+OVERLAP = 0.15
+#: Fewer places do not tell how well they agree.
+FEWEST_PLACES = 3
+#: Freedom of the distribution of places about their pose, and rounds in which their weights settle.
+FREEDOM, ROUNDS = 4.0, 10
+#: Places that scatter by more than so many times what each claims do not show one pose.
+MOST_SCATTER = 400.0
+#: All ranges of a LiDAR are off alike by this, m, one standard deviation.
+RANGE_BIAS_M = 0.01
+
+
+@dataclass(frozen=True)
+class LidarPath:
+    """A LiDAR's maps (`CloudTrack.maps`) and its path, on one clock with others, which is known to a deviation."""
+
+    sensor: str
+    maps: Sequence[Cloud]
+    path: Trajectory
+    clock_sigma_s: float = 0.0
+
+    def stamps(self) -> np.ndarray:
+        """The stamps (N,) of the maps, ns."""
+        return np.array([each.stamp_ns for each in self.maps], dtype=np.int64)
+
+
+def register_lidars(first: LidarPath, second: LidarPath, T_first_second: Array) -> LidarsTogether:
+    """Register the maps of two LiDARs at all places with one pose of the second in the frame of the first.
+
+    ``T_first_second`` (4, 4) is the start. Each place tells the pose by points to planes (`point_to_plane.known`), and
+    counts as much as the scatter of all places says. To that come ranges that are off alike.
+    """
+    clock_sigma_s = float(np.hypot(first.clock_sigma_s, second.clock_sigma_s))
+    names = first.sensor, second.sensor
+    nothing = LidarsTogether(*names, T_first_second, np.zeros((6, 6)), clock_sigma_s=clock_sigma_s)
+    for half_s in HALVES_S:
+        places = list(_places(first, second, half_s))
+        if len(places) < FEWEST_PLACES:
+            words = f"{len(places)} places have maps of both, and {FEWEST_PLACES} are needed; drive longer"
+            nothing = nothing if nothing.why_not else replace(nothing, why_not=words)
+            continue
+        found = _registered(places, nothing, half_s)
+        if not found.why_not:
+            return found
+        nothing = replace(nothing, why_not=found.why_not)
+    return nothing
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What both saw at one time, in the frames of both then."""
+
+    first: Surface
+    second: Surface
+    rays: tuple[Array, Array]  #: (n, 3): the directions in which the points of each were seen
+    spacing_m: float
+    velocity: Array  #: (6,): the second's motion in a second
+
+
+def _places(first: LidarPath, second: LidarPath, half_s: float) -> Iterator[_Place]:
+    """Places as far apart in time as maps are long, with the vehicle moved on between."""
+    if not first.maps or not second.maps:
+        return
+    ours, theirs = first.stamps(), second.stamps()
+    last: tuple[int, Array] | None = None
+    for k, stamp in enumerate(ours.tolist()):
+        j = int(np.abs(theirs - stamp).argmin())
+        late_s = 1e-9 * float(theirs[j] - stamp)
+        at, gaps = zip(*(each.path.at(np.array([stamp, theirs[j]])) for each in (first, second)), strict=True)
+        if abs(late_s) > MAPS_S or np.max(gaps) > LOST_S:
+            continue
+        reach = float(np.median(np.linalg.norm(first.maps[k].points, axis=1)))
+        if last and (stamp - last[0] < 1.98e9 * half_s or not moved_on(last[1], at[0][0], reach)):
+            continue
+        shift = se3.inverse(at[1][:1])[0] @ at[1][1]
+        both = [
+            _cut(first.maps[k], first.path, 0.0, half_s, np.eye(4)),
+            _cut(second.maps[j], second.path, late_s, half_s, shift),
+        ]
+        if min(len(points) for points, _ in both) < NEIGHBOURS:
+            continue
+        spacing_m = SPACING * max(float(np.median(np.linalg.norm(points, axis=1))) for points, _ in both)
+        last = stamp, at[0][0]
+        around, _ = second.path.at(np.array([stamp - round(1e9 * AROUND_S), stamp + round(1e9 * AROUND_S)]))
+        velocity = se3.logmap(se3.inverse(around[:1]) @ around[1:])[0] / (2.0 * AROUND_S)
+        (one, its), (other, others) = (_surface(*each, spacing_m) for each in both)
+        yield _Place(one, other, (its, others), spacing_m, velocity)
+
+
+def _cut(cloud: Cloud, path: Trajectory, late_s: float, half_s: float, T: Array) -> tuple[Array, Array]:
+    """The points of sweeps of some seconds before and after, and the rays to them (n, 3); both moved by T."""
+    assert cloud.times_s is not None
+    assert cloud.stamp_ns is not None
+    kept = np.abs(cloud.times_s + late_s) <= half_s
+    times, sweep = np.unique(cloud.times_s[kept], return_inverse=True)
+    stamps = cloud.stamp_ns + np.round(1e9 * np.r_[0.0, times]).astype(np.int64)
+    poses = path.at(stamps)[0]
+    from_where = (se3.inverse(poses[:1]) @ poses[1:])[:, :3, 3]
+    points = cloud.points[kept]
+    rays = points - from_where[sweep]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3]), np.asarray(rays @ T[:3, :3].T)
+
+
+def _surface(points: Array, rays: Array, spacing_m: float) -> tuple[Surface, Array]:
+    """A map thinned to a spacing, and its rays. It has no edges: those of beams are none of things."""
+    native, tree = small_gicp.preprocess_points(points, spacing_m, NEIGHBOURS)
+    thin = native.points()[:, :3]
+    none = Features(np.zeros((0, 3)), np.zeros((0, 3)), cKDTree(np.zeros((0, 3))))
+    surface = Surface("", Features(thin, native.normals()[:, :3], cKDTree(thin)), none, native, tree)
+    return surface, rays[cKDTree(points).query(thin)[1]]
+
+
+def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float) -> LidarsTogether:
+    """The pose with which all places agree best, and what it is worth."""
+    T, spacing_m = nothing.T_first_second, float(np.median([each.spacing_m for each in places]))
+    for gate in GATES:
+        for _ in range(STEPS):
+            several = [matches(each.second, each.first, T, gate * each.spacing_m) for each in places]
+            sigma_m = sigmas(several, gate * spacing_m)
+            tells = [known(each, sigma_m) if len(each.at) else None for each in several]
+            total, step = _together([each for each in tells if each])
+            T = T @ se3.expmap(step[None])[0]
+            if np.linalg.norm(step[:3]) / SPACING + np.linalg.norm(step[3:]) / spacing_m < SETTLED:
+                break
+    overlap = float(np.median([each.overlap for each in several]))
+    if overlap < OVERLAP:
+        words = f"they overlap by {overlap:.0%} where the motions put the two, and {OVERLAP:.0%} are needed"
+        return replace(nothing, why_not=words)
+    told_by = [(place, each, tell) for place, each, tell in zip(places, several, tells, strict=True) if tell]
+    if len(told_by) < FEWEST_PLACES:
+        return replace(nothing, why_not=f"they overlap at {len(told_by)} places, and {FEWEST_PLACES} are needed")
+    step, inverse, scatter = _agreed([tell for *_, tell in told_by])
+    if max(scatter) > MOST_SCATTER:
+        words = f"places disagree by {np.sqrt(max(scatter)):.2g} times what each claims: both did not see the same"
+        return replace(nothing, why_not=words)
+    T = T @ se3.expmap(step[None])[0]
+    pulls = [_alike(*each, T, sigma_m) for each in told_by]
+    alike = inverse @ np.sum(pulls, axis=0)
+    alike *= (RANGE_BIAS_M, RANGE_BIAS_M, nothing.clock_sigma_s)
+    # What points of all places are off by together does not average out; what slides stays without weight.
+    told = total @ np.linalg.pinv(total, ROUNDING, hermitian=True)
+    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * told @ units(np.concatenate([each.points for each in several]))[0]
+    covariance = inverse + alike @ alike.T + shared @ shared.T
+    return replace(
+        nothing,
+        T_first_second=T,
+        information=np.linalg.pinv(covariance, ROUNDING, hermitian=True),
+        places=len(told_by),
+        half_s=half_s,
+        overlap=overlap,
+        noise_m=float(sigma_m[0]),
+        scatter=scatter,
+        why_not="",
+    )
+
+
+def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
+    """The step (6,) that most places agree to, its covariance, and how turns and shifts scatter over what places claim.
+
+    Places count less where they are far from the others (Student's t): an odometry that just began, or a moved thing.
+    """
+    information, steps = np.array([each.information for each in tells]), np.array([each.step for each in tells])
+    parts = (slice(0, 3), slice(3, 6))
+    inverses = np.linalg.pinv(information, ROUNDING, hermitian=True)
+    rank = np.array([np.linalg.matrix_rank(each, hermitian=True) for each in information])
+    expected = [float(np.einsum("nij,nji->", information[:, at, at], inverses[:, at, at])) for at in parts]
+    scatter, step = np.ones(2), np.zeros(6)
+    # Of three numbers a place, those of the pose are none to compare, and two less as the scatter is itself found.
+    spare = 1.0 - 5.0 / (3.0 * len(tells))
+    for _ in range(ROUNDS):
+        unit = np.repeat(np.maximum(scatter, 1.0) ** -0.5, 3)
+        scaled = information * unit[:, None] * unit
+        off = steps - step
+        weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
+        weighted = weights[:, None, None] * scaled
+        inverse = np.linalg.pinv(weighted.sum(axis=0), ROUNDING, hermitian=True)
+        step = inverse @ np.einsum("nij,nj->i", weighted, steps)
+        off = steps - step
+        squares = [
+            float(np.einsum("n,ni,nij,nj->", weights, off[:, at], information[:, at, at], off[:, at])) for at in parts
+        ]
+        scatter = np.array(
+            [one / (other * spare) if other else 0.0 for one, other in zip(squares, expected, strict=True)]
+        )
+    return step, inverse, (float(scatter[0]), float(scatter[1]))
+
+
+def _together(tells: Sequence[Known]) -> tuple[Array, Array]:
+    """The information (6, 6) of all places, and the step (6,) that they give."""
+    total = sum((each.information for each in tells), np.zeros((6, 6)))
+    right = sum((each.information @ each.step for each in tells), np.zeros(6))
+    return total, np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
+
+
+def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> Array:
+    """How one place pulls (6, 3) at the pose if the ranges of the first, or of the second, are off, or their clocks."""
+    moved = found.points @ T[:3, :3].T + T[:3, 3]
+    rays = -place.rays[0][place.first.faces.nearest(moved)[1]] @ T[:3, :3], place.rays[1][found.at]
+    pulls, little = [], 1e-3 * float(sigma_m[0])
+    for each in rays:
+        off = found.residuals + little * np.einsum("ni,ni->n", found.rows[:, 3:], each)
+        other = known(replace(found, residuals=off), sigma_m)
+        pulls.append((other.information @ other.step - tell.information @ tell.step) / little)
+    return np.column_stack([*pulls, tell.information @ place.velocity])
