@@ -137,8 +137,8 @@ def _surface(points: Array, rays: Array, spacing_m: float) -> tuple[Surface, Arr
     """A map thinned to a spacing, and its rays. It has no edges: those of beams are none of things."""
     native, tree = small_gicp.preprocess_points(points, spacing_m, NEIGHBOURS)
     thin = native.points()[:, :3]
-    none = Features(np.zeros((0, 3)), np.zeros((0, 3)), cKDTree(np.zeros((0, 3))))
-    surface = Surface("", Features(thin, native.normals()[:, :3], cKDTree(thin)), none, native, tree)
+    none = Features(np.zeros((0, 3)), np.zeros((0, 3)))
+    surface = Surface("", Features(thin, native.normals()[:, :3]), none, native, tree)
     return surface, rays[cKDTree(points).query(thin)[1]]
 
 
