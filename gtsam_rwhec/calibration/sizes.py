@@ -138,7 +138,7 @@ class TargetSize:
         of, who = ("lengths in the clouds", "cameras") if self.is_of_clouds else ("the size", "printers")
         return (
             f"the motion tells {of} of {self.target} to {rounded(100.0 * sigma)} % only, and {100.0 * PRINTED:g} %, as "
-            f"{who} err, moves {most} by {rounded(moved_mm)} mm, which no standard deviation has"
+            f"{who} err, moves {most} by {rounded(moved_mm)} mm, which the standard deviations do not hold"
         )
 
     def is_untold(self, refined: Refined) -> bool:
