@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,11 @@ collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OP
 
 #: The tests of the limit itself, which begin with several threads.
 OF_THE_LIMIT = "test_blas_threads.py"
+
+
+def pytest_collection_finish() -> None:
+    """What was collected lives to the end: no search for garbage need look at it again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="module", autouse=True)

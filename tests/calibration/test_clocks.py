@@ -174,11 +174,11 @@ def test_a_late_clock_is_found_and_estimated(late_s: float) -> None:
 
 
 def test_calibrate_says_why_an_offset_is_not_estimated() -> None:
-    problem, _ = moving(1, 0.03, stamped=False)
+    problem, _ = moving(1, 0.03, count=30, stamped=False)
     assert why_of(rw.calibrate(problem)).evidence == "the measurements have no stamps"
     few, _ = moving(1, count=FEWEST_STAMPS - 1)
     assert why_of(rw.calibrate(few)).evidence == f"cam: {FEWEST_STAMPS - 1} stamps are too few for an offset"
-    late, _ = moving(1, 0.03)
+    late, _ = moving(1, 0.03, count=30)
     told = rw.calibrate(late, rw.CalibrateOptions(time_offsets=False))
     assert why_of(told).evidence == "an option says so"
     assert told.time_offsets_s == {}

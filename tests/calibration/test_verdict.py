@@ -221,9 +221,9 @@ def check(seeds: range) -> None:
 
 
 def test_a_verdict_does_not_hang_on_the_last_digit() -> None:
-    check(range(1))
+    check(range(30, 31))
 
 
 @pytest.mark.slow
 def test_no_verdict_of_200_hangs_on_the_last_digit() -> None:
-    check(range(1, 26))
+    check(range(25))

@@ -87,7 +87,7 @@ def calls(tags: int) -> tuple[Counter[str], int]:
 
 
 def test_no_more_is_called_for_more_tags() -> None:
-    (few, factors), (many, more_factors) = calls(10), calls(40)
+    (few, factors), (many, more_factors) = calls(5), calls(15)
     assert few
     assert few == many
     assert factors == more_factors

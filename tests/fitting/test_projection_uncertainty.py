@@ -36,8 +36,8 @@ def in_one_corner(given: Cell) -> Cell:
 def test_deviations_are_those_of_many_runs() -> None:
     projected = []
     P = np.array([0.2, -0.1, 1.5])
+    given = cell(0, images=15, cameras=1, corner_px=1e-9)
     for seed in range(60):
-        given = cell(0, images=15, cameras=1, corner_px=1e-9)
         rng = np.random.default_rng(seed)
         views = {
             pair: replace(view, pixels=view.pixels + rng.normal(scale=0.1, size=view.pixels.shape))

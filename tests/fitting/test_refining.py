@@ -295,20 +295,18 @@ def hardly_tilting(seed: int, frames: int = 400) -> tuple[rw.Problem, np.ndarray
 
 def test_noise_in_the_derivatives_is_no_information() -> None:
     """A's noise is in residuals and in their derivatives: together they say that a height is what it is taken to be."""
-    squares, before = [], []
-    for seed in range(2):
-        problem, Y = hardly_tilting(seed)
-        for found, without in ((squares, True), (before, False)):
-            with pytest.MonkeyPatch.context() as patch:
-                if not without:
-                    patch.setattr(Task, "without_noise", lambda self, found: (self, found))
-                refined, noise = refined_under(problem)
-            assert noise.hand == "sensorcarrier"
-            assert not noise.has_systematic  # the evidence is that of the side that was chosen in the end
-            error = se3.logmap((np.linalg.inv(refined.Y["camera"].matrix()) @ Y)[None])[0]
-            found.append(float(error @ np.linalg.solve(refined.covariance("camera"), error)))
-    assert np.median(squares) < 12.6 < np.median(before)
-    assert max(squares) < max(before)
+    problem, Y = hardly_tilting(0)
+    squares = []
+    for without in (True, False):
+        with pytest.MonkeyPatch.context() as patch:
+            if not without:
+                patch.setattr(Task, "without_noise", lambda self, found: (self, found))
+            refined, noise = refined_under(problem)
+        assert noise.hand == "sensorcarrier"
+        assert not noise.has_systematic  # the evidence is that of the side that was chosen in the end
+        error = se3.logmap((np.linalg.inv(refined.Y["camera"].matrix()) @ Y)[None])[0]
+        squares.append(float(error @ np.linalg.solve(refined.covariance("camera"), error)))
+    assert squares[0] < 12.6 < squares[1], squares
 
 
 def test_a_wall_of_small_tags_along_a_path_that_walks() -> None:
