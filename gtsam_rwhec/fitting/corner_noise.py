@@ -174,16 +174,17 @@ class Reduced:
         """
         sums, log_det = self.without_common(noise)
         s2, S, d = noise.corner_px**2, noise.carrier, len(self.G)
-        arrow, whole = None, sums.G / s2 + self.prior
-        if S is not None:
+        whole = sums.G / s2 + self.prior
+        if S is None:
+            arrow = self._order.split(whole)
+        else:
             A, places = np.eye(6) + sums.M * S[:, None] * S / s2, d + np.arange(6 * len(sums.M)).reshape(-1, 6)
             C = sums.C * S[:, None] / s2
             if self._order.blocks.size <= places.size:
                 arrow = Arrow(places, np.arange(d), A, C, whole)
             else:
-                flat = C.reshape(-1, d)
-                whole = np.block([[whole, flat.T], [flat, block_diag(*A)]])
-        inverse = (arrow or self._order.split(whole)).inverse()
+                arrow = self._order.split(whole).with_more(C.reshape(-1, d), block_diag(*A))
+        inverse = arrow.inverse()
         return sums, inverse, log_det + self.count * float(np.log(s2)) + inverse.log_det
 
     def estimate(self, noise: Noise, sums: Reduced, inverse: ArrowInverse) -> tuple[Array, Array]:

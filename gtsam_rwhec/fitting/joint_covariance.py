@@ -267,6 +267,13 @@ class Arrow:
         """The sum with a matrix of the same blocks."""
         return replace(self, alone=self.alone + other.alone, ties=self.ties + other.ties, rest=self.rest + other.rest)
 
+    def with_more(self, ties: Array, own: Array) -> Arrow:
+        """The same with k parameters more in the rest: their products (k, d) with those before, and (k, k)."""
+        others = np.append(self.others, ties.shape[1] + np.arange(len(own)))
+        of_blocks, of_rest = ties[:, self.blocks].transpose(1, 2, 0), ties[:, self.others]
+        rest = np.block([[self.rest, of_rest.T], [of_rest, own]])
+        return Arrow(self.blocks, others, self.alone, np.concatenate([self.ties, of_blocks], axis=2), rest)
+
     def inverse(self) -> ArrowInverse:
         """LinAlgError if it is not positive definite."""
         L = np.linalg.cholesky(self.alone)
