@@ -105,25 +105,25 @@ def test_what_the_surroundings_do_not_tell_is_left_out() -> None:
 
 def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are_said() -> None:
     rng, truth = np.random.default_rng(0), se3.pose(np.eye(3), np.array([-2.0, 0.3, 0.4]))
-    stamps, paths = np.arange(6) * 2 * 10**9, []
+    stamps, paths = np.arange(4) * 2 * 10**9, []
     for T in (np.eye(4), truth):
-        poses = se3.pose(np.tile(np.eye(3), (6, 1, 1)), np.outer(np.arange(6), [4.0, 0.0, 0.0])) @ T
+        poses = se3.pose(np.tile(np.eye(3), (4, 1, 1)), np.outer(np.arange(4), [4.0, 0.0, 0.0])) @ T
         clouds = []
         for stamp, pose in zip(stamps.tolist(), poses, strict=True):
-            sides = rng.integers(0, 4, 4000)  # floor, ceiling, walls
-            points = np.column_stack([rng.uniform(-8, 8, 4000), rng.uniform(-2, 2, 4000), rng.uniform(-1.5, 1.5, 4000)])
+            sides = rng.integers(0, 4, 2000)  # floor, ceiling, walls
+            points = np.column_stack([rng.uniform(-8, 8, 2000), rng.uniform(-2, 2, 2000), rng.uniform(-1.5, 1.5, 2000)])
             for axis, half in ((1, 2.0), (2, 1.5)):
                 for k, sign in enumerate((-1.0, 1.0)):
                     on = sides == 2 * axis - 2 + k
                     points[on, axis] = sign * half + rng.normal(0.0, 0.01, int(on.sum()))
             points[:, 0] += pose[0, 3]
             seen = (points - pose[:3, 3]) @ pose[:3, :3]
-            clouds.append(Cloud.of(seen, times_s=np.zeros(4000), stamp_ns=stamp))
+            clouds.append(Cloud.of(seen, times_s=np.zeros(2000), stamp_ns=stamp))
         paths.append(LidarPath(f"lidar {len(paths)}", clouds, Trajectory(stamps, poses)))
     off = se3.expmap(np.array([[0.02, -0.02, 0.03, 0.3, 0.2, -0.3]]))[0]
     found = register_lidars(paths[0], paths[1], truth @ off)
     assert not found.why_not
-    assert found.places == 6
+    assert found.places == 4
     assert "what slides (1 of 6 directions)" in str(found)
     assert abs(np.linalg.eigh(found.information)[1][3, 0]) == pytest.approx(1.0, abs=1e-3)
     error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
