@@ -336,8 +336,8 @@ def _of_sweeps(sweeps: Sequence[Topic], where: str) -> tuple[str, tuple[str, ...
     reference = max(found, key=lambda name: found[name].count)
     more = (
         "# Each LiDAR's motion is found by registering its sweeps, and their poses where two saw the same. Where\n"
-        "# they did not, a vehicle in a plane tells no heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of poses\n"
-        "# may be a sensor too: {topic: /odom}.\n"
+        "# they did not, a vehicle in a plane tells no heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of\n"
+        "# poses may be a sensor too: {topic: /odom}.\n"
     )
     remarks: dict[KeyPath, str] = {("reference",): "TODO a guess: the sensor in whose frame you want the others"}
     notes = tuple(f"sweeps: {name}, topic {topic.name}, {topic.count} clouds" for name, topic in found.items())
