@@ -57,6 +57,7 @@ SCRIPTS: dict[str, tuple[str, str | None]] = {
     "odometry_bounds": ("--runs 40", "--runs 1"),
     "object_clouds": ("--runs 300", "--runs 6 --views 9"),
     "odometry_planar": ("--runs 200", "--runs 1"),
+    "lidars_together": ("", "--runs 1"),
     "lidar_camera": ("", "--runs 3 --biased 1 --splits 2"),
     "fleet_scale": ("", None),
     "fleet_kills": ("", None),

@@ -56,7 +56,8 @@ class LidarsTogether:
             return f"{pair} do not tell their pose: {self.why_not}"
         values = np.linalg.eigvalsh(self.information)
         told = values > ROUNDING * values[-1]
-        free = "" if told.all() else f"; {int((~told).sum())} directions slide, and are left to the motions"
+        slide = int((~told).sum())
+        free = f"; what slides ({slide} of 6 directions) is left to the motions" if slide else ""
         spread = np.linalg.pinv(self.information, hermitian=True)
         deg, mm = np.degrees(np.sqrt(np.trace(spread[:3, :3]))), 1e3 * np.sqrt(np.trace(spread[3:, 3:]))
         return (

@@ -8,11 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rwhec_factors import se3
 from scipy.spatial import cKDTree
+from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.cloud_odometry import LOST_S, MAP_HALF_S, MAPS_S, NEIGHBOURS, SPACING, moved_on
 from gtsam_rwhec.clouds.lidar_pair import ROUNDING, LidarsTogether
-from gtsam_rwhec.clouds.point_to_plane import SHARED_BY_VIEWS, Known, Matches, known, matches, sigmas, units
+from gtsam_rwhec.clouds.point_to_plane import (
+    LEAST_SHARE,
+    SHARED_BY_VIEWS,
+    Known,
+    Matches,
+    known,
+    matches,
+    sigmas,
+    units,
+)
 from gtsam_rwhec.clouds.surfaces import Features, Surface
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.geometry.poses import Array
@@ -33,6 +43,8 @@ AROUND_S = 0.2
 OVERLAP = 0.15
 #: Fewer places do not tell how well they agree.
 FEWEST_PLACES = 3
+#: Ellipsoids of this level hold what they claim, however few the places are.
+LEVEL = 0.95
 #: Freedom of the distribution of places about their pose, and rounds in which their weights settle.
 FREEDOM, ROUNDS = 4.0, 10
 #: Places that scatter by more than so many times what each claims do not show one pose.
@@ -149,8 +161,15 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
         for _ in range(STEPS):
             several = [matches(each.second, each.first, T, gate * each.spacing_m) for each in places]
             sigma_m = sigmas(several, gate * spacing_m)
-            tells = [known(each, sigma_m) if len(each.at) else None for each in several]
-            total, step = _together([each for each in tells if each])
+            told = [
+                (place, each, known(each, sigma_m)) for place, each in zip(places, several, strict=True) if len(each.at)
+            ]
+            if len(told) < FEWEST_PLACES:
+                return replace(nothing, why_not=f"they overlap at {len(told)} places, and {FEWEST_PLACES} are needed")
+            unit, _ = units(np.concatenate([each.points for _, each, _ in told]))
+            tells, total = _without_slides([tell for *_, tell in told], unit)
+            right = np.sum([each.information @ each.step for each in tells], axis=0)
+            step = np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
             T = T @ se3.expmap(step[None])[0]
             if np.linalg.norm(step[:3]) / SPACING + np.linalg.norm(step[3:]) / spacing_m < SETTLED:
                 break
@@ -158,26 +177,22 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
     if overlap < OVERLAP:
         words = f"they overlap by {overlap:.0%} where the motions put the two, and {OVERLAP:.0%} are needed"
         return replace(nothing, why_not=words)
-    told_by = [(place, each, tell) for place, each, tell in zip(places, several, tells, strict=True) if tell]
-    if len(told_by) < FEWEST_PLACES:
-        return replace(nothing, why_not=f"they overlap at {len(told_by)} places, and {FEWEST_PLACES} are needed")
-    step, inverse, scatter = _agreed([tell for *_, tell in told_by])
+    step, inverse, scatter = _agreed(tells)
     if max(scatter) > MOST_SCATTER:
         words = f"places disagree by {np.sqrt(max(scatter)):.2g} times what each claims: both did not see the same"
         return replace(nothing, why_not=words)
     T = T @ se3.expmap(step[None])[0]
-    pulls = [_alike(*each, T, sigma_m) for each in told_by]
+    pulls = [_alike(*each, T, sigma_m) for each in told]
     alike = inverse @ np.sum(pulls, axis=0)
     alike *= (RANGE_BIAS_M, RANGE_BIAS_M, nothing.clock_sigma_s)
     # What points of all places are off by together does not average out; what slides stays without weight.
-    told = total @ np.linalg.pinv(total, ROUNDING, hermitian=True)
-    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * told @ units(np.concatenate([each.points for each in several]))[0]
+    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * np.linalg.pinv(total, ROUNDING, hermitian=True) @ total @ unit
     covariance = inverse + alike @ alike.T + shared @ shared.T
     return replace(
         nothing,
         T_first_second=T,
         information=np.linalg.pinv(covariance, ROUNDING, hermitian=True),
-        places=len(told_by),
+        places=len(told),
         half_s=half_s,
         overlap=overlap,
         noise_m=float(sigma_m[0]),
@@ -196,11 +211,9 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
     inverses = np.linalg.pinv(information, ROUNDING, hermitian=True)
     rank = np.array([np.linalg.matrix_rank(each, hermitian=True) for each in information])
     expected = [float(np.einsum("nij,nji->", information[:, at, at], inverses[:, at, at])) for at in parts]
-    scatter, step = np.ones(2), np.zeros(6)
-    # Of three numbers a place, those of the pose are none to compare, and two less as the scatter is itself found.
-    spare = 1.0 - 5.0 / (3.0 * len(tells))
+    scatter, step, unsure = np.ones(2), np.zeros(6), 1.0
     for _ in range(ROUNDS):
-        unit = np.repeat(np.maximum(scatter, 1.0) ** -0.5, 3)
+        unit = np.repeat(np.maximum(unsure * scatter, 1.0) ** -0.5, 3)
         scaled = information * unit[:, None] * unit
         off = steps - step
         weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
@@ -211,17 +224,26 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
         squares = [
             float(np.einsum("n,ni,nij,nj->", weights, off[:, at], information[:, at, at], off[:, at])) for at in parts
         ]
+        count = float(weights.sum() ** 2 / (weights**2).sum())
+        spare = 1.0 - 1.0 / count
         scatter = np.array(
             [one / (other * spare) if other else 0.0 for one, other in zip(squares, expected, strict=True)]
         )
+        # The scatter of few places is itself not known: ellipsoids hold as much as if it were.
+        unsure = 6.0 * float(fdtri(6.0, 3.0 * (count - 1.0), LEVEL) / chdtri(6.0, 1.0 - LEVEL))
     return step, inverse, (float(scatter[0]), float(scatter[1]))
 
 
-def _together(tells: Sequence[Known]) -> tuple[Array, Array]:
-    """The information (6, 6) of all places, and the step (6,) that they give."""
-    total = sum((each.information for each in tells), np.zeros((6, 6)))
-    right = sum((each.information @ each.step for each in tells), np.zeros(6))
-    return total, np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
+def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], Array]:
+    """What places tell without what slides in all of them, and the sum of the information (6, 6).
+
+    Each place has another direction that slides, by the noise of its normals, so that their sum has none.
+    """
+    total = np.sum([each.information for each in tells], axis=0)
+    values, along = np.linalg.eigh(unit.T @ total @ unit)
+    kept = along[:, values > LEAST_SHARE * values[-1]]
+    told = unit @ kept @ kept.T @ np.linalg.inv(unit)
+    return [replace(each, information=told.T @ each.information @ told) for each in tells], told.T @ total @ told
 
 
 def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> Array:

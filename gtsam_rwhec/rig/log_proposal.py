@@ -345,8 +345,9 @@ def _of_sweeps(sweeps: Sequence[Topic], where: str, vehicle: PoseTopic | None) -
         reference, why = free_name(vehicle.child if is_name(vehicle.child) else "vehicle", taken), "the vehicle's poses"
         sources[reference] = OdometrySource(tf=frames) if vehicle.is_tf else OdometrySource(topic=vehicle.topic)
     more = (
-        "# Each LiDAR's motion is found by registering its sweeps. A vehicle that moves in a plane does not tell\n"
-        "# heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of poses may be a sensor too: {topic: /odom}.\n"
+        "# Each LiDAR's motion is found by registering its sweeps, and their poses where two saw the same. Where\n"
+        "# they did not, a vehicle in a plane tells no heights: add given: {heights_m: {SENSOR: 0.5}}. A topic of\n"
+        "# poses may be a sensor too: {topic: /odom}.\n"
     )
     remarks: dict[KeyPath, str] = {("reference",): "TODO a guess: the sensor in whose frame you want the others"}
     notes = tuple(f"sweeps: {name}, topic {topic.name}, {topic.count} clouds" for name, topic in found.items())

@@ -13,9 +13,10 @@ from given_commands import command
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.clouds import Cloud, odometry
+from gtsam_rwhec.clouds import Cloud, LidarPath, odometry, register_lidars
 from gtsam_rwhec.clouds.named_fields import record_of_cloud
 from gtsam_rwhec.errors import CloudError, LogError
+from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.runs.detection_stage import detect_log
@@ -100,6 +101,38 @@ def test_what_the_surroundings_do_not_tell_is_left_out() -> None:
         clouds.append(Cloud.of(points, times_s=times, stamp_ns=k * 10**8, source=f"sweep {k}"))
     with pytest.raises(CloudError, match=r"of 6 sweeps 1 can be .*sweep 1: .* do not tell its motion along x"):
         odometry(clouds)
+
+
+def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are_said() -> None:
+    rng, truth = np.random.default_rng(0), se3.pose(np.eye(3), np.array([-2.0, 0.3, 0.4]))
+    stamps, paths = np.arange(4) * 2 * 10**9, []
+    for T in (np.eye(4), truth):
+        poses = se3.pose(np.tile(np.eye(3), (4, 1, 1)), np.outer(np.arange(4), [4.0, 0.0, 0.0])) @ T
+        clouds = []
+        for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+            sides = rng.integers(0, 4, 2000)  # floor, ceiling, walls
+            points = np.column_stack([rng.uniform(-8, 8, 2000), rng.uniform(-2, 2, 2000), rng.uniform(-1.5, 1.5, 2000)])
+            for axis, half in ((1, 2.0), (2, 1.5)):
+                for k, sign in enumerate((-1.0, 1.0)):
+                    on = sides == 2 * axis - 2 + k
+                    points[on, axis] = sign * half + rng.normal(0.0, 0.01, int(on.sum()))
+            points[:, 0] += pose[0, 3]
+            seen = (points - pose[:3, 3]) @ pose[:3, :3]
+            clouds.append(Cloud.of(seen, times_s=np.zeros(2000), stamp_ns=stamp))
+        paths.append(LidarPath(f"lidar {len(paths)}", clouds, Trajectory(stamps, poses)))
+    off = se3.expmap(np.array([[0.02, -0.02, 0.03, 0.3, 0.2, -0.3]]))[0]
+    found = register_lidars(paths[0], paths[1], truth @ off)
+    assert not found.why_not
+    assert found.places == 4
+    assert "what slides (1 of 6 directions)" in str(found)
+    assert abs(np.linalg.eigh(found.information)[1][3, 0]) == pytest.approx(1.0, abs=1e-3)
+    error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
+    assert abs(error[3]) > 0.2  # as the start had it
+    assert error @ found.information @ error < 20.0
+    elsewhere = replace(paths[1], maps=[replace(each, points=each.points + 40.0) for each in paths[1].maps])
+    said = str(register_lidars(paths[0], elsewhere, truth))
+    assert said.startswith("the clouds of lidar 0 and lidar 1 do not tell their pose: they overlap ")
+    assert "0 places have maps of both" in str(register_lidars(paths[0], replace(paths[1], maps=()), truth))
 
 
 def test_a_sweep_of_elsewhere_costs_itself_alone(recorded: dict[str, list[Cloud]]) -> None:
