@@ -15,6 +15,7 @@ from gallery_faults import FAULTS, Fault
 BY_NAME = {fault.name: fault for fault in FAULTS}
 
 
+@pytest.mark.usefixtures("without_figures")
 @pytest.mark.parametrize(
     ("name", "images", "verdict", "words"),
     [("millimetres", 4, "refused", "Write length: mm"), ("upside_down", 8, "care", "1 of the 8 images of camera")],

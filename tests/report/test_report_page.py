@@ -81,6 +81,7 @@ def test_every_block_is_shown_and_names_are_text() -> None:
     assert '"name": "\\u003cscript\\u003ealert' in page
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_evidence_of_another_result_is_left_out_and_said(folder: Path, tmp_path: Path) -> None:
     result, beside = tmp_path / "result.json", tmp_path / "evidence.json"
     result.write_bytes((folder / "result.json").read_bytes())
