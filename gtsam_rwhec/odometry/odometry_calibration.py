@@ -132,7 +132,7 @@ def _beside_the_motions(
     drive: _Drive, maps: Mapping[str, Sequence[Cloud]]
 ) -> tuple[tuple[LidarsTogether, ...], list[Finding]]:
     """What the maps of every two LiDARs tell, and which known poses the motions alone contradict."""
-    if not maps and not drive.given.poses:
+    if sum(map(bool, maps.values())) < 2 and not drive.given.poses:
         return (), []
     answer, task, offsets, _ = replace(drive, given=replace(drive.given, poses=())).solved(drive.options.window_s)
     T = near_poses(answer, task)
