@@ -105,7 +105,10 @@ def calibrate_odometries(
     check_progress(progress)
     tell = progress or silent
     tracks = _ordered(tracks, reference, given)
-    given.checked([track.sensor for track in tracks], reference)
+    names = [track.sensor for track in tracks]
+    given.checked(names, reference)
+    if lost := [sensor for sensor in maps or () if sensor not in names]:
+        raise FrameError(f"maps are of {lost[0]!r}, and no track is of it; the sensors are {', '.join(names)}")
     tell("comparing clocks")
     check_common_time(tracks, options.search_s if options.estimate_time_offsets else 0.0)
     gates = [gated(track, options.gates) for track in tracks]
@@ -129,10 +132,7 @@ def _beside_the_motions(
     drive: _Drive, maps: Mapping[str, Sequence[Cloud]]
 ) -> tuple[tuple[LidarsTogether, ...], list[Finding]]:
     """What the maps of every two LiDARs tell, and which known poses the motions alone contradict."""
-    names = [track.sensor for track in drive.tracks]
-    if lost := [sensor for sensor in maps if sensor not in names]:
-        raise FrameError(f"maps are of {lost[0]!r}, and no track is of it; the sensors are {', '.join(names)}")
-    if not maps and not drive.given.poses:
+    if sum(map(bool, maps.values())) < 2 and not drive.given.poses:
         return (), []
     answer, task, offsets, _ = replace(drive, given=replace(drive.given, poses=())).solved(drive.options.window_s)
     T = near_poses(answer, task)

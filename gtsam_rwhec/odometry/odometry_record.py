@@ -37,6 +37,10 @@ ADVICE = {
     "file",
 }
 PRAISE = "the motions of all sensors agree, their joint cost is certified, and they determine every pose"
+PRAISE_WITH_CLOUDS = (
+    "the motions of all sensors agree, their joint cost is certified, and with what the clouds of LiDARs tell of each "
+    "other they determine every pose"
+)
 PRAISE_WITH_GIVEN = (
     "the motions of all sensors agree, their joint cost is certified, and with what was given they determine every "
     "pose. The motions do not check all that was given: an error in it is an error of the poses"
@@ -196,7 +200,8 @@ class OdometryCalibration:
         findings += [Finding(Ground.NOT_UNIQUE, f"another answer fits as well: {other.why}") for other in self.others]
         findings += [*_contradicted(self), *self.findings]
         is_unchecked = any(one.off_by == 0.0 for one in self.influences)
-        return Judgement.of(findings, PRAISE_WITH_GIVEN if is_unchecked else PRAISE, ADVICE)
+        praise = PRAISE if all(one.why_not for one in self.together) else PRAISE_WITH_CLOUDS
+        return Judgement.of(findings, PRAISE_WITH_GIVEN if is_unchecked else praise, ADVICE)
 
     def __str__(self) -> str:
         return "\n".join([str(self.judgement), *(f"- {remark}" for remark in self.remarks)])

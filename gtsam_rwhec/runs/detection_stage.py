@@ -194,7 +194,7 @@ def _motions_made(log: Log, rig: Rig, tell: Progress) -> tuple[dict[str, list[Po
             from gtsam_rwhec.runs.cloud_detections import motion_by_clouds
 
             made[odometry_topic(sensor)], of_sensor = motion_by_clouds(log, rig, sensor, tell)
-            maps.append(of_sensor)
+            maps += [of_sensor] if rig.is_of_odometries else []  # beside cameras nothing reads them
     return made, maps
 
 

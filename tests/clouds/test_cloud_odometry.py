@@ -15,7 +15,7 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, LidarPath, odometry, register_lidars
 from gtsam_rwhec.clouds.named_fields import record_of_cloud
-from gtsam_rwhec.errors import CloudError, LogError
+from gtsam_rwhec.errors import CloudError, FrameError, LogError
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.rig.rig_file import parse_rig
@@ -103,23 +103,28 @@ def test_what_the_surroundings_do_not_tell_is_left_out() -> None:
         odometry(clouds)
 
 
+def maps_of(world: np.ndarray, poses: np.ndarray, stamps: np.ndarray, seed: int) -> list[Cloud]:
+    """What a sensor at T_world_sensor (N, 4, 4) sees of points (n, 3) within 10 m, to 1 cm."""
+    rng, clouds = np.random.default_rng(seed), []
+    for T, stamp in zip(poses, stamps.tolist(), strict=True):
+        near = (world - T[:3, 3]) @ T[:3, :3]
+        near = near[(np.linalg.norm(near, axis=1) < 10.0) & (rng.uniform(size=len(near)) < 0.5)]
+        seen = near + rng.normal(0.0, 0.01, near.shape)
+        clouds.append(Cloud.of(seen, times_s=np.zeros(len(seen)), stamp_ns=stamp))
+    return clouds
+
+
 def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are_said() -> None:
     rng, truth = np.random.default_rng(0), se3.pose(np.eye(3), np.array([-2.0, 0.3, 0.4]))
-    stamps, paths = np.arange(4) * 2 * 10**9, []
-    for T in (np.eye(4), truth):
-        poses = se3.pose(np.tile(np.eye(3), (4, 1, 1)), np.outer(np.arange(4), [4.0, 0.0, 0.0])) @ T
-        clouds = []
-        for stamp, pose in zip(stamps.tolist(), poses, strict=True):
-            sides = rng.integers(0, 4, 2000)  # floor, ceiling, walls
-            points = np.column_stack([rng.uniform(-8, 8, 2000), rng.uniform(-2, 2, 2000), rng.uniform(-1.5, 1.5, 2000)])
-            for axis, half in ((1, 2.0), (2, 1.5)):
-                for k, sign in enumerate((-1.0, 1.0)):
-                    on = sides == 2 * axis - 2 + k
-                    points[on, axis] = sign * half + rng.normal(0.0, 0.01, int(on.sum()))
-            points[:, 0] += pose[0, 3]
-            seen = (points - pose[:3, 3]) @ pose[:3, :3]
-            clouds.append(Cloud.of(seen, times_s=np.zeros(2000), stamp_ns=stamp))
-        paths.append(LidarPath(f"lidar {len(paths)}", clouds, Trajectory(stamps, poses)))
+    x, across, sign = rng.uniform(-12.0, 24.0, 16_000), rng.uniform(-2.0, 2.0, 16_000), rng.choice([-2.0, 2.0], 16_000)
+    sides = rng.integers(0, 2, 16_000)[:, None] == 0  # walls, or floor and ceiling
+    world = np.where(sides, np.column_stack([x, sign, across]), np.column_stack([x, across, sign]))
+    stamps, poses = np.arange(4) * 2 * 10**9, np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = 4.0 * np.arange(4)
+    paths = [
+        LidarPath(f"lidar {k}", maps_of(world, poses @ T, stamps, k), Trajectory(stamps, poses @ T))
+        for k, T in enumerate((np.eye(4), truth))
+    ]
     off = se3.expmap(np.array([[0.02, -0.02, 0.03, 0.3, 0.2, -0.3]]))[0]
     found = register_lidars(paths[0], paths[1], truth @ off)
     assert not found.why_not
@@ -133,6 +138,29 @@ def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are
     said = str(register_lidars(paths[0], elsewhere, truth))
     assert said.startswith("the clouds of lidar 0 and lidar 1 do not tell their pose: they overlap ")
     assert "0 places have maps of both" in str(register_lidars(paths[0], replace(paths[1], maps=()), truth))
+
+
+def test_clouds_that_the_motions_contradict_are_left_out() -> None:
+    driven = lidar_drive.driven(20.0, seed=2)
+    rng, way = np.random.default_rng(0), driven.T_world_vehicle[:, :3, 3]
+    ground = rng.uniform(way.min(axis=0) - 12.0, way.max(axis=0) + 12.0, (15_000, 3)) * (1.0, 1.0, 0.0)
+    walls = np.column_stack([np.round(ground[:, :1] / 7.0) * 7.0, ground[:, 1:2], rng.uniform(0.0, 3.0, 15_000)])
+    world = np.concatenate([ground, walls, walls[:, [1, 0, 2]]])
+    at = np.arange(10, 200, 40)
+    maps = {
+        name: maps_of(world, driven.T_world_vehicle[at] @ T, driven.stamps_ns[at], k)
+        for k, (name, T) in enumerate(lidar_drive.MOUNTS.items())
+    }
+    tracks = [rw.odometry.OdometryTrack(name, *each) for name, each in driven.tracks.items()]
+    options = rw.odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
+    shifted = {**maps, "rear": [replace(each, points=each.points + np.eye(3)[0]) for each in maps["rear"]]}
+    for given, verdict in ((maps, "use"), (shifted, "do_not_use")):
+        found = rw.odometry.calibrate_odometries(tracks, reference="front", options=options, maps=given)
+        (record,) = rw.odometry.result_of(found).together
+        assert record.used == (found.judgement.verdict == "use") == (verdict == "use"), found.judgement
+    assert "by their clouds, the pose of rear in front contradicts the motions" in found.judgement.reason
+    with pytest.raises(FrameError, match="maps are of 'roof'"):
+        rw.odometry.calibrate_odometries(tracks, reference="front", maps={"roof": maps["rear"]})
 
 
 def test_a_sweep_of_elsewhere_costs_itself_alone(recorded: dict[str, list[Cloud]]) -> None:
