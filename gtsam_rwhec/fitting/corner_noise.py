@@ -355,7 +355,7 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     hessian = np.array([up - down for (_, up), (_, down) in zip(above, below, strict=True)]) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
     V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
-    result = {}
+    result: dict[tuple[str, str], float] = {}
     widths = {name: rows.stop - rows.start for name, rows in reduced.slots.items()}
     for width in set(widths.values()):
         names = [name for name in widths if widths[name] == width]
