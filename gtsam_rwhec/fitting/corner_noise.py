@@ -24,6 +24,7 @@ from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows, Sums
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.fitting.joint_covariance import Arrow, ArrowInverse, EliminationOrder
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -338,6 +339,7 @@ STEP = 1e-3
 FEWEST, LEAST_KNOWN = 3.0, 1.0
 
 
+@one_blas_thread()
 def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict[tuple[str, str], float]:
     """Of each unknown's covariance; with `carrier` false only the corners' noise was estimated."""
     deviations = deviations_of(noise)
