@@ -165,14 +165,14 @@ class LogWriter:
 
     def poses(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
         """Write a ``foxglove.PosesInFrame`` of (N, 4, 4) poses."""
-        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "poses": [_pose(pose) for pose in T]}
+        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "poses": _poses(T)}
         self._write(topic, "foxglove.PosesInFrame", stamp_ns, message)
 
     def pose_array(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
         """Write a ``geometry_msgs/msg/PoseArray`` of (N, 4, 4) poses as ROS 2 does: CDR, little endian."""
         time = _time(stamp_ns)
         head = _padded(struct.pack("<iI", time["sec"], time["nsec"]) + _cdr_text(frame)) + struct.pack("<I", len(T))
-        poses = [[*part["position"].values(), *part["orientation"].values()] for part in map(_pose, T)]
+        poses = [[*part["position"].values(), *part["orientation"].values()] for part in _poses(T)]
         data = b"\0\1\0\0" + head + bytes(-len(head) % 8) + np.array(poses, "<f8").tobytes()
         channel = self._channel(topic, "cdr", self._schema("geometry_msgs/msg/PoseArray", "ros2msg", POSE_ARRAY), {})
         with self._saying():
@@ -240,12 +240,14 @@ class LogWriter:
 
     def detections(self, topic: str, stamp_ns: int, frame: str, tags: Iterable[DetectionRecord]) -> None:
         """Write a ``gtsam_rwhec.TagDetections`` of one image; the records' own stamps and frames are not used."""
+        tags = list(tags)
+        poses = iter(_poses([tag.T_camera_tag for tag in tags if tag.T_camera_tag is not None]))
         parts = [
             {
                 "size_m": tag.size_m,
                 "corners_px": None if tag.corners_px is None else _points(tag.corners_px),
                 "corner_indices": tag.corner_indices,
-                "pose": None if tag.T_camera_tag is None else _pose(tag.T_camera_tag),
+                "pose": None if tag.T_camera_tag is None else next(poses),
                 "covariance": None if tag.covariance is None else np.ravel(tag.covariance).tolist(),
                 "reprojection_px": tag.reprojection_px,
                 "reason": tag.reason or None,
@@ -346,17 +348,25 @@ def _time(stamp_ns: int) -> dict[str, int]:
 
 
 def _pose(T: Array) -> dict[str, dict[str, float]]:
-    T = np.asarray(T, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise LogError(f"a pose must be a finite (4, 4) matrix to be written, not {T.tolist()}")
-    R = T[:3, :3]
-    if np.abs(R.T @ R - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise LogError(f"a pose to be written has {R.tolist()} where its rotation should be")
-    quaternion = Rotation.from_matrix(R).as_quat()
-    return {
-        "position": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
-        "orientation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
-    }
+    return _poses([T])[0]
+
+
+def _poses(every: Iterable[Array]) -> list[dict[str, dict[str, float]]]:
+    poses = [np.asarray(T, dtype=np.float64) for T in every]
+    for T in poses:
+        if T.shape != (4, 4) or not np.isfinite(T).all():
+            raise LogError(f"a pose must be a finite (4, 4) matrix to be written, not {T.tolist()}")
+    if not poses:
+        return []
+    T = np.array(poses)
+    R = T[:, :3, :3]
+    wrong = (np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2)) > 1e-3) | (np.linalg.det(R) < 0)
+    if wrong.any():
+        raise LogError(f"a pose to be written has {R[wrong.argmax()].tolist()} where its rotation should be")
+    return [
+        {"position": dict(zip("xyz", t, strict=True)), "orientation": dict(zip("xyzw", q, strict=True))}
+        for t, q in zip(T[:, :3, 3].tolist(), Rotation.from_matrix(R).as_quat().tolist(), strict=True)
+    ]
 
 
 #: Messages by schema, each with a value of its type in every field; a list has one entry.
