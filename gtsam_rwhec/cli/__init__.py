@@ -11,7 +11,7 @@ from gtsam_rwhec.errors import MissingPackageError
 from gtsam_rwhec.files.optional_packages import extra_named
 
 #: Python looks for garbage after so many new objects: most of a run's stay, and looking often took 0.8 s of 100 tags.
-GARBAGE = 20_000
+GARBAGE = 50_000
 
 
 def main() -> None:

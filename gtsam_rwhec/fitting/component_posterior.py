@@ -224,7 +224,7 @@ class Mixture:
         wanted = chdtri(len(rows), 1.0 - CONFIDENCE)
 
         def is_small(share: float) -> bool:
-            return _quantile(samples, weights, plain + share * mean) > wanted
+            return bool(_quantile(samples, weights, plain + share * mean) > wanted)
 
         if least and not is_small(least):
             return least

@@ -275,10 +275,10 @@ class Sums:
 
     def add(self, stack: Stack, places: Places, rows: Rows, J_A: Array | None, sign: float = 1.0) -> None:
         """Add a stack's rows, with those by A, J_A (V, 2n, 6), or without."""
-        _add(self.squares, places.squares, sign * rows.squares(stack))
+        _add(self.squares, places[0], sign * rows.squares(stack))
         if J_A is not None:
-            _add(self.of_A, places.of_A, sign * rows.times(J_A))
-            _add(self.M, places.M, sign * (J_A.transpose(0, 2, 1) @ J_A))
+            _add(self.of_A, places[1], sign * rows.times(J_A))
+            _add(self.M, places[2], sign * (J_A.transpose(0, 2, 1) @ J_A))
 
     def few_rows(self) -> tuple[Array, Array, Array]:
         """Rows with these sums: Q'[J, r] (I, 6, d + 1) and Q'J_A (I, 6, 6) of each instant, and one triangle for all.

@@ -24,6 +24,7 @@ from gtsam_rwhec.fitting.common_errors import Carriers, CommonErrors, OfStack
 from gtsam_rwhec.fitting.corner_model import Model, Point, Rows, Sums
 from gtsam_rwhec.fitting.corner_patterns import OF_AN_IMAGE, patterns
 from gtsam_rwhec.fitting.joint_covariance import Arrow, ArrowInverse, EliminationOrder
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -338,6 +339,7 @@ STEP = 1e-3
 FEWEST, LEAST_KNOWN = 3.0, 1.0
 
 
+@one_blas_thread()
 def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict[tuple[str, str], float]:
     """Of each unknown's covariance; with `carrier` false only the corners' noise was estimated."""
     deviations = deviations_of(noise)
@@ -355,7 +357,7 @@ def degrees_of_freedom(reduced: Reduced, noise: Noise, *, carrier: bool) -> dict
     hessian = np.array([up - down for (_, up), (_, down) in zip(above, below, strict=True)]) / (2.0 * STEP) / 4.0
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
     V = (vectors * (2.0 / np.maximum(values, LEAST_KNOWN))) @ vectors.T
-    result = {}
+    result: dict[tuple[str, str], float] = {}
     widths = {name: rows.stop - rows.start for name, rows in reduced.slots.items()}
     for width in set(widths.values()):
         names = [name for name in widths if widths[name] == width]

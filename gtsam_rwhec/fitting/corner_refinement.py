@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import gtsam
 import numpy as np
@@ -77,7 +78,7 @@ class _Settled:
     graph: CornerGraph
     joint: Array
     slots: Mapping[tuple[str, str], slice]
-    freedom: Mapping[tuple[str, str], float]
+    freedom_of: Callable[[], Mapping[tuple[str, str], float]]
     iterations: int
     last_step: float
 
@@ -165,7 +166,7 @@ def refine_corners(
         noise=settled.noise,
         joint=settled.joint,
         slots=settled.slots,
-        freedom=settled.freedom,
+        freedom_of=settled.freedom_of,
         left_out={
             pair: stack.known[at] & (weights[at] == 0.0)
             for stack, weights in zip(model.stacks, settled.model.weights, strict=True)
@@ -259,8 +260,8 @@ def _settled(
     with told_where_it_fails(model, point):
         joint, last_step = graph.covariance(values, reduced.slots)
     check_determined(model, start, point, joint, reduced.slots)
-    freedom = degrees_of_freedom(reduced, noise, carrier=options.carrier_noise == "estimate")
-    return _Settled(model, point, noise, graph, joint, reduced.slots, freedom, iterations, last_step)
+    freedom_of = cache(partial(degrees_of_freedom, reduced, noise, carrier=options.carrier_noise == "estimate"))
+    return _Settled(model, point, noise, graph, joint, reduced.slots, freedom_of, iterations, last_step)
 
 
 def optimum(

@@ -29,6 +29,10 @@ SHAPE = 4
 NEAREST_M = 1e-6
 
 
+#: Where products are in the flat forms of sums (`corner_model.Sums`): (T, m + 1, m + 1), (V, 6, m + 1) and (V, 6, 6).
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True, eq=False)
 class Stack:
     """All images by one sensor of targets that are alike: they have as many corners, and as many unknowns."""
@@ -83,16 +87,7 @@ class Stack:
         at = np.pad(columns, ((0, 0), (0, 1)), constant_values=size - 1)
         by_A = 6 * self.instant[:, None] + np.arange(6)
         of_A = by_A[:, :, None] * size + self.each(at)[:, None]
-        return Places(at[:, :, None] * size + at[:, None], of_A, 6 * by_A[:, :, None] + np.arange(6))
-
-
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Where products are in the flat forms of sums by all unknowns and by A (`corner_model.Sums`)."""
-
-    squares: np.ndarray  #: (T, m + 1, m + 1)
-    of_A: np.ndarray  #: (V, 6, m + 1)
-    M: np.ndarray  #: (V, 6, 6)
+        return at[:, :, None] * size + at[:, None], of_A, 6 * by_A[:, :, None] + np.arange(6)
 
 
 @dataclass(frozen=True, eq=False)

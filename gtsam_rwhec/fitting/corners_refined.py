@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import gtsam
@@ -81,8 +81,8 @@ class CornersRefined:
     #: (d, d): Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
     joint: Array = field(repr=False)
     slots: Mapping[tuple[str, str], slice] = field(repr=False)
-    #: Degrees of freedom of each unknown's covariance, whose noise was estimated.
-    freedom: Mapping[tuple[str, str], float] = field(repr=False)
+    #: Computes `freedom`: what is only compared with others does not need it.
+    freedom_of: Callable[[], Mapping[tuple[str, str], float]] = field(repr=False)
     #: (V, n) each. Corners that disagree with all others.
     left_out: dict[tuple[str, str], np.ndarray] = field(repr=False)
     #: The GTSAM graph at the optimum's noise, with its model and its variables' keys.
@@ -95,6 +95,11 @@ class CornersRefined:
     last_step: float
     #: What is doubtful, in words with the figures, the gravest first; empty where nothing is.
     findings: tuple[str, ...] = ()
+
+    @property
+    def freedom(self) -> Mapping[tuple[str, str], float]:
+        """Degrees of freedom of each unknown's covariance, whose noise was estimated."""
+        return self.freedom_of()
 
     def __str__(self) -> str:
         """What was refined from what, how well it fits, and what is doubtful, in a few sentences."""

@@ -64,8 +64,8 @@ def refine(
     tell = progress or silent
     check_inputs(problem, solution, options)
     if problem.directed:
-        near = solution or _any_inliers(problem, options, tell)
-        problem = aligned_at(problem, near.X, near.Y, near.scale)
+        about = solution or _any_inliers(problem, options, tell)
+        problem = aligned_at(problem, about.X, about.Y, about.scale)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
     everything = Variables.of(problem, sensors_with_offset(problem, options))
     data = data_of(problem, everything, options)

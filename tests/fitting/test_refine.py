@@ -11,6 +11,7 @@ from refinement_problems import KAPPA, SIGMA_M, SIGMA_RAD, copied, distance, ref
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.fitting.refinement_from_poses import refine as refine_poses
 from gtsam_rwhec.simulate import Noise, general, perturb
 
 
@@ -109,6 +110,16 @@ def test_estimated_noise_does_not_depend_on_what_was_given(residual: str) -> Non
         assert noise.rotation_rad == pytest.approx(SIGMA_RAD, rel=0.15)
         assert noise.translation_m == pytest.approx(SIGMA_M, rel=0.15)
         assert sum(noise.degrees_of_freedom) == pytest.approx(6 * 80 - 24, abs=0.5)
+
+
+@pytest.mark.parametrize("residual", ["chordal", "geodesic"])
+def test_the_noise_of_a_near_answer_is_a_start(residual: str) -> None:
+    problem = copied(rig(seed=7).problem, kappa=lambda pair, raw: 0.01 * raw.kappa)
+    solution, options = rw.solve(problem), rw.RefineOptions(noise="estimate", residual=residual)
+    near = refine_poses(problem, solution, options)
+    again = refine_poses(problem, solution, options, near=near)
+    assert again.iterations < near.iterations
+    np.testing.assert_allclose(again.covariance(), near.covariance(), rtol=1e-3, atol=1e-11)
 
 
 def test_noise_by_sensor_and_by_pair() -> None:
