@@ -32,10 +32,13 @@ BUDGET = {
     # that cannot be used 45
     # clouds with noise and patterns 110; sizes that are off by less than is doubted 50; corners and noise of many tags
     # by steps that eliminate targets 270; samples of noise that reach as far as it does 10; what is named 80
-    "lines": 100_590,
-    "code": 62_780,
+    # LiDARs of one vehicle registered with each other by what both saw 670, in three files; folders of depth images 120;
+    # one registration for proposal and calibration 60; sizes that the motion hardly tells, and errors along beams 80;
+    # a LiDAR beside poses of a vehicle 20; many tags by what does not change 90
+    "lines": 101_630,
+    "code": 63_440,
     # capture has 25 files, and is a package of its own
-    "files": 439,
+    "files": 442,
     "packages": 20,
     "names that occur twice": 0,
     "lines of tests and benchmarks": 73_500,
