@@ -32,7 +32,7 @@ BUDGET = {
     # that cannot be used 45
     # clouds with noise and patterns 110; sizes that are off by less than is doubted 50; corners and noise of many tags
     # by steps that eliminate targets 270; samples of noise that reach as far as it does 10; what is named 80
-    # LiDARs of one vehicle registered with each other by what both saw 670, in three files; folders of depth images 120;
+    # LiDARs of one vehicle registered with each other by what both saw 670, in three files; depth folders 120;
     # one registration for proposal and calibration 60; sizes that the motion hardly tells, and errors along beams 80;
     # a LiDAR beside poses of a vehicle 20; many tags by what does not change 90
     "lines": 101_630,
