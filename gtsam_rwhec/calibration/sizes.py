@@ -112,13 +112,12 @@ class TargetSize:
 
     @property
     def share_off(self) -> float:
-        """By which share it may be wrong (root mean square) where the motion tells it, or speaks against it; else 0.
+        """By which share it may be wrong (root mean square); 0 where no scale is determined.
 
         Either it is exact, or off as printers err; both are as likely beforehand, and the motion weighs them (Bayes).
-        Where the motion does neither, a printer's error would be a guess: then `is_untold` judges.
         """
         sigma = self._usual
-        if sigma is None or sigma <= 0.0 or not (sigma < 0.5 * PRINTED or self.may_be_off):
+        if sigma is None or sigma <= 0.0:
             return 0.0
         off, shrunk = self.scale - 1.0, PRINTED**2 / (PRINTED**2 + sigma**2)
         is_off = expit(0.5 * math.log(1.0 - shrunk) + 0.5 * (off / sigma) ** 2 * shrunk)
@@ -132,7 +131,7 @@ class TargetSize:
     def untold(self) -> str:
         """What an error that the motion would not show does, in words; empty where it would show."""
         sigma = self._usual
-        if sigma is None or sigma < 0.5 * PRINTED or not self.moves:
+        if sigma is None or sigma < 0.5 * PRINTED or self.may_be_off or not self.moves:
             return ""
         moved_mm, most = max((1e3 * PRINTED * float(np.linalg.norm(of[3:])), name) for name, of in self.moves.items())
         of, who = ("lengths in the clouds", "cameras") if self.is_of_clouds else ("the size", "printers")

@@ -275,10 +275,11 @@ def _calibrated(run: Run) -> Calibration:
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
     if refined is not None:
         stated = found_sizes if problem.scale == "known" else ()
-        of_sizes = moves_of_sizes(stated)
+        untold = [size for size in stated if size.is_untold(refined)]
+        record.findings += [Finding(Ground.SIZE_UNTOLD, size.untold) for size in untold]
+        of_sizes = moves_of_sizes([size for size in stated if size not in untold])
         for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes):
             refined = refined.with_errors(moves)
-        record.findings += [Finding(Ground.SIZE_UNTOLD, size.untold) for size in stated if size.is_untold(refined)]
     best = solution if refined is None else refined
     views = {} if best is None else views_of(problem, inliers, best.scale)
     carriers = Carriers(problem.sensor_carrier, problem.target_carrier)

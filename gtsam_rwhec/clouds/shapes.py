@@ -146,10 +146,11 @@ def find_sphere(cloud: Cloud, radius_m: float | None = None, *, noise_m: float |
         off = ranges - expected
         near = (np.abs(off) < GATE * _spread(off[cosine > GRAZING], noise)) & (cosine > 0.0)
         used = near & (cosine > GRAZING)
-        if used.sum() < FEWEST_POINTS:
+        if used.sum() < FEWEST_POINTS or not 0.0 < radius <= max(largest, radius_m or 0.0):
+            known = "" if radius_m else "; give its radius_m, or a cloud without walls and tables (cloud.selected)"
             raise CloudError(
                 f"{where}: no such sphere in {len(points)} points: the nearest to one has {used.sum()} points on its "
-                "side towards the sensor, away from its edge; look whether it is seen, and from near enough"
+                f"side towards the sensor, away from its edge; look whether it is seen, and from near enough{known}"
             )
         J = normal[used] if radius_m is not None else np.column_stack([normal[used], np.ones(used.sum())])
         J /= cosine[used, None]

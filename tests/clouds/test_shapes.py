@@ -76,6 +76,9 @@ def test_what_is_not_there_is_said() -> None:
     cloud, _ = scene(np.random.default_rng(0))
     with pytest.raises(CloudError, match="no such sphere"):
         rw.clouds.find_sphere(cloud, 0.5)
+    wall = cloud.selected(cloud.points[:, 2] > 0.7)  # least squares ran off to 800 m
+    with pytest.raises(CloudError, match=r"no such sphere.*give its radius_m, or a cloud without walls"):
+        rw.clouds.find_sphere(wall)
     with pytest.raises(CloudError, match="at least 30 are needed"):
         rw.clouds.find_plane(cloud.selected(np.arange(5)), noise_m=NOISE_M)
     with pytest.raises(OptionError, match="radius_m=-1"):
