@@ -54,7 +54,7 @@ STUDENT = 2.6
 USUAL_STUDENT = 1.15
 #: Printers and focal lengths are off by such a share, usually.
 PRINTED = 0.002
-#: Such an error must not move a frame out of its ellipsoid of 95 %: the quantile of chi2(6).
+#: Such an error must not move a sensor out of its ellipsoid of 95 %: the quantile of chi2(6).
 OUTSIDE = 12.59
 #: Standard deviations of the priors that stand for fixed poses here, in metres and rad.
 FIXED_M, FIXED_RAD = 1e-4, 1e-4
@@ -119,32 +119,32 @@ class TargetSize:
         sigma = self._usual
         if sigma is None or sigma <= 0.0:
             return 0.0
-        off, shrunk = self.scale - 1.0, PRINTED**2 / (PRINTED**2 + sigma**2)
-        is_off = expit(0.5 * math.log(1.0 - shrunk) + 0.5 * (off / sigma) ** 2 * shrunk)
+        off, shrunk = self.scale - 1.0, 1.0 / (1.0 + (sigma / PRINTED) ** 2)
+        is_off = expit(math.log(sigma / math.hypot(PRINTED, sigma)) + 0.5 * (off / sigma) ** 2 * shrunk)
         return float(np.sqrt(is_off * ((shrunk * off) ** 2 + shrunk * sigma**2)))
 
     @property
     def _usual(self) -> float | None:
         return self.sigma if self.usual_sigma is None else self.usual_sigma
 
-    @property
-    def untold(self) -> str:
-        """What an error that the motion would not show does, in words; empty where it would show."""
+    def untold(self, refined: Refined) -> str:
+        """What a usual error, which the motion would not show, moves a sensor by, in words; empty where that is little.
+
+        That is, where the sensor stays in its ellipsoid of 95 %, or the motion tells the size.
+        """
         sigma = self._usual
-        if sigma is None or sigma < 0.5 * PRINTED or self.may_be_off or not self.moves:
+        if sigma is None or sigma < 0.5 * PRINTED or self.may_be_off:
             return ""
-        moved_mm, most = max((1e3 * PRINTED * float(np.linalg.norm(of[3:])), name) for name, of in self.moves.items())
+        moved = {name: PRINTED * move[:, 0] for name, move in self.moves.items() if name in refined.Y}
+        outside = [name for name, m in moved.items() if m @ refined.information(name) @ m > OUTSIDE]
+        if not outside:
+            return ""
+        moved_mm, most = max((1e3 * float(np.linalg.norm(moved[name][3:])), name) for name in outside)
         of, who = ("lengths in the clouds", "cameras") if self.is_of_clouds else ("the size", "printers")
         return (
             f"the motion tells {of} of {self.target} to {rounded(100.0 * sigma)} % only, and {100.0 * PRINTED:g} %, as "
             f"{who} err, moves {most} by {rounded(moved_mm)} mm, which the standard deviations do not hold"
         )
-
-    def is_untold(self, refined: Refined) -> bool:
-        """Whether a usual error, which the motion would not show, moves a frame out of its ellipsoid of 95 %."""
-        known = [unknown for unknown in refined.unknowns if str(unknown) in self.moves]
-        moved = [(PRINTED * self.moves[str(of)][:, 0], refined.information(of)) for of in known]
-        return bool(self.untold) and max((float(m @ W @ m) for m, W in moved), default=0.0) > OUTSIDE
 
     def __str__(self) -> str:
         if self.sigma is None:

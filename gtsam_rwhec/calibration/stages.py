@@ -275,9 +275,9 @@ def _calibrated(run: Run) -> Calibration:
         record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
     if refined is not None:
         stated = found_sizes if problem.scale == "known" else ()
-        untold = [size for size in stated if size.is_untold(refined)]
-        record.findings += [Finding(Ground.SIZE_UNTOLD, size.untold) for size in untold]
-        of_sizes = moves_of_sizes([size for size in stated if size not in untold])
+        untold = [size.untold(refined) for size in stated]
+        record.findings += [Finding(Ground.SIZE_UNTOLD, words) for words in untold if words]
+        of_sizes = moves_of_sizes([size for size, words in zip(stated, untold, strict=True) if not words])
         for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes):
             refined = refined.with_errors(moves)
     best = solution if refined is None else refined

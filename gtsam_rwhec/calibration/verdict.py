@@ -276,7 +276,7 @@ _ADVICE = {
         "its corners) and the stated intrinsics, and calibrate again"
     ),
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
-    Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
+    Ground.SYSTEMATIC: "measure at more and wider spread poses, calibrate the arm itself, and check intrinsics",
     Ground.NOT_CHECKED: (
         "measure so that the named check can run (more measurements, kept with the problem, and poses of the carriers "
         "without gaps), or check the poses in another way before you rely on them"

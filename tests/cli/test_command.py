@@ -208,7 +208,7 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     assert done.stdout.startswith("Use these poses: ")
     assert done.stdout.index("How far off a point is") < done.stdout.index("What was chosen, and why")
-    assert re.search(r"cam_0 +the frame that carries cam_0 +2\.60 +95 +3\.91 ", done.stdout)
+    assert re.search(r"cam_0 +the frame that carries cam_0 +2\.60 +95 +3\.92 ", done.stdout)
     assert done.stdout.index("±x mm") < done.stdout.index("Proven: ") < done.stdout.index("certified: cost 368.6")
     assert "Other sensors in the frame of cam_0" in done.stdout
     assert not re.search("Not shown|evidence.json|Inputs and versions|free_directions", done.stdout)

@@ -79,7 +79,7 @@ def test_what_all_beams_share_is_in_the_covariance() -> None:
             places.T_camera_board, seen.T_sensor_board, places.size_m, seen.covariances,
             camera_covariances=places.covariances, common_m=common_m,
         )  # fmt: skip
-        found = rw.calibrate(problem, rw.CalibrateOptions(noise="given"))
+        found = rw.calibrate(problem, rw.CalibrateOptions(noise="given", sizes="known"))
         held.append(found.contains("lidar", places.T_camera_lidar, 0.95))
     assert held == [False, True]
 
