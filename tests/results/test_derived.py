@@ -115,7 +115,9 @@ def test_of_other_measurements_there_is_no_spectrum() -> None:
 
 
 SIGMA_M, SIGMA_RAD = 0.002, np.radians(0.2)
-OPTIONS = rw.CalibrateOptions(noise="given", robust="none", drift="none", systematic=False, misreadings=False)
+OPTIONS = rw.CalibrateOptions(
+    noise="given", robust="none", drift="none", systematic=False, misreadings=False, sizes="known"
+)
 X = se3.expmap(np.array([[0.2, -0.1, 0.4, 0.5, 0.1, -0.3]]))[0]
 Y = se3.expmap(np.array([[-0.3, 0.5, 0.1, 0.05, -0.02, 0.1]]))[0]
 
