@@ -148,20 +148,12 @@ def ball_radius(variances: Array, level: float, degrees_of_freedom: float = np.i
         known = chdtr(3, ratio) if np.isinf(degrees_of_freedom) else fdtr(3, degrees_of_freedom, ratio / 3.0)
         return float((weight * known).sum()) - level
 
-    # Regula falsi (Illinois), since the import of scipy.optimize takes as long as a calibration of few poses.
-    low, high, off_low, off_high = 0.0, 1.0, -level, lacking(1.0)
-    while off_high < 0.0:
-        low, high, off_low, off_high = high, 4.0 * high, off_high, lacking(4.0 * high)
-    off = off_high
-    while high - low > 1e-12 and abs(off) > 1e-15:
-        middle = (low * off_high - high * off_low) / (off_high - off_low)
-        before, off = off, lacking(middle)
-        # An end that stays twice counts half.
-        if off < 0.0:
-            low, off_low, off_high = middle, off, off_high * (0.5 if before < 0.0 else 1.0)
-        else:
-            high, off_high, off_low = middle, off, off_low * (0.5 if before > 0.0 else 1.0)
-    return float(np.sqrt(largest * (low if off < 0.0 else high)))
+    end = 1.0
+    while lacking(end) < 0.0:
+        end *= 4.0
+    from scipy.optimize import brentq  # here, since its import takes as long as a calibration of few poses
+
+    return float(np.sqrt(largest * brentq(lacking, 0.0, end, xtol=1e-12)))
 
 
 #: The words for a carrier that a problem does not name. Without A, each but one means the carrier of the point's own

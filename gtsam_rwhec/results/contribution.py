@@ -10,7 +10,7 @@ import heapq
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from gtsam_rwhec.fitting.joint_covariance import EliminationOrder
 from gtsam_rwhec.geometry.poses import Array
@@ -171,12 +171,10 @@ def _inverse_root(matrix: Array) -> Array:
 
     Where only this image tells something, a direction is lost without it: its eigenvalue is zero up to rounding.
     """
-    try:
-        root: Array = dtrtri(np.linalg.cholesky(matrix), lower=1)[0]
-        if (root**2).sum() * LOST < 1.0:  # then no eigenvalue is smaller
-            return root
-    except np.linalg.LinAlgError:
-        pass
+    factor, failed = dpotrf(matrix, lower=1)
+    root: Array = dtrtri(factor, lower=1)[0]
+    if not failed and (root**2).sum() * LOST < 1.0:  # then no eigenvalue is smaller
+        return root
     values, vectors = np.linalg.eigh(matrix)
     return np.asarray((vectors / np.sqrt(np.maximum(values, LOST))).T)
 

@@ -356,8 +356,10 @@ def result_json(
 
 
 def encoded(tree: dict[str, Any]) -> bytes:
-    """JSON in UTF-8. Raises `ValueError` if a name has a lone surrogate."""
-    return json_of(tree, indent=2, inf_nan_mode="constants") + b"\n"
+    """JSON in UTF-8. Raises `ValueError` if a name has a lone surrogate, or a number is not finite."""
+    content = json_of(tree, indent=2, inf_nan_mode="constants") + b"\n"
+    values_of(content, allow_inf_nan=False)
+    return content
 
 
 def _heading(judgement: Judgement) -> dict[str, Any]:

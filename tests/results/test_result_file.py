@@ -21,7 +21,7 @@ from strategies import changed_trees, damaged
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
-from gtsam_rwhec.results.result_file import parse_result, read_solution, write_solution
+from gtsam_rwhec.results.result_file import encoded, parse_result, read_solution, write_solution
 from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.certificate import Cause
@@ -283,3 +283,10 @@ def test_any_content_gives_a_result_or_an_error_of_ours(written: Path, data: st.
         assert len(str(error)) < 5000  # noqa: PT017
     else:
         str(result.solution.certificate)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "\ud800"])
+def test_what_json_does_not_have_is_not_written(value: object) -> None:
+    """Most readers of JSON refuse NaN."""
+    with pytest.raises(ValueError, match=r"line|surrogates"):
+        encoded({"scale": value})
