@@ -44,6 +44,7 @@ from .calibration import cross_validate as cross_validate
 from .calibration import reading_of as reading_of
 from .geometry import Trajectory as Trajectory
 from .geometry import pose_covariances as pose_covariances
+from .fitting import ArmAccuracy as ArmAccuracy
 from .fitting import CarrierNoise as CarrierNoise
 from .fitting import RefineOptions as RefineOptions
 from .fitting import Refined as Refined

@@ -23,7 +23,15 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.fitting.fit_options import About, CornerOptions, Drift, PoseOptions, RefineOptions, check_choices
+from gtsam_rwhec.fitting.fit_options import (
+    About,
+    ArmAccuracy,
+    CornerOptions,
+    Drift,
+    PoseOptions,
+    RefineOptions,
+    check_choices,
+)
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -44,8 +52,8 @@ class CalibrateOptions(PoseOptions):
     drift: Drift = "auto"
     #: Whether A may have errors that vary with the configuration (an arm's kinematics), if the data show them. Their
     #: constant part shows in no residual: it is assumed to be twice as large, weighted by the probability that the data
-    #: give such errors.
-    systematic: bool = True
+    #: give such errors. An ``ArmAccuracy`` states how large the constant part is.
+    systematic: bool | ArmAccuracy = True
     #: The carrier in whose frame errors of A are modelled, such as an arm's hand. None: the data decide.
     hand: About | None = None
     #: "auto" and "gnc": measurements that contradict the others are left out, and the rest is certified again. "auto"
@@ -80,7 +88,11 @@ class CalibrateOptions(PoseOptions):
         choices = {"drift": Drift, "robust": RobustChoice, "sizes": SizesChoice, "observations": ObservationChoice}
         check_choices(self, choices if self.hand is None else choices | {"hand": About})
         self.check_share("level", 0.0)
-        for name in ("misreadings", "repair", "systematic"):
+        if not isinstance(self.systematic, bool | ArmAccuracy):
+            raise OptionError(
+                f"CalibrateOptions.systematic={brief(self.systematic)}; give True, False or an ArmAccuracy"
+            )
+        for name in ("misreadings", "repair"):
             if not isinstance(getattr(self, name), bool):
                 raise OptionError(f"CalibrateOptions.{name}={brief(getattr(self, name))}; give True or False")
         if self.repair and not self.misreadings:

@@ -13,8 +13,8 @@ from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
-from gtsam_rwhec.fitting.fit_options import Component, NoiseOptions, RefineOptions
-from gtsam_rwhec.fitting.noise_in_data import MOST_BY_CHANCE, NoiseInData, ratio_words
+from gtsam_rwhec.fitting.fit_options import ArmAccuracy, Component, NoiseOptions, RefineOptions
+from gtsam_rwhec.fitting.noise_in_data import CONSTANT, MOST_BY_CHANCE, TOLD_RATIO, NoiseInData, ratio_words
 from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
@@ -136,7 +136,13 @@ def _by_the_whole_model(
     if problem.is_of_registrations:
         # Thousands of points tell what is known of each view. Errors that all views share show in no residuals.
         stated |= {Component.ROTATION: 1.0, Component.TRANSLATION: 1.0}
-    noise = NoiseOptions(stated=stated, drift=options.drift, systematic=options.systematic, side=side)
+    arm = options.systematic
+    if isinstance(arm, ArmAccuracy):
+        stated |= {
+            Component.SYSTEMATIC_ROTATION: arm.rotation_rad / CONSTANT,
+            Component.SYSTEMATIC_TRANSLATION: arm.translation_m / CONSTANT,
+        }
+    noise = NoiseOptions(stated=stated, drift=options.drift, systematic=arm is not False, side=side)
     how = replace(how, carrier_noise=None)
     before, choices = None, 0
     while True:
@@ -215,6 +221,7 @@ def refined_under_its_noise(
             if clock.is_sure:
                 record.choose(f"rate of the clock of {clock.sensor}", "estimated, and taken off", str(clock))
         _say_drift(run, noise.model)
+        _say_lasting(run, noise.model)
         _say_systematic(run, noise.model)
         _say_blocks(run, noise.model)
     # Of measurements that are too few to estimate any noise, the verdict says so.
@@ -267,6 +274,19 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
         )
 
 
+def _say_lasting(run: Run, model: NoiseInData) -> None:
+    """Record whether errors last, of the view or in time; if the covariance is mostly theirs, add a finding."""
+    lasting = model.lasting
+    if lasting is None or lasting.ratio <= TOLD_RATIO:
+        return
+    larger = f"{rounded(math.sqrt(lasting.ratio))} times as large for it"
+    evidence = "measurements that are near each other, in time or in what the sensor sees, err alike"
+    probable = f"{100.0 * lasting.probability:.0f} % probable"
+    run.record.choose("errors that last", f"{probable}; the standard deviations are {larger}", evidence)
+    if lasting.is_by_far:
+        run.record.find(Ground.CORRELATED, f"{evidence} and do not average out; standard deviations are {larger}")
+
+
 def _say_blocks(run: Run, model: NoiseInData) -> None:
     """Record whether blocks of the log agree as well as the noise allows; if they do not by far, add a finding."""
     if not model.scatter:
@@ -287,12 +307,16 @@ def _say_systematic(run: Run, model: NoiseInData) -> None:
     if not model.arms_assumed:
         record.choose(what, "none", run.says_so)
         return
+    arm = run.options.systematic
+    if isinstance(arm, ArmAccuracy):
+        size = f"{rounded(math.degrees(arm.rotation_rad))}° and {rounded(1e3 * arm.translation_m)} mm for each axis"
+        record.choose("accuracy of the arm", f"{size}, as you stated", run.says_so)
     tried = "a model with errors that vary with the carriers' configuration explains the residuals"
     if not model.has_systematic:
         how = "hardly" if model.systematic_evidence > 1.0 else "no"
         record.choose(
             what,
-            "none found; the covariances hold as much as could hide",
+            f"none found; what hides is in the covariances as {100.0 * model.systematic_probability:.0f} % probable",
             f"{tried} {how} better ({ratio_words(model.systematic_evidence)}; more than {MOST_BY_CHANCE:g} counts)",
         )
         return

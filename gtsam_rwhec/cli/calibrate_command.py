@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import typer
 
@@ -43,6 +43,7 @@ from gtsam_rwhec.files.terminal_text import say, shown_path
 Method = Literal["auto", "sdp", "local"]
 Noise = Literal["auto", "given", "estimate"]
 Robust = Literal["auto", "gnc", "none"]
+Stated = TypeVar("Stated")
 
 #: Parameters that count for a log; its rig file states the rest.
 OF_LOG = frozenset({"source", "verbose", "rig", "images", "no_report_images", "workers", "anyway", "force", "output"})
@@ -51,7 +52,12 @@ OF_FOLDER = frozenset(
     {"source", "verbose", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"}
 )
 #: Parameters that overrule a choice of ``rw.calibrate``.
-OF_CHOICES = frozenset({"noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "as_read", "repair"})
+OF_CHOICES = frozenset(
+    {
+        "noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "arm_accuracy_deg", "arm_accuracy_mm", "as_read",
+        "repair",
+    }
+)  # fmt: skip
 #: Parameters of the certified solution alone.
 OF_SOLVE = frozenset({"method", "initial"})
 # The options that each input refuses, by the reason and what to do.
@@ -119,6 +125,17 @@ def calibrate(
         typer.Option(
             rich_help_panel=CHOICES_PANEL, help="Standard deviation of the carriers' poses A along each axis, mm."
         ),
+    ] = None,
+    arm_accuracy_deg: Annotated[
+        float | None,
+        typer.Option(
+            rich_help_panel=CHOICES_PANEL,
+            help="How far off an arm's poses are, alike at poses near each other: about each axis, degrees.",
+        ),
+    ] = None,
+    arm_accuracy_mm: Annotated[
+        float | None,
+        typer.Option(rich_help_panel=CHOICES_PANEL, help="The same along each axis, mm: its absolute accuracy."),
     ] = None,
     as_read: Annotated[
         bool,
@@ -222,16 +239,13 @@ def calibrate(
         refuse(context, NOT_FOR_SAMPLES)
     if (method == "local") != (initial is not None):
         raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
-    if (carrier_noise_deg is None) != (carrier_noise_mm is None):
-        raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both, or neither")
+    carriers = _in_rad_and_m(rw.CarrierNoise, "--carrier-noise", carrier_noise_deg, carrier_noise_mm)
+    arm = _in_rad_and_m(rw.ArmAccuracy, "--arm-accuracy", arm_accuracy_deg, arm_accuracy_mm)
     if repair and as_read:
         raise typer.BadParameter("--repair shifts rows that were misread, which --as-read does not look for: give one")
     if noise == "given" and (sigma is None or kappa is None):
         raise typer.BadParameter("--noise given needs --sigma and --kappa: give both, or use --noise estimate")
     check_output(output, source)
-    carriers = None
-    if carrier_noise_deg is not None and carrier_noise_mm is not None:
-        carriers = rw.CarrierNoise(math.radians(carrier_noise_deg), 1e-3 * carrier_noise_mm)
     with StageDisplay() as stage, said_in_the_report():
         stage(f"reading {source}")
         if is_samples:
@@ -255,7 +269,12 @@ def calibrate(
             judgement = rw.judge(solution, findings=findings)
         else:
             options = rw.CalibrateOptions(
-                noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read, repair=repair
+                noise=noise,
+                robust=robust,
+                carrier_noise=carriers,
+                systematic=arm or True,
+                misreadings=not as_read,
+                repair=repair,
             )
             calibration = rw.calibrate(problem, options, progress=stage)
             if repair and rw.Ground.ROWS_REPAIRED not in calibration.judgement.grounds:
@@ -275,6 +294,15 @@ def calibrate(
     finally:  # the report is printed even if the file cannot be written
         report(verbose=verbose, lines=rw.report.lines_beside(written), page=page, whole=WHOLE)
     return exit_status(judgement)
+
+
+def _in_rad_and_m(
+    of: Callable[[float, float], Stated], option: str, deg: float | None, mm: float | None
+) -> Stated | None:
+    """What two options state of the carriers' poses; None where neither is given."""
+    if (deg is None) != (mm is None):
+        raise typer.BadParameter(f"{option}-deg and {option}-mm go together: give both, or neither")
+    return None if deg is None or mm is None else of(math.radians(deg), 1e-3 * mm)
 
 
 def _evidence(source: Path, problem: rw.Problem, calibration: rw.Calibration, command: str) -> rw.results.Evidence:

@@ -1,4 +1,5 @@
 # Refine poses: options, the record of a refined calibration, and its parts.
+from .fit_options import ArmAccuracy as ArmAccuracy
 from .fit_options import CarrierNoise as CarrierNoise
 from .fit_options import RefineOptions as RefineOptions
 from .refined import Movement as Movement

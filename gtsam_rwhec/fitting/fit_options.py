@@ -60,6 +60,24 @@ class CarrierNoise:
                 )
 
 
+@dataclass(frozen=True)
+class ArmAccuracy:
+    """How far off an arm's poses are, alike at poses that are near each other: no residual shows most of it.
+
+    It is what calibrations of arms or data sheets call absolute accuracy, not repeatability.
+    """
+
+    #: Standard deviations about each axis, rad, and along each axis, m.
+    rotation_rad: float
+    translation_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_rad", "translation_m"):
+            value = getattr(self, name)
+            if not (is_real(value) and 0.0 < value <= np.finfo(np.float64).max):
+                raise NoiseError(f"ArmAccuracy.{name} is {brief(value)}; give a positive standard deviation")
+
+
 def check_choices(options: object, choices: Mapping[str, Any]) -> None:
     """OptionError for an option, by name, that is none of the words of its Literal."""
     for name, words in choices.items():

@@ -17,6 +17,7 @@ from gtsam_rwhec.fitting.clock_rates import ClockRate
 from gtsam_rwhec.fitting.component_posterior import Mixture, mixture_of
 from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, CarrierNoise, Component, DriftFrame
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
+from gtsam_rwhec.fitting.lasting_errors import LastingErrors
 from gtsam_rwhec.fitting.noise_search import (
     MOST_TRACKS,
     Settled,
@@ -28,7 +29,6 @@ from gtsam_rwhec.fitting.noise_search import (
     with_drift,
 )
 from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind
-from gtsam_rwhec.fitting.view_errors import ViewErrors
 from gtsam_rwhec.geometry.poses import Array
 
 C = Component
@@ -36,7 +36,7 @@ C = Component
 EVIDENCE = 5.0
 #: Twice the log likelihood's rise that systematic errors of rotation and of translation must exceed.
 MOST_BY_CHANCE = EVIDENCE * len(SYSTEMATIC)
-#: Errors of the view are told where they make variances larger by this factor.
+#: Errors that last are told where they make variances larger by this factor.
 TOLD_RATIO = 1.1
 _UNITS = {
     C.JITTER: ("ms", 1e3), C.DRIFT_SCALE: ("%", 1e2),
@@ -99,8 +99,8 @@ class NoiseInData:
     scatter: tuple[Scatter, ...] = ()
     #: The one by which the covariance is larger; None where blocks agree.
     worst: Scatter | None = None
-    #: What errors do that last as long as the view; None where no errors fade in time.
-    by_view: ViewErrors | None = None
+    #: What errors do that last; None of few measurements.
+    lasting: LastingErrors | None = None
     #: How often the errors of a track jump: it was cut there.
     jumps: int = 0
     #: What is known of the rates of clocks along a path.
@@ -173,16 +173,17 @@ class NoiseInData:
             said.append(
                 f"Errors of A that vary with the configuration: {self.systematic_words}, {found} "
                 f"({ratio_words(self.systematic_evidence)}): {100.0 * self.systematic_probability:.0f} % probable. "
-                "Their constant part, which residuals do not show, is assumed to be twice as large."
+                "Their constant part, which residuals do not show, is assumed to be twice as large: state the arm's "
+                "accuracy if you know it."
             )
         said += [f"{clock}, which is taken off." for clock in self.clocks if clock.is_sure]
         if self.jumps:
             said.append(f"The errors jump {self.jumps} times, as where loops are closed; the track is cut there.")
-        if self.by_view is not None and self.by_view.ratio > TOLD_RATIO:
+        if self.lasting is not None and self.lasting.ratio > TOLD_RATIO:
             said.append(
-                f"These errors depend on the view ({ratio_words(self.by_view.evidence)}): views that differ by "
-                f"{rounded(math.degrees(self.by_view.reach_rad))}° err differently. Seen again, they err again, and do "
-                f"not average out: standard deviations are {rounded(math.sqrt(self.by_view.ratio))} times as large."
+                "Errors that last, of the view or in time, are "
+                f"{100.0 * self.lasting.probability:.0f} % probable: they do not average out, and standard deviations "
+                f"are {rounded(math.sqrt(self.lasting.ratio))} times as large."
             )
         if self.worst is not None:
             times = rounded(math.sqrt(self.worst.ratio))
@@ -265,7 +266,7 @@ def noise_in(
     constant: tuple[Array, Array],
     scatter: tuple[Scatter, ...],
     worst: Scatter | None,
-    by_view: ViewErrors | None,
+    lasting: LastingErrors | None,
 ) -> NoiseInData:
     """What the data say of their noise; `constant` are the variances of `constant_variances`."""
     white = found.white or found
@@ -299,7 +300,7 @@ def noise_in(
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
         scatter=scatter,
         worst=worst,
-        by_view=by_view,
+        lasting=lasting,
         jumps=len(task.jumps),
     )
 

@@ -15,6 +15,7 @@ from gtsam_rwhec.fitting.component_posterior import FEWEST
 from gtsam_rwhec.fitting.drift import drift_columns
 from gtsam_rwhec.fitting.fit_options import C, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
+from gtsam_rwhec.fitting.lasting_errors import lasting_errors
 from gtsam_rwhec.fitting.noise_graph import refined_of
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData, is_drift_untried, mixed, noise_in, settled
 from gtsam_rwhec.fitting.noise_rows import Instants
@@ -22,7 +23,6 @@ from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import check_inputs, data_of, sensors_with_offset
 from gtsam_rwhec.fitting.unknowns import UnknownKind, Variables
-from gtsam_rwhec.fitting.view_errors import errors_of_view
 from gtsam_rwhec.fitting.weighted_fit import as_of_six
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
@@ -62,8 +62,8 @@ class UnderNoise:
         task.tell("covariances: with the uncertainty of the noise itself")
         scatter = scatter_of_blocks(task, found)
         worst = too_much(scatter, is_drift_untried=is_drift_untried(task, found))
-        by_view = errors_of_view(task, found)
-        larger = max(1.0 if one is None else one.ratio for one in (worst, by_view))
+        lasting = lasting_errors(task, found)
+        larger = max(1.0 if one is None else one.ratio for one in (worst, lasting))
         joint, mixture, constant = mixed(task, found, larger)
         layout = task.layout
         best = moved(found.state, task.variables, layout, found.model.basis @ mixture.step)
@@ -81,7 +81,7 @@ class UnderNoise:
         task.tell("covariances: the graph of the answer")
         refined = refined_of(task, found, joint.without(clocks), freedom, inliers or {}, self.solution, self.how)
         noise = replace(
-            noise_in(task, found, mixture, constant, scatter, worst, by_view), clocks=tuple(clocks.values())
+            noise_in(task, found, mixture, constant, scatter, worst, lasting), clocks=tuple(clocks.values())
         )
         return replace(refined, noise_sentences=noise.sentences), noise
 

@@ -178,6 +178,7 @@ def calibrated_unit(
             robust="auto" if rig.cleaning.robust == "gnc" else "none",
             sizes="known" if rig.sizes == "known" else "check",
             carrier_noise=measured.carrier_noise,
+            systematic=rig.carriers.arm,
             time_offsets=measured.estimated or False,
             carrier_path=measured.path,
         ),

@@ -44,6 +44,7 @@ from .sections import Carriers as Carriers
 from .sections import Cleaning as Cleaning
 from .sections import DetectionNoise as DetectionNoise
 from .sections import Link as Link
+from .sections import PoseAccuracy as PoseAccuracy
 from .sections import PoseNoise as PoseNoise
 from .sections import PoseSource as PoseSource
 from .sections import Sensor as Sensor

@@ -252,6 +252,7 @@ _REMARKS: dict[KeyPath, str] = {
     ("carriers",): "the frames that carry the sensors and the targets",
     ("carriers", "max_gap_s"): "s; between poses further apart in time nothing is interpolated",
     ("carriers", "noise"): "standard deviations of the carriers' poses",
+    ("carriers", "accuracy"): "how far off poses near each other are alike",
     ("targets",): "lengths in metres, as measured on the print",
     ("sizes",): "of the targets: known, check or estimate",
     ("noise",): "of the detections: estimate, {rotation_deg, translation_mm} or {corner_px}",

@@ -6,6 +6,7 @@ end with it stand beside the field: the reference and the JSON Schema (`rig_refe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -14,7 +15,7 @@ from pydantic import BeforeValidator, model_validator
 
 from gtsam_rwhec.cameras.camera import COEFFICIENTS, MODELS, Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import Lens
-from gtsam_rwhec.fitting.fit_options import Stated
+from gtsam_rwhec.fitting.fit_options import ArmAccuracy, Stated
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import to_rotations
 from gtsam_rwhec.logs.pose_tables import PoseStatement
@@ -186,6 +187,10 @@ class PoseNoise(Section):
     translation_mm: Positive = needed("standard deviation along each axis", 0.2)
 
 
+class PoseAccuracy(PoseNoise):
+    """How far off poses near each other are alike: standard deviations about and along each axis."""
+
+
 class PoseSource(Section):
     """Where the carriers' poses are: in tf (two frames), on a topic, or in files beside the images (frames).
 
@@ -277,6 +282,17 @@ class Carriers(Section):
         "standard deviations of these poses; leave it out if you do not know them",
         {"rotation_deg": 0.02, "translation_mm": 0.2},
     )
+    accuracy: PoseAccuracy | None = optional(
+        "how far off these poses are, alike at poses that are near each other: an arm's absolute accuracy, not its "
+        "repeatability. No residual shows it; without it, it is assumed from what varies with the arm's configuration",
+        {"rotation_deg": 0.05, "translation_mm": 0.5},
+    )
+
+    @property
+    def arm(self) -> ArmAccuracy | Literal[True]:
+        """What is known of errors that poses near each other share."""
+        of = self.accuracy
+        return True if of is None else ArmAccuracy(math.radians(of.rotation_deg), 1e-3 * of.translation_mm)
 
 
 class Link(Section):

@@ -167,6 +167,7 @@ class CleanedLog:
             robust="gnc" if rig.cleaning.robust == "gnc" else "none",
             sizes=SIZES[rig.sizes],
             carrier_noise=noise,
+            systematic=rig.carriers.arm,
             time_offsets=self.estimated or False,
             carrier_path=self.motion.trajectory if self.estimated else None,
             corners=CornerOptions(

@@ -162,6 +162,7 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
         (["calibrate", DEMO, "-o", "/nowhere/result.json"], "the folder /nowhere does not exist"),
         (["calibrate", DEMO, "--robust", "gnc", "--certified-only"], "--robust"),
         (["calibrate", DEMO, "--carrier-noise-mm", "2"], "go together"),
+        (["calibrate", DEMO, "--arm-accuracy-deg", "0.1"], "--arm-accuracy-deg and --arm-accuracy-mm go together"),
         (["calibrate", DEMO, "--noise", "given"], "--noise estimate"),
         (["calibrate", CELL / "robot_cell.mcap"], "--rig"),
         (["calibrate", CELL / "robot_cell.mcap", "--rig", CELL / "rig.yaml"], "several files"),
@@ -224,6 +225,12 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     assert "Noise of A: 0.3° and 2 mm for each axis of the target carrier, as given." in noisier.stdout
     wider = rw.read_refined(tmp_path / "noisier.json")
     assert (wider.standard_deviations("cam_0")[1] > refined.standard_deviations("cam_0")[1]).all()
+    accuracy = ("--arm-accuracy-deg", 0.1, "--arm-accuracy-mm", 1)
+    of_an_arm = run("calibrate", DEMO, "--scale", "shared", *accuracy, "--verbose")
+    assert (
+        "Accuracy of the arm: 0.1° and 1 mm for each axis, as you stated, because an option says so."
+        in of_an_arm.stdout
+    )
     again = given("calibrate", DEMO, "--certified-only", "--method", "local", "--initial", result)
     assert again.exit_code == 0, again.stderr
     assert "given start" in again.stdout

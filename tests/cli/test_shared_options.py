@@ -36,6 +36,8 @@ VALUES = {
     "repair": None,
     "carrier_noise_deg": "0.1",
     "carrier_noise_mm": "1",
+    "arm_accuracy_deg": "0.05",
+    "arm_accuracy_mm": "0.5",
     "images": None,
     "no_report_images": None,
     "anyway": None,

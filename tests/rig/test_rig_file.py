@@ -35,6 +35,7 @@ from gtsam_rwhec.rig import (
     DetectionNoise,
     Intrinsics,
     Link,
+    PoseAccuracy,
     PoseNoise,
     PoseSource,
     Rig,
@@ -61,7 +62,9 @@ def test_everything_is_read(tmp_path: Path) -> None:
     assert rig.carriers == Carriers(
         sensors="hand", targets="base", poses=PoseSource(tf=("base", "hand")), max_gap_s=0.3,
         noise=PoseNoise(rotation_deg=0.02, translation_mm=0.2),
+        accuracy=PoseAccuracy(rotation_deg=0.05, translation_mm=0.5),
     )  # fmt: skip
+    assert rig.carriers.arm == rw.ArmAccuracy(rotation_rad=np.radians(0.05), translation_m=5e-4)
     assert list(rig.sensors) == ["cam_left", "cam_right", "driver"]
     assert rig.sensors["cam_left"] == Sensor(
         images="/cam_left/image", intrinsics=Intrinsics(topic="/cam_left/camera_info"), time_offset="estimate",
@@ -103,6 +106,7 @@ def test_what_is_left_out() -> None:
     rig = parse_rig(MINIMAL, "rig.yaml")
     assert rig.carriers.max_gap_s == 0.2
     assert rig.carriers.noise is None
+    assert rig.carriers.arm is True
     assert rig.sensors["cam"] == Sensor(detections="/tags", time_offset=0.0)
     assert (rig.sizes, rig.noise, rig.detection, rig.cleaning) == ("check", "estimate", {}, Cleaning())
     assert Cleaning().model_dump() == {
@@ -205,7 +209,12 @@ def rigs(draw: st.DrawFn) -> Rig:
     )  # fmt: skip
     noise = st.builds(PoseNoise, rotation_deg=POSITIVE, translation_mm=POSITIVE)
     carriers = Carriers(
-        sensors=hand, targets=base, poses=poses, max_gap_s=draw(POSITIVE), noise=draw(st.none() | noise)
+        sensors=hand,
+        targets=base,
+        poses=poses,
+        max_gap_s=draw(POSITIVE),
+        noise=draw(st.none() | noise),
+        accuracy=draw(st.none() | st.builds(PoseAccuracy, rotation_deg=POSITIVE, translation_mm=POSITIVE)),
     )
     sensors = {}
     for _ in range(draw(st.integers(1, 3))):
