@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
+from scipy.special import expit, logsumexp, softmax
 
 from gtsam_rwhec.fitting.block_agreement import LARGELY
 from gtsam_rwhec.fitting.drift import DriftPrior, own_directions, unit_of
@@ -39,8 +40,8 @@ SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 #: How far errors reach: where their correlation is 1 / e, of views (rad, and a share of distance), and of instants
 #: where no drift is seen (a share of the log).
 OF_VIEWS, OF_TIME = (0.1, 0.2, 0.4, 0.8), (0.1, 0.3, 1.0)
-#: Before the data, how much more probable it is that some errors last than that none do.
-ODDS = 1.0 / 3.0
+#: Before the data, the logarithm of how much more probable it is that some errors last than that none do.
+LOG_ODDS = -math.log(3.0)
 #: As detections err: rotations in the target's axes, translations along the sensor's.
 OF_DETECTIONS = Walk(0.5, "detection")
 
@@ -102,10 +103,11 @@ class _Weighed:
 
 
 def lasting_errors(task: Task, found: Settled) -> LastingErrors | None:
-    """What errors that last do; None where tracks are short, or errors walk at random or are of A."""
+    """What errors that last do; None where tracks are short, errors walk at random or are of A, or some poses slide."""
     model, sigma = found.model, found.fit.sizes.values(found.fit.logs)
     drift = model.drift
-    if drift is not None and (drift.correlation == 1.0 or drift.walk.is_shared):
+    is_other = drift is not None and (drift.correlation == 1.0 or drift.walk.is_shared)
+    if is_other or model.rows.slides is not None:
         return None
     frames = [
         model.basis[place]
@@ -127,13 +129,12 @@ def lasting_errors(task: Task, found: Settled) -> LastingErrors | None:
     as_modelled = [answer] if drift is None else [compared.weighed(each, fading) for each in SHARES]
     near = [np.exp(-compared.differ / reach) for reach in OF_VIEWS] + [np.exp(-compared.walked / r) for r in reaches]
     lasting = [compared.weighed(each, alike) for alike in near for each in SHARES]
-    best = min(one.minus_two_log for one in as_modelled + lasting)
-    without, likely = (np.exp([0.5 * (best - one.minus_two_log) for one in of]) for of in (as_modelled, lasting))
-    odds = ODDS * float(likely.mean() / without.mean())
-    probability = odds / (1.0 + odds)
+    logs, without = (np.array([-0.5 * one.minus_two_log for one in of]) for of in (lasting, as_modelled))
+    evidence = float(logsumexp(logs) - logsumexp(without)) - math.log(len(lasting) / len(as_modelled))
+    probability = float(expit(evidence + LOG_ODDS))
     # What the average of all these has more than the model: of errors that last, and of white ones. These average out
     # over all measurements, and not over those alone that are compared.
-    scales = likely / likely.sum() * [one.scale / answer.scale for one in lasting]
+    scales = softmax(logs) * [one.scale / answer.scale for one in lasting]
     shares = np.array([one.share for one in lasting])
     alike = np.einsum("k,kij->ij", scales * shares, np.array([one.near for one in lasting]))
     more = compared.of_lasting(alike - share * fading)

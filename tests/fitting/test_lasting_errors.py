@@ -96,6 +96,9 @@ def test_few_measurements_and_random_walks_are_not_asked() -> None:
     raw = problem.measurements("board", "camera")
     few.add("board", "camera", raw.A[::20], raw.B[::20])
     assert found_in(few, None) is None
+    points = rw.Problem()
+    points.add_points("board", "camera", raw.A, raw.B[:, :3, 3], sigma=0.005)
+    assert found_in(points, None) is None
 
 
 def test_poses_far_apart_in_a_slow_log_are_worth_less() -> None:
