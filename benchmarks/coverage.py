@@ -115,9 +115,8 @@ def simulate(case: Case, seed: np.random.SeedSequence) -> tuple[rw.simulate.Simu
 
 def refined_of(case: Case, problem: rw.Problem, noise: Literal["given", "estimate"]) -> rw.Refined:
     """Solve and refine."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         # A's noise makes the costs larger than the weights of B predict; what is not unique has infinite variances.
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
         solution = rw.solve(problem)
         options = rw.RefineOptions(noise=noise, carrier_noise=CARRIER if case.noisy_A else None)
         return rw.refine(problem, solution, options)

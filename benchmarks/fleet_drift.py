@@ -144,8 +144,7 @@ def calibrations(number: int, seed: int) -> dict[str, Any]:
     rows = []
     options = rw.CalibrateOptions(systematic=False, misreadings=False, sizes="known", robust="none")
     for night in range(CHANGED + WITHIN):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             result = rw.calibrate(log_of("white", X, Y, ARM, generator), options)
         refined = without_constant_errors(as_result(result))
         unknowns = (Unknown.of("camera0"), Unknown.of("board"))

@@ -128,8 +128,7 @@ def measured(case: Case, share: float, seeds: int) -> Result:
             *case.frames, seed=seed, number_of_measurements=case.measurements, noise=NOISE, scale=case.scale
         )
         problem, good = corrupted(simulation, case.kind, share, 1000 + seed)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             clean.append(squared_errors(simulation, rw.solve(selected(problem, good))))
             try:
                 found = robust_solution(problem, noise_scale=case.noise_scale)
@@ -200,8 +199,7 @@ def in_words(draws: list[dict[str, tuple[float, float]]], names: tuple[str, ...]
 def real_dataset(share: float = 0.3, seeds: int = 5) -> list[Row]:
     """The real dataset with B replaced at random: every outlier found, and the answer that of the rest alone."""
     problem = rw.read_csv(utias_folder())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         clean = robust_solution(problem, noise_scale="estimate")
     kept, seconds = 0, []
     to_rest, to_clean, to_plain = [], [], []
@@ -214,8 +212,7 @@ def real_dataset(share: float = 0.3, seeds: int = 5) -> list[Row]:
             good[pair] = generator.random(len(raw.B)) >= share
             wrong = random_poses(len(raw.B), 2.0, generator)
             spoilt.add(*pair, raw.A, np.where(good[pair][:, None, None], raw.B, wrong))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             start = time.perf_counter()
             found = robust_solution(spoilt, noise_scale="estimate")
             seconds.append(time.perf_counter() - start)

@@ -160,8 +160,7 @@ class Record:
     @contextmanager
     def noted(self) -> Iterator[None]:
         """Turn this library's warnings into notes, except those that the verdict reports; others stay warnings."""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             yield
         for warning in caught:
             if not isinstance(warning.message, RwhecWarning):

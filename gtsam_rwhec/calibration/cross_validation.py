@@ -192,8 +192,7 @@ def cross_validate(
     notes: dict[str, None] = {}
 
     def calibrated(some: Problem, name: str) -> Solution | Refined:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             solution = solve(some, options=solve_options)
             answer = solution if options is None else refine(some, solution, options)
         for warning in caught:

@@ -226,8 +226,7 @@ def sizes(
         T = free.fixed.pop(name)
         free.priors.pop(name, None)
         free.add_prior(name, T, FIXED_M, 0.5 / FIXED_RAD**2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # they are about sizes that nobody uses
         try:
             start = solve(free)
             scales = start.scale.values() if isinstance(start.scale, dict) else [start.scale]

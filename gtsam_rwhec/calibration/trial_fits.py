@@ -101,8 +101,7 @@ def fitted(
     if not sample:
         return None  # a shift of rows leaves nothing of pairs with one row each
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # the words of trials are for nobody
+        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):  # the words of trials are for nobody
             return _fitted(problem, sample, mode, rounds)
     except (RwhecError, np.linalg.LinAlgError):
         return None  # too few measurements for this scale, or no finite answer: this reading explains nothing

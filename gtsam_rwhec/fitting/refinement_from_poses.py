@@ -179,8 +179,7 @@ def _chosen_under_full_noise(
     threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
     factors: FactorsByPair = {}
     solution, chosen = start, inliers
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # the last fit has its own
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # the last fit has its own
         for step in range(1, MAX_CHOICES + 1):
             tell(f"choosing the inliers under the full noise, step {step} of at most {MAX_CHOICES}")
             problem = selected(whole, chosen)
@@ -199,8 +198,8 @@ def _chosen_under_full_noise(
 
 def _any_inliers(problem: Problem, options: RefineOptions, tell: Progress) -> Solution:
     """A start from the measurements that agree under isotropic noise, whatever its size."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # the inliers are chosen again under the full noise
+    # the inliers are chosen again under the full noise
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         return robust_solution(
             problem, confidence=options.inlier_confidence, noise_scale="estimate", progress=tell
         ).solution

@@ -122,8 +122,7 @@ def _settled(
     state, parts = _start(old, variables), parts_of(problem)
     space = free_space_of(parts, variables, state, data)
     if space.directions:  # the motion is poor; or residuals are so large that it looks so, and another start is needed
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             there = variables.start(solve(problem))
         other = free_space_of(parts, variables, there, data)
         if len(other.directions) < len(space.directions):

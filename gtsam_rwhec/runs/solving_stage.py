@@ -283,8 +283,7 @@ def with_comparable_noise(
         noise="estimate", robust=rig.cleaning.robust, carrier_noise=motion.noise, carrier_model="propagated"
     )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             noise = refine(problem, solve(problem), options, progress=tell).noise
     except RwhecError as error:
         words = (
@@ -314,8 +313,7 @@ def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progr
         carrier_model="propagated",
     )
     problem, inliers = found.problem, found.outliers.inliers
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         kept = selected(problem, inliers) if inliers else problem
         return refine(kept, found.solution or solve(kept), how, progress=progress)
 

@@ -229,8 +229,7 @@ def _cleaned(detections: Log, given: Rig | None, old: OldCalibration, tell: Prog
     free = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in before]
     found: RunLog | None = None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LogWarning)
+        with warnings.catch_warnings(action="ignore", category=LogWarning):
             found = cleaned(detections, rig, tell)
     except StampError:
         if not free:

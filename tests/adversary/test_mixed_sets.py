@@ -20,8 +20,7 @@ PROVEN = 1e-12
 
 
 def solved(problem: rw.Problem) -> rw.Solution:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
         return rw.solve(problem)
 
 

@@ -265,8 +265,7 @@ def refined(task: Task, found: Settled, solution: rw.Solution, options: RefineOp
 
 def test_it_is_the_graphs_optimum() -> None:
     task, found, solution = of_two_targets()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         result = refined(task, found, solution)
     assert result.cost == pytest.approx(result.graph.error(result.values), rel=1e-6)
     assert result.cost < result.initial_cost

@@ -34,8 +34,7 @@ from gtsam_rwhec.solver.part_form import PartForm
 
 
 def solved(problem: rw.Problem) -> rw.Solution:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
         return rw.solve(problem)
 
 
