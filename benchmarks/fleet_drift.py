@@ -54,7 +54,6 @@ CHANGED, WITHIN, DEVIATIONS = 14, 3, 4.0
 RATE, BAND, FOUND, DATED = 1e-3, 0.20, 0.90, 0.80
 #: Deviations of a night's numbers, rad and m; they differ by this factor between nights.
 SIZE, VARYING = np.r_[np.full(3, 1e-3), np.full(3, 1e-3)], 1.5
-POSES = 40
 
 
 def fleet_rows(kind: str, size: int, generator: np.random.Generator) -> Iterator[RobotRow]:

@@ -18,6 +18,7 @@ from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN, NoiseFound, refined_
 from gtsam_rwhec.calibration.outliers import say_outliers, without_outliers
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import CountError, OptionError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.pair_data import PairData, local_paths
 from gtsam_rwhec.fitting.refined import Refined
@@ -350,11 +351,10 @@ def _without_velocity(run: Run, found: Answer) -> str:
             where += [f"{pair} at {stamp} ns" for stamp in stamps_ns[~path.known].tolist()]
     if not where:
         return ""
-    more = f" and {len(where) - NAMED} more" if len(where) > NAMED else ""
     total = sum(len(path.known) for path in paths.values())
     return (
         f"; beside gaps in the carriers' path no velocity is known, so {len(where)} of {total} measurements count as "
-        f"they are paired, without an offset ({', '.join(where[:NAMED])}{more})"
+        f"they are paired, without an offset ({some(where, NAMED)})"
     )
 
 

@@ -58,8 +58,6 @@ from gtsam_rwhec.solver.solution import solve
 
 #: The name of this choice: whether the answer is from corners or from poses.
 MEASUREMENTS = "refinement"
-#: Prior standard deviation of an estimated size, relative.
-SIZE_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from rwhec_factors.se3 import expmap, inverse, logmap
 from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.row_shifts import AS_GIVEN, SHIFTS, cheapest, costs_of, errors_at_shifts, likely_shifts
 from gtsam_rwhec.calibration.trial_fits import SLOW_SHARE, Sample, Sampled, Spread, TrialFit, angles, fitted, signal_of
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -90,8 +91,7 @@ class Slips:
     @property
     def words(self) -> str:
         """Where the rows of each pair slip, as a sentence's part; at most `NAMED` places."""
-        more = len(self.slips) - NAMED
-        return "; ".join(map(str, self.slips[:NAMED])) + (f"; and {more} more" if more > 0 else "")
+        return some(list(map(str, self.slips)), NAMED, between="; ")
 
 
 def with_rows_shifted(problem: Problem, shifts: Mapping[Pair, np.ndarray]) -> Problem:

@@ -11,18 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.files.terminal_text import shown, some
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.drift_events import AlarmEvent, day_text
-from gtsam_rwhec.fleet.fleet_report import (
-    drift_remarks,
-    drift_verdict,
-    some,
-    summary,
-    tone_of,
-    verdict_cell,
-    worst_first,
-)
+from gtsam_rwhec.fleet.fleet_report import drift_remarks, drift_verdict, summary, tone_of, verdict_cell, worst_first
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.stores import write_once
 from gtsam_rwhec.fleet.tasks import below
@@ -121,7 +113,7 @@ def _failures(rows: Sequence[RobotRow]) -> tuple[Block, ...]:
         if row.verdict is None:
             reasons.setdefault(row.failure or row.reason or "no reason is known", []).append(shown(row.unit))
     if reasons:
-        cells = tuple((reason, some(names, most=MOST_NAMES)) for reason, names in reasons.items())
+        cells = tuple((reason, some(names, MOST_NAMES)) for reason, names in reasons.items())
         blocks.append(Table("Without a calibration, by reason", ("reason", "which"), cells))
     logs = tuple((shown(log.url), shown(row.unit), log.reason) for row in rows for log in row.failed_logs)
     if logs:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, some
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
 from gtsam_rwhec.problem.knowledge import checked_scale, difference
@@ -134,6 +134,4 @@ def _check_scale(problem: Problem, scale: Scale) -> None:
 
 def _listed(names: Iterable[object]) -> str:
     """Names for a message: the first ten."""
-    known = list(map(brief, names))
-    more = f" and {len(known) - 10} more" if len(known) > 10 else ""
-    return (", ".join(known[:10]) + more) or "none"
+    return some(list(map(brief, names)), 10) or "none"

@@ -261,8 +261,7 @@ def test_motions_and_mixed_problems() -> None:
 
 def test_a_world_origin_far_away_changes_nothing() -> None:
     problem = rig(seed=2).problem
-    shift = np.eye(4)
-    shift[:3, 3] = (4e5, -7e5, 2e5)
+    shift = se3.pose(np.eye(3), (4e5, -7e5, 2e5))
     far = copied(problem, A=lambda pair, raw: raw.A @ np.linalg.inv(shift))
     near, away = refined(problem, residual="chordal"), refined(far, residual="chordal")
     for name in ("sensor0", "sensor1"):

@@ -201,8 +201,7 @@ def test_a_sphere_counts_whole_wherever_its_frame_is() -> None:
     rng = np.random.default_rng(7)
     A, X, Y, centre = np.array([pose(rng) for _ in range(15)]), pose(rng), pose(rng, 0.3), np.array([0.2, -0.1, 0.4])
     B = se3.inverse(Y)[None] @ A @ X @ se3.expmap(np.c_[np.zeros((15, 3)), MOVE_M * rng.normal(size=(15, 3))])
-    at_centre = np.eye(4)
-    at_centre[:3, 3] = centre
+    at_centre = se3.pose(np.eye(3), centre)
     moved = se3.adjoint(at_centre[None])[0]
     covariance = moved @ np.diag([900.0, 900, 900, *[MOVE_M**2] * 3]) @ moved.T
     registered, points = rw.Problem(), rw.Problem()

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from naive_cost import naive_cost
+from rwhec_factors import se3
 from rwhec_factors.se3 import pose
 from solved_problems import MODES, NOISE, matrices, simulated
 
@@ -152,8 +153,7 @@ def test_exact_data_are_certified_wherever_the_origin_of_the_world_is(distance_m
     """What is left of the cost is the rounding of the poses, which is 1e-10 m where the origin is 1,000 km away."""
     near = general(2, 2, seed=1).problem
     problem = rw.Problem()
-    away = np.eye(4)
-    away[:3, 3] = distance_m * np.array([0.6, 0.8, 0.1])
+    away = se3.pose(np.eye(3), distance_m * np.array([0.6, 0.8, 0.1]))
     for pair in near.pairs:
         for batch in near.batches(*pair):
             problem.add(*pair, batch.A @ away, batch.B)
