@@ -24,6 +24,7 @@ from gtsam_rwhec.errors import (
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.fitting.fit_options import About, CornerOptions, Drift, PoseOptions, RefineOptions, check_choices
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -94,10 +95,8 @@ class CalibrateOptions(PoseOptions):
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
                 "sensors' names: ('cam_0',)"
             )
-        if self.corners is not None and not isinstance(self.corners, CornerOptions):
-            raise OptionError(f"CalibrateOptions.corners is a {type(self.corners).__name__}; give a CornerOptions")
-        if not isinstance(self.solve, SolveOptions):
-            raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
+        check_kind(self.corners, CornerOptions | None, "CalibrateOptions.corners", "a CornerOptions")
+        check_kind(self.solve, SolveOptions, "CalibrateOptions.solve", "a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
 

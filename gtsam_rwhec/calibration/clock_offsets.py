@@ -25,6 +25,7 @@ from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import WINDOW_S, LocalPaths, Trajectory
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
@@ -192,21 +193,21 @@ def _rows_of(data: list[PairData], solution: Solution, fixed_scales: frozenset[s
     targets = list(dict.fromkeys(item.pair.target for item in data))
     owners = [] if solution.scale_mode == "known" else [name for name in targets if name not in fixed_scales]
     first, step = 7 + 6 * len(targets), int(solution.scale_mode == "per_target")
-    scale_at = {name: first + i * step for i, name in enumerate(owners)}
+    column_of = {name: first + i * step for i, name in enumerate(owners)}
     r, J = [], []
     for item in data:
         target, sensor = item.pair
         scale = 1.0
-        if target in scale_at:
-            scale = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
+        if target in column_of:
+            scale = scale_at(solution.scale, target)
         at = item.residuals.linearize(solution.X[target].matrix(), solution.Y[sensor].matrix(), scale)
-        own = np.zeros((item.count, 6, max(scale_at.values(), default=first - 1) + 1))
+        own = np.zeros((item.count, 6, max(column_of.values(), default=first - 1) + 1))
         own[:, :, 0] = at.offset
         own[:, :, 1:7] = at.sensor
         k = 7 + 6 * targets.index(target)
         own[:, :, k : k + 6] = at.target
-        if target in scale_at:
-            own[:, :, scale_at[target]] = at.scale
+        if target in column_of:
+            own[:, :, column_of[target]] = at.scale
         r.append(at.residual)
         J.append(own)
     return np.concatenate(r), np.concatenate(J)

@@ -22,6 +22,7 @@ from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.robust_solution import NoiseScale, robust_solution
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import LONGEST_GAP_S
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -236,7 +237,7 @@ def more_consistent(problem: Problem, inliers: Inliers) -> Inliers | None:
     spread = np.array([of_other.residual.rotation_rad, of_other.residual.translation_m]) / MEDIAN_OF_CHI
     found: Inliers = {}
     for pair in inliers:
-        scale = of_other.scale[pair.target] if isinstance(of_other.scale, dict) else of_other.scale
+        scale = scale_at(of_other.scale, pair.target)
         errors = residuals(of_other.frames, scale, pair, raw[pair].A, raw[pair].B)
         found[pair] = np.asarray((errors < AGREES_SIGMAS * spread[:, None]).all(axis=0))
     return found if sum(int(mask.sum()) for mask in found.values()) >= left_out // 2 else None

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import expit
 
-from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, NoiseError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions, Walk
@@ -27,7 +27,8 @@ from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.geometry.real_numbers import check_kind
+from gtsam_rwhec.problem.knowledge import ScaleMode, scale_at
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected, summed_again
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -212,8 +213,7 @@ def sizes(
         known, the measurements were not kept, or no positive sizes fit: then the motion says nothing about them.
     """
     check_progress(progress)
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     if problem.scale != "known" or not problem.has_measurements or not problem.pairs:
         return ()
     (progress or silent)("looking at the targets' sizes")
@@ -371,8 +371,7 @@ def doubted_lengths(problem: Problem, solution: Solution) -> str:
     need the raw measurements.
     """
     distances = [
-        np.linalg.norm(batch.B[:, :3, 3], axis=1)
-        / (solution.scale[pair.target] if isinstance(solution.scale, Mapping) else solution.scale)
+        np.linalg.norm(batch.B[:, :3, 3], axis=1) / scale_at(solution.scale, pair.target)
         for pair in problem.pairs
         if not pair.is_motion
         for batch in problem.batches(*pair)

@@ -24,6 +24,7 @@ from gtsam_rwhec.calibration.row_shifts import AS_GIVEN, SHIFTS, cheapest, costs
 from gtsam_rwhec.calibration.trial_fits import SLOW_SHARE, Sample, Sampled, Spread, TrialFit, angles, fitted, signal_of
 from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
@@ -227,7 +228,7 @@ class _Trial:
         frames = {name: T.matrix() for name, T in (solution.X | solution.Y).items()}
         errors, steps = {}, []
         for pair, one in self.rows.items():
-            scale = solution.scale[pair.target] if isinstance(solution.scale, dict) else solution.scale
+            scale = scale_at(solution.scale, pair.target)
             errors[pair] = one.errors(frames[pair.sensor], frames[pair.target], scale)
             twists = one.residuals(frames[pair.sensor], frames[pair.target], scale, 0)
             steps.append(np.diff(twists, axis=0) / math.sqrt(2.0))
@@ -250,11 +251,7 @@ class _Trial:
     def _errors(self, fit: TrialFit) -> dict[Pair, Array]:
         scale = fit.scale
         return {
-            pair: one.errors(
-                fit.frames[pair.sensor],
-                fit.frames[pair.target],
-                scale[pair.target] if isinstance(scale, dict) else scale,
-            )
+            pair: one.errors(fit.frames[pair.sensor], fit.frames[pair.target], scale_at(scale, pair.target))
             for pair, one in self.rows.items()
         }
 
@@ -358,7 +355,7 @@ class _Trial:
         products = squares = 0.0
         for pair, one in self.rows.items():
             X, Y = best.fit.frames[pair.target], best.fit.frames[pair.sensor]
-            scale = best.fit.scale[pair.target] if isinstance(best.fit.scale, dict) else best.fit.scale
+            scale = scale_at(best.fit.scale, pair.target)
             twists = one.residuals(Y, X, scale, SHIFTS[best.shifts[pair]])
             size = np.maximum(np.median(np.abs(twists), axis=0), 1e-9)
             z = np.clip(twists / size, -4.0, 4.0)

@@ -32,6 +32,7 @@ from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.fitting.weighted_fit import as_of_six
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.geometry.trajectory import WINDOW_S
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -346,15 +347,13 @@ def inliers_of(
 
 def check_inputs(problem: Problem, solution: Solution | None, options: RefineOptions) -> None:
     """Refuse a problem that cannot be refined from this solution with these options; ``refine`` lists the errors."""
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     if not isinstance(solution, Solution) and (solution is not None or getattr(options, "robust", "") != "gnc"):
         raise OptionError(
             f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned (or None with "
             "robust='gnc')"
         )
-    if not isinstance(options, RefineOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
+    check_kind(options, RefineOptions, "options", "a gtsam_rwhec.RefineOptions")
     if options.observations == "corners":
         raise OptionError("observations='corners': call gtsam_rwhec.refine, which refines on from here by the corners")
     problem.require_pairs()

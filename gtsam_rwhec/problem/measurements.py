@@ -11,10 +11,10 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, NoiseError, OptionError, StampError, UnitsWarning
+from gtsam_rwhec.errors import CountError, NoiseError, StampError, UnitsWarning
 from gtsam_rwhec.files.terminal_text import brief, some
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms
-from gtsam_rwhec.geometry.real_numbers import real_array
+from gtsam_rwhec.geometry.real_numbers import check_kind, real_array
 from gtsam_rwhec.problem.moments import Gauge
 
 Value = TypeVar("Value")
@@ -130,8 +130,7 @@ class GivenMeasurements:
 
     def check_source(self) -> None:
         """Raise an OptionError for a source that is no text."""
-        if self.source is not None and not isinstance(self.source, str):
-            raise OptionError(f"source is a {type(self.source).__name__}; give text: the name of a file or topic")
+        check_kind(self.source, str | None, "source", "text: the name of a file or topic")
 
     @property
     def has_noise(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Literal
 
 import gtsam
@@ -14,6 +14,7 @@ from gtsam_rwhec.files.terminal_text import natural_key
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Positive, Triple, triple
 
 Deviations = tuple[float | None, float | None, float | None]
@@ -99,7 +100,7 @@ def scalars_of(refined: RefinedPoses) -> Iterator[Scalar]:
     for unknown in refined.unknowns:
         deviation = _finite(math.sqrt(refined.covariance(unknown)[0, 0]))
         if unknown.kind is UnknownKind.SCALE:
-            value = refined.scale[unknown.owner] if isinstance(refined.scale, Mapping) else refined.scale
+            value = scale_at(refined.scale, unknown.owner)
             yield Scalar(kind="scale", owner=unknown.owner, value=value, deviation=deviation)
         elif unknown.kind is UnknownKind.TIME_OFFSET:
             value = refined.time_offsets_s[unknown.owner]

@@ -9,8 +9,8 @@ import numpy as np
 
 from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, MANY, LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
-from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.solution import Solution
 
@@ -46,8 +46,7 @@ def judge(
     findings : sequence of Finding, optional
         What ``calibrate`` found besides: misreadings, sizes, sensors without an answer.
     """
-    if not isinstance(solution, Solution):
-        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    check_kind(solution, Solution, "the solution", "what gtsam_rwhec.solve returned")
     found = [*findings_of(solution, refined), *findings]
     if log is not None:
         sensors = {count.sensor for count in log.outliers}
