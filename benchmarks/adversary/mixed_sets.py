@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -10,6 +11,7 @@ from exact_cost import fractions
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.errors import NotUniqueWarning
 from gtsam_rwhec.solver.directed_pairs import DirectedPair
 
 #: What a set may have, each with its own target; "motions" are of the sensor itself.
@@ -27,6 +29,12 @@ class MixedSet:
     problem: rw.Problem
     truth: dict[str, np.ndarray]
     scale: float
+
+
+def solved(problem: rw.Problem) -> rw.Solution:
+    """The solution of a set; what slides in it may leave directions free."""
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
+        return rw.solve(problem)
 
 
 def pose(rng: np.random.Generator, reach_m: float = 1.0) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import gtsam
@@ -10,20 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mixed_sets import MOVE_M, TURN_RAD, mixed_set, pose
+from mixed_sets import MOVE_M, TURN_RAD, mixed_set, pose, solved
 from rwhec_factors import se3
 from scipy.optimize import least_squares
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import (
-    CountError,
-    MeasurementsNotKeptError,
-    NoiseError,
-    NotUniqueWarning,
-    OptionError,
-    PoseError,
-    ScaleError,
-)
+from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, NoiseError, OptionError, PoseError, ScaleError
 from gtsam_rwhec.fitting.robust_solution import robust_solution
 from gtsam_rwhec.problem.directions import SLIDES, aligned, centres_of, motions_of_slides, scaled, with_common_slides
 from gtsam_rwhec.problem.measurements import Pair
@@ -31,11 +22,6 @@ from gtsam_rwhec.problem.selection import VarianceFactors, aligned_at, reweighte
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver.answers import PairPoses, given_answer, parts_about
 from gtsam_rwhec.solver.part_form import PartForm
-
-
-def solved(problem: rw.Problem) -> rw.Solution:
-    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
-        return rw.solve(problem)
 
 
 @pytest.mark.parametrize("seed", range(8))
