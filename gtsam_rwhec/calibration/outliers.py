@@ -58,9 +58,7 @@ class LeftOut:
         return twice > self.measurements or (share < HALF and twice == self.measurements > 0)
 
 
-def contradicted_frames(
-    counts: Mapping[Pair, tuple[int, int]], nearly_half: float = NEARLY_HALF
-) -> tuple[LeftOut, ...]:
+def contradicted_frames(counts: Mapping[Pair, tuple[int, int]]) -> tuple[LeftOut, ...]:
     """The sensors and targets with mostly outliers: more than half, half of few measurements, or nearly half of many.
 
     ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
@@ -72,13 +70,13 @@ def contradicted_frames(
     rest = counts
     everything = _by_frame(counts)
     names: list[str] = []
-    for share in (HALF, nearly_half):
+    for share in (HALF, NEARLY_HALF):
         while beyond := [frame for frame in _by_frame(rest).values() if frame.is_beyond(share)]:
             names.append(max(beyond, key=lambda frame: frame.left_out).frame)
             rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
     # A frame that has measurements only with contradicted frames depends on these.
     known = {*names, *_by_frame(rest)}
-    names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(nearly_half)]
+    names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(NEARLY_HALF)]
     return tuple(everything[name] for name in names)
 
 

@@ -22,7 +22,7 @@ from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions, Walk
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_refinement import refine_under_noise
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import Refined, sigma_of
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -294,14 +294,12 @@ def _under_all_noise(
 def sizes_in(refined: Refined) -> list[TargetSize]:
     """The sizes of an answer with a scale of each target, or one of all."""
     if not isinstance(refined.scale, Mapping):
-        variance = float(refined.covariance("scale")[0, 0])
-        sigma = math.sqrt(variance) if math.isfinite(variance) else None
+        sigma = sigma_of(refined, "scale")
         moves = _moves(refined, Unknown.of("scale"))
         return [TargetSize(name, refined.scale, sigma, moves=moves) for name in refined.X]
-    variances = {name: float(refined.covariance(Unknown(UnknownKind.SCALE, name))[0, 0]) for name in refined.scale}
-    sigmas = {name: math.sqrt(of) if math.isfinite(of) else None for name, of in variances.items()}
+    unknowns = {name: Unknown(UnknownKind.SCALE, name) for name in refined.scale}
     return [
-        TargetSize(name, scale, sigmas[name], moves=_moves(refined, Unknown(UnknownKind.SCALE, name)))
+        TargetSize(name, scale, sigma_of(refined, unknowns[name]), moves=_moves(refined, unknowns[name]))
         for name, scale in refined.scale.items()
     ]
 

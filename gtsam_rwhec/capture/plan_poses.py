@@ -22,7 +22,7 @@ from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import check_kind
+from gtsam_rwhec.geometry.real_numbers import check_kind, finite_or_none
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.result_file import Result
@@ -291,7 +291,7 @@ def _outlook(
         freedom += (ranking.degrees_of_freedom - freedom) * measurements / count if np.isfinite(freedom) else 0.0
         return task.radius_mm(cell, np.linalg.inv(cell.known + rough + measurements / count * added), freedom)[0]
 
-    wanted = 1e3 * options.wanted.radius_m if np.isfinite(options.wanted.radius_m) else None
+    wanted = finite_or_none(1e3 * options.wanted.radius_m)
     needed, free = None, free_frames(cell, np.linalg.inv(ranking.information))
     least = after(ENDLESS) if number else now
     floor = max(1e3 * ball_radius(np.maximum(of, 0.0), task.level) for of in task.variances(cell.floor))

@@ -19,6 +19,7 @@ from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.stores import write_once
 from gtsam_rwhec.fleet.tasks import below
 from gtsam_rwhec.fleet.watching import DAY_NS, RobotChart, Watched, watch
+from gtsam_rwhec.geometry.real_numbers import finite_or_none
 from gtsam_rwhec.report.figures import INK, VERMILLION, shortened, svg_figure
 from gtsam_rwhec.report.html_page import page_html, write_page
 from gtsam_rwhec.report.report_blocks import Block, Chart, Link, Listing, Number, Page, Paragraph, Section, Table, Words
@@ -142,7 +143,7 @@ def _table(rows: Sequence[RobotRow], *, has_results: bool) -> Table:
         def number(field: str, value: float | None, times: float = 1.0, spec: str = ".3g") -> Number:
             return Number(f"{ROWS_FILE}#/rows/{i}/{field}", value, times, spec)
 
-        turned, moved = (value if math.isfinite(value) else None for value in row.largest_deviations())
+        turned, moved = map(finite_or_none, row.largest_deviations())
         known = row.covariance is not None and len(row.covariance) > 0
         return (
             _name(row, has_results),

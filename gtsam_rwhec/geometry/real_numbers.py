@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from numbers import Integral, Real
 from types import UnionType
 from typing import Any, TypeGuard
@@ -31,6 +32,11 @@ def is_real(value: object) -> TypeGuard[float]:
 def is_between(value: object, least: float, largest: float) -> TypeGuard[float]:
     """Whether a value is one real number from ``least`` to ``largest``; NaN is not."""
     return is_real(value) and bool(least <= value <= largest)
+
+
+def finite_or_none(value: float) -> float | None:
+    """The same number, or None where it is infinite or NaN: files in JSON have neither."""
+    return value if math.isfinite(value) else None
 
 
 def is_whole(value: object, least: int) -> TypeGuard[int]:

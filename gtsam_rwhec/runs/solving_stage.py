@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from gtsam_rwhec.cameras.intrinsics_evidence import IntrinsicsEvidence
 from gtsam_rwhec.errors import CameraError, LogError, RwhecError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.fit_options import CornerOptions, RefineOptions
-from gtsam_rwhec.fitting.refined import PairNoise, Refined, RefinedPoses
+from gtsam_rwhec.fitting.refined import PairNoise, Refined, RefinedPoses, sigma_of
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -394,12 +393,6 @@ def _sizes(rig: Rig, found: Calibration, refined: Refined) -> tuple[SizeFields, 
         if one.name in told
         for scale, sigma, is_free in [told[one.name]]
     )
-
-
-def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
-    """The standard deviation of a scalar, or None if it is infinite."""
-    variance = float(refined.covariance(unknown)[0, 0])
-    return math.sqrt(variance) if math.isfinite(variance) else None
 
 
 def _with_outliers_marked(pairs: Pairs, outliers: Outliers) -> Pairs:
