@@ -22,7 +22,7 @@ from rwhec_factors.se3 import expmap, inverse, logmap
 from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.row_shifts import AS_GIVEN, SHIFTS, cheapest, costs_of, errors_at_shifts, likely_shifts
 from gtsam_rwhec.calibration.trial_fits import SLOW_SHARE, Sample, Sampled, Spread, TrialFit, angles, fitted, signal_of
-from gtsam_rwhec.files.terminal_text import some
+from gtsam_rwhec.files.terminal_text import counted, some
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Measurements, Pair
@@ -75,9 +75,9 @@ class Slip:
         at = "" if self.stamp_ns is None else f", {self.stamp_ns} ns"
         begin = f"row {self.from_row}" if first == last else f"row {self.from_row} ({first} to {last} fit as well)"
         many = abs(self.shift)
-        whose = f"{many} row{'s' if many > 1 else ''} {'later' if self.shift > 0 else 'earlier'}"
+        whose = f"{counted(many, 'row')} {'later' if self.shift > 0 else 'earlier'}"
         belongs = f"belongs to the A that is {whose}" if many else "belongs to its own A again"
-        return f"from {begin} of {self.pair}{at} on, B {belongs} ({self.number} row{'s' if self.number > 1 else ''})"
+        return f"from {begin} of {self.pair}{at} on, B {belongs} ({counted(self.number, 'row')})"
 
 
 @dataclass(frozen=True)

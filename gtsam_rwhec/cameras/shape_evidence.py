@@ -18,7 +18,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_evidence import change_test, different
 from gtsam_rwhec.cameras.targets import Charuco, Target
 from gtsam_rwhec.cameras.unknown_intrinsics import board_rows, poses_eliminated
-from gtsam_rwhec.files.terminal_text import some
+from gtsam_rwhec.files.terminal_text import counted, some
 from gtsam_rwhec.geometry.poses import Array
 
 #: A hypothesis needs this many views that show moved corners beside other corners.
@@ -243,7 +243,7 @@ def _lines(board: Charuco, seen: np.ndarray, expected: np.ndarray) -> str:
         if 0 < count < len(unseen):
             left[axis] -= count
             what = "row" if axis == 1 else "column"
-            parts.append(f"{words} {count} {what}{'s' * (count > 1)} of corners")
+            parts.append(f"{words} {counted(count, what)} of corners")
     if not parts:
         return ""
     return f"{' and '.join(parts)} (if they are not there, write squares: [{left[2] + 1}, {left[1] + 1}])"

@@ -94,6 +94,16 @@ def some(names: Sequence[str], most: int, between: str = ", ") -> str:
     return between.join(names[:most]) + last
 
 
+def listed(words: Sequence[str]) -> str:
+    """One word or more as people list them: "a", "a and b", "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+
+
+def counted(number: int, word: str) -> str:
+    """A number of things: "1 row", "3 rows"."""
+    return f"{number} {word}{'s' * (number != 1)}"
+
+
 def rounded(value: float, digits: int = 2) -> str:
     """A number with so many digits, and without an exponent from 0.0001 up to a million."""
     return f"{float(f'{value:.{digits}g}'):g}"

@@ -11,7 +11,7 @@ from typing import Literal
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief, shown, some
+from gtsam_rwhec.files.terminal_text import brief, counted, shown, some
 from gtsam_rwhec.fleet.drift_events import NoAnswerEvent, day_text
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.fleet_run import FleetRun
@@ -68,8 +68,8 @@ def summary(rows: Sequence[RobotRow]) -> str:
     parts = [f"{counts[verdict]} {words}" for verdict, words in _WORDS.items() if counts[verdict]]
     parts += [f"{failed} failed"] if failed else []
     lost = sum(len(row.failed_logs) for row in rows)
-    logs = f" {lost} log{'s' * (lost != 1)} could not be used." if lost else ""
-    return f"{len(rows)} calibration{'s' * (len(rows) != 1)}: {', '.join(parts) or 'none'}.{logs}"
+    logs = f" {counted(lost, 'log')} could not be used." if lost else ""
+    return f"{counted(len(rows), 'calibration')}: {', '.join(parts) or 'none'}.{logs}"
 
 
 def worst_first(rows: Sequence[RobotRow]) -> list[RobotRow]:
@@ -149,7 +149,7 @@ def drift_verdict(watched: Watched, since_ns: int = 0) -> str:
         return "Nothing was watched: no robot has a night that says where its frames are."
     changed = list(dict.fromkeys(alarm.robot for alarm in watched.alarms if alarm.when_ns >= since_ns))
     nights = sum(len(robot.tests) for robot in watched.robots.values())
-    of = f"{len(watched.robots)} robot{'s' * (len(watched.robots) != 1)}, {nights} night{'s' * (nights != 1)}"
+    of = f"{counted(len(watched.robots), 'robot')}, {counted(nights, 'night')}"
     since = f" since {day_text(since_ns)}" if since_ns else ""
     if not changed:
         return f"Nothing moved by more than chance{since}: {of}."

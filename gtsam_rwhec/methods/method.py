@@ -16,7 +16,7 @@ from typing import Any, Generic, Literal, ParamSpec, TypeVar
 import gtsam
 
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, PriorError, RwhecError, ScaleError
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, counted
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, check_kind, is_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
@@ -262,10 +262,9 @@ def _check_frames(method: Method[Any], problem: Problem) -> None:
         "Xs and Ys": (True, ""),
     }["Xs and Ys" if Takes.CORNERS in method.takes else method.properties.multiple]
     if not can:
-        pairs = len(problem.pairs)
         raise FrameError(
-            f"this method solves for {what}; the problem has {targets} target{'s' * (targets != 1)}, {sensors} "
-            f"sensor{'s' * (sensors != 1)} and {pairs} pair{'s' * (pairs != 1)}"
+            f"this method solves for {what}; the problem has {counted(targets, 'target')}, "
+            f"{counted(sensors, 'sensor')} and {counted(len(problem.pairs), 'pair')}"
         )
     if targets == sensors == 1 and Takes.PRIORS not in method.takes and problem.number_of_measurements < FEWEST:
         raise CountError(
