@@ -35,13 +35,13 @@ BUDGET = {
     # LiDARs of one vehicle registered with each other by what both saw 670, in three files; depth folders 120;
     # one registration for proposal and calibration 60; sizes that the motion hardly tells, and errors along beams 80;
     # a LiDAR beside poses of a vehicle 20; many tags by what does not change 90
-    "lines": 101_630,
-    "code": 63_440,
+    "lines": 101_510,
+    "code": 63_280,
     # capture has 25 files, and is a package of its own
     "files": 442,
     "packages": 20,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 73_500,
+    "lines of tests and benchmarks": 73_040,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

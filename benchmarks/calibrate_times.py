@@ -45,8 +45,7 @@ def seconds_of_calls(case: Case, calls: int) -> list[float]:
         log = dense_logs.simulate(case.recorded, np.random.default_rng(number))
         problem = log.problem(slice(0, None, case.every))
         begin = time.perf_counter()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             rw.calibrate(problem)
         found.append(time.perf_counter() - begin)
     return found

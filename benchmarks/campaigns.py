@@ -77,8 +77,7 @@ def run(name: str, seeds: range) -> dict[str, Any]:
     counts, failing, start = Counts(), [], time.process_time()
     for seed in seeds:
         try:
-            with warnings.catch_warnings(), one_blas_thread():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(action="ignore"), one_blas_thread():
                 of_seed, cases = CAMPAIGNS[name].one(seed)
         except Exception as error:  # noqa: BLE001  (whatever it is, it is a finding)
             of_seed, cases = Counts(), [f"raised {type(error).__name__}: {error}"]

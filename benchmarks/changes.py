@@ -108,8 +108,7 @@ def run(kind: str, number: int, seed: int) -> dict[str, Any]:
     """One pair of logs: chances without a change, and whether changes are found."""
     generator = np.random.default_rng([seed, KINDS.index(kind), number])
     X, Y = cell(kind, generator)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         arm = ARM.misbuilt(*MISBUILT, generator)
         problems = [log_of(kind, X, Y, arm, generator) for _ in range(2)]
         # Nothing is misread, of another size or an outlier here, so none is looked for.
@@ -151,8 +150,7 @@ def run(kind: str, number: int, seed: int) -> dict[str, Any]:
         common.difference + everything, common.covariances, common.free, common.groups, freedom, LEVEL
     )
     if number % VERIFIED_MOVED == 0:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             turned = gtsam.Pose3.Expmap(one[rows] * unit_of(old, frame)).matrix()
             again = rw.results.verify(old, with_moved(problems[1], frame, turned), systematic=kind == "arm")
         result["verified_one"], result["verified_named"] = not again.holds, again.test.changed == (frame,)

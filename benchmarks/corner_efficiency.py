@@ -81,8 +81,7 @@ def one(name: str, seed: int) -> dict[str, tuple[float, ...]]:
     given = simulated_cells.cell(seed, stated=stated, carrier=kind.carrier, corner_px=CORNER_PX, **kind.geometry)
     exact = kind.carrier == (0.0, 0.0)
     options = rw.CornerOptions(stated=kind.told, carrier_noise="exact" if exact else "estimate")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         poses = refined_from_poses(given, kind.carrier)
     corners = rw.refine_corners(given.observations, poses.X, poses.Y, options)
     bound = bound_at_the_truth(given, corners, Noise(CORNER_PX, *kind.carrier))

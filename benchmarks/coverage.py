@@ -1,6 +1,6 @@
 """Do 95 % ellipsoids hold the truth in 95 % of runs, and is the refined estimate as good as can be?
 
-    python benchmarks/coverage.py [--runs 1000] [--workers 2] [--plot FOLDER]
+    python benchmarks/coverage.py [--runs 1000] [--workers 2]
 
 Coverage: simulated problems (a rig with one sensor and one target, or two of each, among 40 or 20 poses), Langevin and
 Gaussian noise of 0.5 degrees and 5 mm or 2 degrees and 20 mm on B, A exact or with 0.3 degrees and 2 mm, scale known
@@ -19,9 +19,8 @@ import os
 import sys
 import time
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -115,9 +114,8 @@ def simulate(case: Case, seed: np.random.SeedSequence) -> tuple[rw.simulate.Simu
 
 def refined_of(case: Case, problem: rw.Problem, noise: Literal["given", "estimate"]) -> rw.Refined:
     """Solve and refine."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         # A's noise makes the costs larger than the weights of B predict; what is not unique has infinite variances.
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
         solution = rw.solve(problem)
         options = rw.RefineOptions(noise=noise, carrier_noise=CARRIER if case.noisy_A else None)
         return rw.refine(problem, solution, options)
@@ -145,14 +143,14 @@ def held(refined: rw.Refined, truth: rw.simulate.Simulation) -> dict[str, bool]:
 class Outcome:
     """Of some runs of one case: for each noise source, how many of each quantity held; runs with something free."""
 
-    held: dict[tuple[str, str], int]
+    held: Counter[tuple[str, str]]
     runs: int
     free: int
 
 
 def run_chunk(case: Case, seeds: list[np.random.SeedSequence]) -> Outcome:
     """Simulate, solve, refine with given and with estimated noise."""
-    counts: dict[tuple[str, str], int] = defaultdict(int)
+    counts: Counter[tuple[str, str]] = Counter()
     free = 0
     for seed in seeds:
         truth, problem = simulate(case, seed)
@@ -161,7 +159,7 @@ def run_chunk(case: Case, seeds: list[np.random.SeedSequence]) -> Outcome:
             free += bool(refined.free_directions)
             for quantity, inside in held(refined, truth).items():
                 counts[noise, quantity] += inside
-    return Outcome(dict(counts), len(seeds), free)
+    return Outcome(counts, len(seeds), free)
 
 
 def efficiency(runs: int, seed: int = 3) -> list[Row]:
@@ -235,38 +233,6 @@ def print_table(console: Console, results: dict[Case, Outcome]) -> list[tuple[Ca
     return missed
 
 
-def plot(results: dict[Case, Outcome], folder: Path) -> Path:
-    """Every share, with the band of the bar."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True, layout="constrained")
-    quantities = ("X", "Y", "relative", "scale")
-    markers, colours = ("o", "s", "^", "D"), ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
-    for axis, noise in zip(axes, ("given", "estimate"), strict=True):
-        axis.axhspan(100 * (CONFIDENCE - BAR), 100 * (CONFIDENCE + BAR), color="0.92", label="bar: 95 +- 2 %")
-        axis.axhline(100 * CONFIDENCE, color="0.5", lw=1)
-        for quantity, marker, colour in zip(quantities, markers, colours, strict=True):
-            points = [
-                (i, 100 * n / outcome.runs)
-                for i, outcome in enumerate(results.values())
-                for (source, q), n in outcome.held.items()
-                if source == noise and q.split()[0] == quantity
-            ]
-            if points:
-                axis.plot(*zip(*points, strict=True), marker, color=colour, ms=5, mew=0, label=quantity)
-        axis.set_title(f"noise {'given' if noise == 'given' else 'estimated from the residuals'}")
-        axis.set_xlabel("case (row of the table)")
-    axes[0].set_ylabel("runs whose 95 % ellipsoid holds the truth, %")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5)
-    path = folder / "coverage.png"
-    figure.savefig(path, dpi=130)
-    return path
-
-
 def coverage(runs: int, workers: int, seed: int, console: Console) -> dict[Case, Outcome]:
     """All cases, in chunks over processes."""
     seeds = dict(zip(CASES, np.random.SeedSequence(seed).spawn(len(CASES)), strict=True))
@@ -282,16 +248,15 @@ def coverage(runs: int, workers: int, seed: int, console: Console) -> dict[Case,
 
 def joined(outcomes: list[Outcome]) -> Outcome:
     """All runs of one case."""
-    counts: dict[tuple[str, str], int] = defaultdict(int)
+    held: Counter[tuple[str, str]] = Counter()
     for outcome in outcomes:
-        for key, number in outcome.held.items():
-            counts[key] += number
-    return Outcome(dict(counts), sum(o.runs for o in outcomes), sum(o.free for o in outcomes))
+        held.update(outcome.held)  # unlike a sum of counters, it keeps what held in no run
+    return Outcome(held, sum(o.runs for o in outcomes), sum(o.free for o in outcomes))
 
 
 def main() -> int:
     """Run both; 0 if the bars are met."""
-    arguments = given_options(runs=1000, efficiency_runs=4000, workers=os.cpu_count() or 1, seed=0, plot=Path)
+    arguments = given_options(runs=1000, efficiency_runs=4000, workers=os.cpu_count() or 1, seed=0)
     console = wide_console()
     begin = time.perf_counter()
     status = 0
@@ -308,8 +273,6 @@ def main() -> int:
             f"{100 * max(shares):.1f} %; bar 95 +- 2 %, missed by {len(missed)}; {free} answers called not unique."
         )
         status = int(bool(missed))
-        if arguments.plot is not None:
-            console.print(f"Written to {plot(results, arguments.plot)}.")
     if arguments.efficiency_runs:
         status = max(status, print_rows("Efficiency", efficiency(arguments.efficiency_runs)))
     return status

@@ -269,8 +269,7 @@ class Counts:
 
 def counted(counts: Sequence[int], trials: range, seed: int) -> Counts:
     """These trials of each number of measurements; a trial is the same whichever others are run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         free, free_unique, free_refused = verdicts(False, counts, trials, seed, lambda problem, solution: True)
         rich, rich_unique, rich_refused = verdicts(
             True,

@@ -54,7 +54,6 @@ CHANGED, WITHIN, DEVIATIONS = 14, 3, 4.0
 RATE, BAND, FOUND, DATED = 1e-3, 0.20, 0.90, 0.80
 #: Deviations of a night's numbers, rad and m; they differ by this factor between nights.
 SIZE, VARYING = np.r_[np.full(3, 1e-3), np.full(3, 1e-3)], 1.5
-POSES = 40
 
 
 def fleet_rows(kind: str, size: int, generator: np.random.Generator) -> Iterator[RobotRow]:
@@ -144,8 +143,7 @@ def calibrations(number: int, seed: int) -> dict[str, Any]:
     rows = []
     options = rw.CalibrateOptions(systematic=False, misreadings=False, sizes="known", robust="none")
     for night in range(CHANGED + WITHIN):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             result = rw.calibrate(log_of("white", X, Y, ARM, generator), options)
         refined = without_constant_errors(as_result(result))
         unknowns = (Unknown.of("camera0"), Unknown.of("board"))

@@ -16,6 +16,7 @@ import numpy as np
 from bars import SHARED
 from loky import ProcessPoolExecutor
 from numpy.typing import NDArray
+from rwhec_factors import se3
 from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw
@@ -113,8 +114,7 @@ def _calibrated(out: Path) -> tuple[Array, Array]:
 
 def _turned(Y: Array, middle: Array, degrees: float) -> Array:
     """The camera, turned about the vertical through the arm."""
-    turn = np.eye(4)
-    turn[:3, :3] = cv2.Rodrigues(np.radians([0.0, 0.0, degrees]))[0]
+    turn = se3.pose(cv2.Rodrigues(np.radians([0.0, 0.0, degrees]))[0], np.zeros(3))
     turn[:3, 3] = middle - turn[:3, :3] @ middle
     return turn @ Y
 
@@ -123,9 +123,7 @@ def _further(A_real: Array, X: Array, middle: Array, number: int, rng: np.random
     """Further poses of the hand: real ones turned by any angle about the arm, and moved a little."""
     result = []
     for k in range(number):
-        moved = np.eye(4)
-        moved[:3, :3] = cv2.Rodrigues(rng.normal(scale=np.radians(12.0), size=3))[0]
-        moved[:3, 3] = rng.normal(scale=0.05, size=3)
+        moved = se3.pose(cv2.Rodrigues(rng.normal(scale=np.radians(12.0), size=3))[0], rng.normal(scale=0.05, size=3))
         result.append(_turned(A_real[k % len(A_real)], middle, rng.uniform(0.0, 360.0)) @ X @ moved @ inverse(X))
     return np.array(result).reshape(-1, 4, 4)
 

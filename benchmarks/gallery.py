@@ -79,8 +79,7 @@ def calibrated_folder(fault: Fault, seed: int, folder: Path, *, is_good: bool) -
     rng = np.random.default_rng([seed, zlib.crc32(fault.name.encode())])
     rig = scene.write((fault.good if is_good else fault.bad)(rng), folder / "run", seed)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             calibrated = rw.calibrate_log(folder / "run", read_rig(rig), folder / "out", workers=1)
     except RwhecError as error:
         return "refused", str(error)

@@ -11,6 +11,7 @@ import gallery_scene as scene
 import numpy as np
 from gallery_scene import Recording
 from rendered_prints import Array
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -65,9 +66,7 @@ def little_rotation(rng: np.random.Generator) -> Recording:
 
 def _in_view(rng: np.random.Generator, R_board_camera: Array, distance_m: Array, beside_m: float) -> Array:
     """T_board_camera (N, 4, 4) with directions (N, 3, 3) that look at points beside the board's middle."""
-    T = np.tile(np.eye(4), (len(R_board_camera), 1, 1))
-    T[:, :3, :3] = R_board_camera
-    T[:, :3, 3] = -R_board_camera[:, :, 2] * distance_m[:, None]
+    T = se3.pose(R_board_camera, -R_board_camera[:, :, 2] * distance_m[:, None])
     T[:, :2, 3] += rng.uniform(-beside_m, beside_m, (len(T), 2))
     return T
 
@@ -75,18 +74,18 @@ def _in_view(rng: np.random.Generator, R_board_camera: Array, distance_m: Array,
 def _step(rng: np.random.Generator, degrees: tuple[float, float], metres: tuple[float, float]) -> Array:
     """A pose (4, 4) away from the identity by an angle and a distance of these ranges, in random directions."""
     axis, along = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(axis * np.radians(rng.uniform(*degrees))).as_matrix()
-    T[:3, 3] = along * rng.uniform(*metres)
-    return T
+    return se3.pose(
+        Rotation.from_rotvec(axis * np.radians(rng.uniform(*degrees))).as_matrix(), along * rng.uniform(*metres)
+    )
 
 
 def board_moved(rng: np.random.Generator) -> Recording:
     """Somebody pushes the board over the table about half way."""
     good = stations(rng)
     at = round(scene.IMAGES * rng.uniform(0.35, 0.65))
-    push = np.eye(4)
-    push[:3, :3] = Rotation.from_euler("z", rng.choice([-1, 1]) * rng.uniform(1.0, 8.0), degrees=True).as_matrix()
+    push = se3.pose(
+        Rotation.from_euler("z", rng.choice([-1, 1]) * rng.uniform(1.0, 8.0), degrees=True).as_matrix(), np.zeros(3)
+    )
     push[:2, 3] = rng.choice([-1, 1], 2) * rng.uniform(0.008, 0.03, 2)
     T = good.T_base_board.copy()
     T[at:] = T[at:] @ push

@@ -14,6 +14,7 @@ import numpy as np
 import rendered_prints as prints
 import rendered_scenes as scenes
 from rendered_prints import Array
+from rwhec_factors import se3
 from rwhec_factors.se3 import inverse
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -36,8 +37,7 @@ REACH_RAD = BENT_RAD + np.random.default_rng(0).uniform(-1.0, 1.0, (6, 6))
 #: The arm of the data sheet: longer than that of `simulated_arms`, so that it reaches around the board.
 LONG_ARM = replace(ARM, length_m=1.4 * ARM.length_m)
 #: Where the board lies, seen from the arm's base; where the camera sits on the hand.
-T_BASE_BOARD = np.eye(4)
-T_BASE_BOARD[:3, 3] = (-0.60, -0.15, 0.0)
+T_BASE_BOARD = se3.pose(np.eye(3), (-0.60, -0.15, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +82,10 @@ def lens(rng: np.random.Generator) -> Camera:
 
 def on_hand(rng: np.random.Generator) -> Array:
     """T_hand_camera (4, 4): a few centimetres beside the flange, looking ahead."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("zyx", rng.normal(0.0, [40.0, 5.0, 5.0]), degrees=True).as_matrix()
-    T[:3, 3] = rng.uniform([-0.06, -0.06, 0.03], [0.06, 0.06, 0.09])
-    return T
+    return se3.pose(
+        Rotation.from_euler("zyx", rng.normal(0.0, [40.0, 5.0, 5.0]), degrees=True).as_matrix(),
+        rng.uniform([-0.06, -0.06, 0.03], [0.06, 0.06, 0.09]),
+    )
 
 
 def looking(distance_m: Array, tilt_rad: Array, towards_rad: Array, roll_rad: Array, beside_m: Array) -> Array:
@@ -101,10 +101,7 @@ def looking(distance_m: Array, tilt_rad: Array, towards_rad: Array, roll_rad: Ar
         * Rotation.from_euler("x", np.pi)
         * Rotation.from_euler("z", roll_rad[:, None])
     )
-    T = np.tile(np.eye(4), (n, 1, 1))
-    T[:, :3, :3] = R.as_matrix()
-    T[:, :3, 3] = away * distance_m[:, None] + np.column_stack([beside_m, np.zeros(n)])
-    return T
+    return se3.pose(R.as_matrix(), away * distance_m[:, None] + np.column_stack([beside_m, np.zeros(n)]))
 
 
 def all_around(rng: np.random.Generator, n: int | None = None) -> Array:

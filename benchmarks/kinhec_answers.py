@@ -70,8 +70,7 @@ def baselines_of(root: Path, seed: int, numbers: list[int], offsets: Offsets) ->
     benchmark = of_kinhec("benchmark")
     found = {}
     for sequence in sequences(root, seed, numbers):
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
             rows = benchmark.evaluate_sequence(
                 sequence.package_object,
                 list(benchmark.SOLVERS),
@@ -145,8 +144,7 @@ def our_answer(sequence: NeutralSequence, keyframes: Keyframes | None, offset_s:
     problem = sequence.problem(keyframes)
     begin = time.perf_counter()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             calibration = rw.calibrate(problem)
     except RwhecError as error:
         return OurAnswer("no answer", NO_ANSWER, "raised", f"{type(error).__name__}: {error}")

@@ -154,8 +154,7 @@ def run(name: str, share: float, keep: bool) -> Measured:
     size = f"{len(problem.targets)} x {len(problem.sensors)} frames, {len(problem.pairs)} pairs"
     building_gb = _gigabytes()
     clock, processor = time.perf_counter(), time.process_time()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
         warnings.simplefilter("ignore", NotCertifiedWarning)
         solution = rw.solve(problem)
     clock, processor = time.perf_counter() - clock, time.process_time() - processor

@@ -12,6 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from bars import Row, at_most, in_words, interleaved, run_script
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, frame_distance, general
@@ -41,8 +42,7 @@ def rows_of(count: int, repetitions: int) -> list[Row]:
 
     times = interleaved(repetitions, {"opencv": opencv, "solve": solve, "build": build_and_solve})
     solution, (R, t, *_) = solve(), opencv()
-    theirs = np.eye(4)
-    theirs[:3, :3], theirs[:3, 3] = R, t.ravel()
+    theirs = se3.pose(R, t.ravel())
     errors = [frame_distance(T, simulation.X["target0"]) for T in (solution.X["target0"].matrix(), theirs)]
     ratio, with_build = times.ratio("solve", "opencv"), times.ratio("build", "opencv")
     took = f" ({in_words(times.median('solve'))}; OpenCV {in_words(times.median('opencv'))})"

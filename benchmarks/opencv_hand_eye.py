@@ -170,8 +170,7 @@ def errors(problems: int, count: int, noise: Noise, *, opencv_itself: bool) -> l
         simulation = general(1, 1, seed=seed, number_of_measurements=count, noise=noise)
         truth = simulation.Y["sensor0"]
         arrays = hand_eye_poses(simulation)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             answers = {"solve": rw.solve(simulation.problem).Y["sensor0"].matrix()}
             answers["CERTIFIED"] = transform(ours.calibrateHandEye(*arrays, method=ours.CALIB_HAND_EYE_CERTIFIED))
         for name, method in HAND_EYE.items():

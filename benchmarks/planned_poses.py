@@ -93,8 +93,7 @@ def least_mm(true: TrueCell, poses: Array) -> float:
 
 def error_mm(true: TrueCell, problem: rw.Problem) -> float:
     """How far the worst point is from its true place, by an answer with the noise as it is."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         options = rw.RefineOptions(noise="given", carrier_noise=true.noise)
         refined = rw.refine(problem, rw.solve(problem), options)
     point = np.array([0.0, 0.0, WANTED_AT_M, 1.0])
@@ -144,8 +143,7 @@ def calibrated(kind: str, seed: int, road: str) -> list[float]:
     for i in range(LAST + 1):
         source: rw.Problem | rw.Calibration | None = problem if i else None
         if i >= FIRST:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RwhecWarning)
+            with warnings.catch_warnings(action="ignore", category=RwhecWarning):
                 how = rw.CalibrateOptions(observations="poses", carrier_noise=true.noise, systematic=road != "plain")
                 source = rw.calibrate(problem, how)
             points = [source.uncertainty_at([0.0, 0.0, WANTED_AT_M], name).radius_mm for name in true.Y]

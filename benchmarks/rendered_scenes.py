@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from rendered_prints import Array, Picture, Print
+from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 
@@ -85,14 +86,13 @@ def random_pose(
         ray = np.append((pixel - camera.K[:2, 2]) / np.diagonal(camera.K)[:2], 1.0)
         ray /= np.linalg.norm(ray)
         to_ray = np.cross([0.0, 0.0, 1.0], ray)
-        T = np.eye(4)
-        T[:3, :3] = (
+        T = se3.pose(
             _turned(to_ray / max(np.linalg.norm(to_ray), 1e-12) * np.arccos(np.clip(ray[2], -1, 1)))
             @ _turned(tilt * np.array([np.cos(towards), np.sin(towards), 0.0]))
             @ np.diag([1.0, -1.0, -1.0])
-            @ _turned([0.0, 0.0, turn])
+            @ _turned([0.0, 0.0, turn]),
+            ray * focal * element_m * np.cos(tilt) / side_px,
         )
-        T[:3, 3] = ray * focal * element_m * np.cos(tilt) / side_px
         pose = Pose(camera, T, float(np.degrees(tilt)))
         if is_whole(pose, outline):
             break

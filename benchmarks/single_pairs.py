@@ -128,8 +128,7 @@ def rows_of(scale: rw.ScaleMode, starts: int) -> list[Row]:
     for target, sensor in problem.pairs:
         alone = pair_alone(problem, target, sensor, scale)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", rw.errors.RwhecWarning)  # counted below
+            with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):  # counted below
                 solution = rw.solve(alone)
         except rw.errors.ScaleError:
             refused.append(f"{target}-{sensor}")

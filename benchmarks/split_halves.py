@@ -41,8 +41,7 @@ class Halves:
 def run(seed: np.random.SeedSequence, frames: int) -> Halves:
     """Simulate a log, and calibrate its halves."""
     log = dense_logs.simulate(frames, np.random.default_rng(seed))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         halves = [rw.calibrate(log.problem(part)) for part in (slice(0, frames // 2), slice(frames // 2, frames))]
     squares, bounds, distances = {}, {}, {}
     for name, frame in FRAMES.items():

@@ -181,8 +181,7 @@ def run(kind: str, seed: int, road: str, operator: str = "random") -> dict[str, 
     """One cell: what is true when the rule stops, when a naive one does, and after four and eight views."""
     cell, stream, rule = Cell(kind, seed), rw.Stream(), rw.StoppingRule(WANTED, most_takes=MOST_TAKES)
     found: dict[str, Any] = {"kind": kind, "seed": seed, "road": road, "operator": operator}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for takes in range(1, MOST_TAKES + 1):
             cell.take(stream, OPERATORS[operator](cell, stream), takes * 10**9)
             if takes < FIRST_LOOK and takes != 4:

@@ -186,8 +186,7 @@ def run(road: str, kind: str, mover: str, seed: int) -> dict[str, Any]:
     """One sequence calibrated: a line of the campaign."""
     sequence = simulate(kind, mover, seed)
     began = time.perf_counter()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             verdict, T, covariance, freedom, grounds = ROADS[road](sequence)
         except rw.errors.RwhecError as error:

@@ -167,8 +167,7 @@ def run_chunk(name: str, seeds: list[np.random.SeedSequence]) -> Outcome:
     for seed in seeds:
         world = simulate(CASES[name], np.random.default_rng(seed))
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RwhecWarning)
+            with warnings.catch_warnings(action="ignore", category=RwhecWarning):
                 calibration = rw.calibrate(world.problem)
         except RwhecError as error:
             verdicts[f"raised {type(error).__name__}"] += 1

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import pytest
+from limited_process import Reader
 from places import REPOSITORY
 
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -48,6 +49,13 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     Figures of whole runs are drawn in tests/runs/test_whole_runs.py, test_hostile_names.py and test_bad_logs.py.
     """
     monkeypatch.setattr(SvgFigure, "in_page", "<svg></svg>")
+
+
+@pytest.fixture(scope="module")
+def reader() -> Iterator[Reader]:
+    """A process that reads hostile files within its limits."""
+    with Reader() as process:
+        yield process
 
 
 @pytest.fixture(scope="session")

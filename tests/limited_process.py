@@ -122,8 +122,7 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
     signal.alarm(_ALARM)
     started = time.process_time()
     error, message, result = "", "", None
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         try:
             result = HOW[how](path, **options)
         except RwhecError as refused:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec import Problem
 from gtsam_rwhec.problem.moments import Gauge
@@ -32,8 +33,7 @@ def naive_cost(
         data = problem.measurements(target, sensor)
         alpha = scale[target] if isinstance(scale, Mapping) else scale
         T_X, T_Y = poses[target], poses[sensor]
-        origin = np.eye(4)
-        origin[:3, 3] = gauge.sensor_carrier if target == sensor else gauge.target_carrier
+        origin = se3.pose(np.eye(3), gauge.sensor_carrier if target == sensor else gauge.target_carrier)
         for A, B, sigma, kappa in zip(data.A, data.B, data.sigma, data.kappa, strict=True):
             if form == "direct":  # the translations of A, X and Y in the units of B
                 left, right = A @ T_X, T_Y @ B

@@ -29,8 +29,7 @@ def two_cameras() -> tuple[Cell, rw.CornersRefined, Refined]:
     given = cell(5, images=24, stated="nominal", carrier=(5e-4, 2e-4))
     problem = given.observations.poses()
     problem.scale = "per_target"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         base = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
     options = rw.CornerOptions(size_share=0.05, warp_m=1e-3)
     corners = rw.refine_corners(given.observations, base.X, base.Y, options)

@@ -22,8 +22,7 @@ def rig(targets: int = 2, sensors: int = 2, seed: int = 0, **options: Any) -> Si
 
 def refined(problem: rw.Problem, **options: Any) -> rw.Refined:
     """Solved and refined, warnings kept quiet."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         return rw.refine(problem, rw.solve(problem), rw.RefineOptions(**options))
 
 

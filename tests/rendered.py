@@ -7,6 +7,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import AprilGrid, Bundle, Checkerboard, CircleGrid, Tag, TagGrid, Target
@@ -36,10 +37,7 @@ class Print:
 
 def pose(rotation_deg: tuple[float, float, float], t_m: tuple[float, float, float]) -> np.ndarray:
     """T_camera_target; a target that is not turned faces the camera. The target's y is up, the camera's y is down."""
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(np.radians(np.array(rotation_deg)))[0] @ np.diag([1.0, -1.0, -1.0])
-    T[:3, 3] = t_m
-    return T
+    return se3.pose(cv2.Rodrigues(np.radians(np.array(rotation_deg)))[0] @ np.diag([1.0, -1.0, -1.0]), t_m)
 
 
 def tag_modules(family: str, number: int, border_bits: int = 1) -> np.ndarray:
@@ -94,8 +92,7 @@ def bundle(made: Bundle, T: np.ndarray) -> list[tuple[Print, np.ndarray]]:
         corners = tag.corners()
         across, up = corners[1] - corners[0], corners[0] - corners[3]
         axes = np.stack([across, up, np.cross(across, up) / tag.size_m], axis=1) / tag.size_m
-        T_tag = np.eye(4)
-        T_tag[:3, :3], T_tag[:3, 3] = axes, corners.mean(axis=0)
+        T_tag = se3.pose(axes, corners.mean(axis=0))
         at = T @ T_tag
         if at[:3, 2] @ at[:3, 3] < 0.0:
             scene.append((printed(Tag("tag", made.family, tag.id, tag.size_m)), at))

@@ -8,15 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 
 
 def pose(rotation: Array, position: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotation).as_matrix(), position
-    return T
+    return se3.pose(Rotation.from_rotvec(rotation).as_matrix(), position)
 
 
 def rig_poses(on_hand: bool, count: int = 14, seed: int = 5) -> tuple[Array, Array, Array, Array]:

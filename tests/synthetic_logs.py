@@ -55,10 +55,7 @@ noise: estimate
 
 def pose(turned_deg: Iterable[float], position: Iterable[float]) -> Array:
     """Turned about the fixed axes x, y, z, in this order."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", list(turned_deg), degrees=True).as_matrix()
-    T[:3, 3] = list(position)
-    return T
+    return se3.pose(Rotation.from_euler("xyz", list(turned_deg), degrees=True).as_matrix(), list(position))
 
 
 #: T_hand_camera: the cameras look along the hand's z.

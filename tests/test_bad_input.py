@@ -261,8 +261,7 @@ def test_a_refused_first_batch_leaves_no_trace() -> None:
 def test_a_warning_made_an_error_leaves_no_trace() -> None:
     problem = stated()
     before = pickle.dumps(problem)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         with pytest.raises(errors.UnitsWarning):
             problem.add("tag0", "cam0", A, spoilt(B, (slice(None), 0, 3), 500.0))
         with pytest.raises(errors.RotationsProjectedWarning):

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from places import REPOSITORY
+from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 
@@ -152,9 +153,7 @@ def test_what_is_drawn_is_where_the_truth_says(imported: Callable[[str], ModuleT
     scenes, prints = imported("rendered_scenes"), imported("rendered_prints")
     square = prints.drawn(np.zeros((1, 1)), 2e-3, 16, 1.0)
     camera = Camera.of(720, 540, "plumb_bob", [[500.0, 0, 355.3], [0, 501.0, 270.0], [0, 0, 1]], (-0.2, 0.06), "test")
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(np.array([0.9, -0.4, 0.3]))[0] @ np.diag([1.0, -1.0, -1.0])
-    T[:3, 3] = [0.05, -0.03, 0.12]
+    T = se3.pose(cv2.Rodrigues(np.array([0.9, -0.4, 0.3]))[0] @ np.diag([1.0, -1.0, -1.0]), [0.05, -0.03, 0.12])
     image = np.full((540, 720), 0.75, dtype=np.float32)
     scenes.laid_over(image, scenes.Pose(camera, T, 0.0), square, scenes.Light(0.25, 0.75, 0, 0, (0, 0), 1, 0))
     ink = 0.75 - image.astype(float)

@@ -118,8 +118,7 @@ def hostile(kind: str) -> tuple[np.ndarray, np.ndarray]:
 def test_no_warning_of_numpy_leaks(scale: rw.ScaleMode, kind: str, weights: tuple[float, ...]) -> None:
     """Every warning but our own is an error here, and every exception but our own fails the test."""
     problem = rw.Problem(scale)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         warnings.simplefilter("ignore", rw.errors.RwhecWarning)
         problem.add("t", "s", *hostile(kind), *weights)
         for call in (

@@ -38,6 +38,5 @@ def log_of(
 def calibrated(problem: rw.Problem) -> rw.Calibration:
     """With the noise that was stated: quick, and the same for each log."""
     options = rw.CalibrateOptions(noise="given", robust="none", misreadings=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         return rw.calibrate(problem, options)

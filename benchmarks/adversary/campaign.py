@@ -61,8 +61,7 @@ def attacked(seed: int, *, sane: bool) -> Result:
     case = seeded(seed, sane=sane)
     result = Result(seed, case.kind, case.scale, sorted(set(case.traits)), "")
     # The oracle's matrices are as small as the library's: with threads it took 2.6 times as long.
-    with warnings.catch_warnings(record=True) as heard, one_blas_thread():
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard, one_blas_thread():
         try:
             _solve_and_judge(case, result)
         except FOREIGN as error:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from exact_cost import fractions
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.errors import NotUniqueWarning
 from gtsam_rwhec.solver.directed_pairs import DirectedPair
 
 #: What a set may have, each with its own target; "motions" are of the sensor itself.
@@ -26,6 +29,12 @@ class MixedSet:
     problem: rw.Problem
     truth: dict[str, np.ndarray]
     scale: float
+
+
+def solved(problem: rw.Problem) -> rw.Solution:
+    """The solution of a set; what slides in it may leave directions free."""
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
+        return rw.solve(problem)
 
 
 def pose(rng: np.random.Generator, reach_m: float = 1.0) -> np.ndarray:
@@ -98,18 +107,11 @@ def _add(
 def exact_cost(pair: DirectedPair, X: np.ndarray, Y: np.ndarray, alpha: float) -> Fraction:
     """The cost of a pair that weighs by direction, at poses (4, 4) about the user's origin, without any rounding."""
     total, w = Fraction(0), pair.weighing
-    R_X, t_X, R_Y, t_Y = (exact(part) for T in (X, Y) for part in (T[:3, :3], T[:3, 3]))
+    R_X, t_X, R_Y, t_Y = (fractions(part) for T in (X, Y) for part in (T[:3, :3], T[:3, 3]))
     for i in range(pair.count):
-        R_A, t_A, R_B, t_B = (exact(part) for T in (pair.A[i], pair.B[i]) for part in (T[:3, :3], T[:3, 3]))
+        R_A, t_A, R_B, t_B = (fractions(part) for T in (pair.A[i], pair.B[i]) for part in (T[:3, :3], T[:3, 3]))
         E = R_A @ R_X - R_Y @ R_B
         e = Fraction(alpha) * (R_A @ t_X + t_A - t_Y) - R_Y @ t_B
-        turned, moved = E @ exact(w.turns[i]), exact(w.axes[i]).T @ (e + E @ exact(w.centre[i]))
-        total += ((turned**2).sum(axis=0) * exact(w.of_turns[i])).sum() + (moved**2 * exact(w.of_axes[i])).sum()
+        turned, moved = E @ fractions(w.turns[i]), fractions(w.axes[i]).T @ (e + E @ fractions(w.centre[i]))
+        total += ((turned**2).sum(axis=0) * fractions(w.of_turns[i])).sum() + (moved**2 * fractions(w.of_axes[i])).sum()
     return total / 2
-
-
-def exact(values: np.ndarray) -> np.ndarray:
-    """Doubles as fractions."""
-    result = np.empty(values.shape, dtype=object)
-    result.ravel()[:] = [Fraction(float(x)) for x in values.ravel()]
-    return result

@@ -15,7 +15,7 @@ import double_double as dd
 import numpy as np
 import quaternion_pairs as quaternions
 from double_double import Pairs
-from exact_cost import RationalPoses
+from exact_cost import RationalPoses, fractions
 from global_search import Columns, bending, tangents_of, weighted_matrix
 from stated_cost import Enclosure, Poses, StatedCost
 
@@ -132,13 +132,13 @@ class PairDescent:
             for owner in rows.owners if rows.shares_scale else (name,):
                 alpha[owner] = 1 / value if cost.is_inverse else value
         for place, f in enumerate(rows.free):
-            R[f] = quaternions.exactly([_fraction(answers.q, (k, place, i)) for i in range(4)])
-            shift = linear[3 * place : 3 * place + 3]
+            R[f] = np.array(quaternions.exactly([_fraction(answers.q, (k, place, i)) for i in range(4)]))
+            shift = np.array(linear[3 * place : 3 * place + 3])
             if cost.is_inverse:
-                moved = [sum(a * b for a, b in zip(row, shift, strict=True)) for row in R[f]]
-            else:
-                moved = [v / alpha[rows.owners[0]] if rows.shares_scale else v for v in shift]
-            t[f] = [Fraction(float(o)) + v for o, v in zip(cost.origins[f], moved, strict=True)]
+                shift = R[f] @ shift
+            elif rows.shares_scale:
+                shift = shift / alpha[rows.owners[0]]
+            t[f] = fractions(cost.origins[f]) + shift
         return RationalPoses(R, t, alpha)
 
     def rounded(self, answers: Answers, k: int) -> Poses:

@@ -31,8 +31,7 @@ def statuses(first: int, last: int, *, sane: bool) -> dict[int, tuple[str, float
     from gtsam_rwhec.errors import RwhecError
 
     result = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for seed in range(first, last):
             try:
                 case = seeded(seed, sane=sane)

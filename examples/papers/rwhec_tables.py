@@ -144,8 +144,7 @@ def solved(row: Row, seeds: list[np.random.SeedSequence]) -> tuple[Runs | None, 
     errors: list[CalibrationErrors] = []
     for seed in seeds:
         simulation = simulated(row.level, row.model, seed, keep=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             try:
                 if row.method.startswith("lom "):
                     errors.append(lom(row, simulation, seed))

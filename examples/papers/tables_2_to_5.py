@@ -49,9 +49,8 @@ def solve_runs(experiment: Experiment, seeds: list[np.random.SeedSequence], mode
     errors, optimal, certified = [], [], []
     for seed in seeds:
         simulation = simulated(experiment, model, seed, keep=False)
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             # What is not certified is counted below and fails the benchmark.
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
             solution = rw.solve(simulation.problem, method=method)
         errors.append(simulation.errors(solution))
         optimal.append(solution.certificate.is_optimal)

@@ -32,6 +32,7 @@ from gtsam_rwhec.fitting.fit_options import (
     RefineOptions,
     check_choices,
 )
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -88,10 +89,7 @@ class CalibrateOptions(PoseOptions):
         choices = {"drift": Drift, "robust": RobustChoice, "sizes": SizesChoice, "observations": ObservationChoice}
         check_choices(self, choices if self.hand is None else choices | {"hand": About})
         self.check_share("level", 0.0)
-        if not isinstance(self.systematic, bool | ArmAccuracy):
-            raise OptionError(
-                f"CalibrateOptions.systematic={brief(self.systematic)}; give True, False or an ArmAccuracy"
-            )
+        check_kind(self.systematic, bool | ArmAccuracy, "CalibrateOptions.systematic", "True, False or an ArmAccuracy")
         for name in ("misreadings", "repair"):
             if not isinstance(getattr(self, name), bool):
                 raise OptionError(f"CalibrateOptions.{name}={brief(getattr(self, name))}; give True or False")
@@ -106,10 +104,8 @@ class CalibrateOptions(PoseOptions):
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
                 "sensors' names: ('cam_0',)"
             )
-        if self.corners is not None and not isinstance(self.corners, CornerOptions):
-            raise OptionError(f"CalibrateOptions.corners is a {type(self.corners).__name__}; give a CornerOptions")
-        if not isinstance(self.solve, SolveOptions):
-            raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
+        check_kind(self.corners, CornerOptions | None, "CalibrateOptions.corners", "a CornerOptions")
+        check_kind(self.solve, SolveOptions, "CalibrateOptions.solve", "a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
 
@@ -172,8 +168,7 @@ class Record:
     @contextmanager
     def noted(self) -> Iterator[None]:
         """Turn this library's warnings into notes, except those that the verdict reports; others stay warnings."""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             yield
         for warning in caught:
             if not isinstance(warning.message, RwhecWarning):

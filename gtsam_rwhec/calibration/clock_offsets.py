@@ -18,12 +18,14 @@ from gtsam_rwhec.calibration.noise_choice import NOT_KNOWN, NoiseFound, refined_
 from gtsam_rwhec.calibration.outliers import say_outliers, without_outliers
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import CountError, OptionError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.fitting.fit_options import RefineOptions
 from gtsam_rwhec.fitting.pair_data import PairData, local_paths
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import WINDOW_S, LocalPaths, Trajectory
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
@@ -191,21 +193,21 @@ def _rows_of(data: list[PairData], solution: Solution, fixed_scales: frozenset[s
     targets = list(dict.fromkeys(item.pair.target for item in data))
     owners = [] if solution.scale_mode == "known" else [name for name in targets if name not in fixed_scales]
     first, step = 7 + 6 * len(targets), int(solution.scale_mode == "per_target")
-    scale_at = {name: first + i * step for i, name in enumerate(owners)}
+    column_of = {name: first + i * step for i, name in enumerate(owners)}
     r, J = [], []
     for item in data:
         target, sensor = item.pair
         scale = 1.0
-        if target in scale_at:
-            scale = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
+        if target in column_of:
+            scale = scale_at(solution.scale, target)
         at = item.residuals.linearize(solution.X[target].matrix(), solution.Y[sensor].matrix(), scale)
-        own = np.zeros((item.count, 6, max(scale_at.values(), default=first - 1) + 1))
+        own = np.zeros((item.count, 6, max(column_of.values(), default=first - 1) + 1))
         own[:, :, 0] = at.offset
         own[:, :, 1:7] = at.sensor
         k = 7 + 6 * targets.index(target)
         own[:, :, k : k + 6] = at.target
-        if target in scale_at:
-            own[:, :, scale_at[target]] = at.scale
+        if target in column_of:
+            own[:, :, column_of[target]] = at.scale
         r.append(at.residual)
         J.append(own)
     return np.concatenate(r), np.concatenate(J)
@@ -350,11 +352,10 @@ def _without_velocity(run: Run, found: Answer) -> str:
             where += [f"{pair} at {stamp} ns" for stamp in stamps_ns[~path.known].tolist()]
     if not where:
         return ""
-    more = f" and {len(where) - NAMED} more" if len(where) > NAMED else ""
     total = sum(len(path.known) for path in paths.values())
     return (
         f"; beside gaps in the carriers' path no velocity is known, so {len(where)} of {total} measurements count as "
-        f"they are paired, without an offset ({', '.join(where[:NAMED])}{more})"
+        f"they are paired, without an offset ({some(where, NAMED)})"
     )
 
 

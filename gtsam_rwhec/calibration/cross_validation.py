@@ -22,7 +22,7 @@ from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
+from gtsam_rwhec.geometry.real_numbers import check_kind, is_one_of, is_whole
 from gtsam_rwhec.geometry.trajectory import LocalPaths
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -192,8 +192,7 @@ def cross_validate(
     notes: dict[str, None] = {}
 
     def calibrated(some: Problem, name: str) -> Solution | Refined:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             solution = solve(some, options=solve_options)
             answer = solution if options is None else refine(some, solution, options)
         for warning in caught:
@@ -257,8 +256,7 @@ def cross_validate(
 
 
 def _check(problem: Problem, folds: int, by: str) -> None:
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     if not is_one_of(by, get_args(Split)):
         raise OptionError(f"by={brief(by)} is not one of {', '.join(map(repr, get_args(Split)))}")
     if not is_whole(folds, 2):

@@ -70,8 +70,7 @@ def _numbers(R: Array, convention: str) -> Array:
     rotations = Rotation.from_matrix(R)
     if convention == "rotvec":
         return np.asarray(rotations.as_rotvec())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of gimbal lock: two of the numbers are one then
+    with warnings.catch_warnings(action="ignore"):  # of gimbal lock: two of the numbers are one then
         return np.asarray(rotations.as_euler(convention))  # type: ignore[call-overload]  # it is one of its words
 
 

@@ -58,8 +58,6 @@ from gtsam_rwhec.solver.solution import solve
 
 #: The name of this choice: whether the answer is from corners or from poses.
 MEASUREMENTS = "refinement"
-#: Prior standard deviation of an estimated size, relative.
-SIZE_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,7 +460,6 @@ def by_intrinsics(problem: Problem, cameras: Mapping[str, Camera]) -> Problem:
         every[pair] = with_poses(raw, rows, *both.chosen(both.by_carriers(raw.A[rows])))
     again = problem.with_measurements(every)
     again.cameras = {**problem.cameras, **cameras}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # of weights: no outlier is left out yet
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # of weights: no outlier is left out yet
         solution = solve(again)
     return nearer_poses(again, solution.X, solution.Y)[0]

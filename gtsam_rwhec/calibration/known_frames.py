@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, SensorView
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.files.terminal_text import rounded, some
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
@@ -58,7 +58,7 @@ def known_all_the_same(refined: Refined, views: Mapping[str, SensorView], ground
     if not known:
         return []
     are = "is" if len(known) == 1 else "are"
-    return [Finding(ground, f"known all the same {are} {_listed(known)} (standard deviations)")]
+    return [Finding(ground, f"known all the same {are} {some(known, MOST_NAMED)} (standard deviations)")]
 
 
 def _most_m(views: Mapping[str, SensorView]) -> tuple[float, bool]:
@@ -89,7 +89,7 @@ def _known_to_nothing(refined: Refined, most_m: float, carriers: Carriers, *, is
             than = f"{most_m:.2g} m, from which targets were seen" if is_seen else f"{most_m:g} m"
             yield Finding(
                 Ground.KNOWN_TO_NOTHING,
-                f"{_listed(list(bad))} on {carriers.of(side) or f'the carrier of the {side}s'} "
+                f"{some(list(bad), MOST_NAMED)} on {carriers.of(side) or f'the carrier of the {side}s'} "
                 f"{'is' if len(bad) == 1 else 'are'} known to nothing: standard deviations are up to "
                 f"{rounded(1e3 * m)} mm and {rounded(float(np.degrees(rad)))} degrees (a pose has less than {than}, "
                 f"and less than {np.degrees(MOST_RAD):g} degrees)",
@@ -104,11 +104,6 @@ def _known(refined: Refined, most_m: float) -> Iterator[str]:
             rad, m = deviations_of(refined.relative(first, name)[1])
             if rad < KNOWN * MOST_RAD and m < KNOWN * most_m:
                 yield f"{name} in {first} to {rounded(1e3 * m)} mm and {rounded(float(np.degrees(rad)))} degrees"
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(names[:MOST_NAMED]) + more
 
 
 def _heights(

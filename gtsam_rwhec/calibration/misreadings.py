@@ -188,8 +188,7 @@ def misread_as_recorded(run: Run) -> Reading:
     if recording is None or recording.uncleaned is None or run.times > 1 or not run.options.misreadings:
         return Reading()
     problem = recording.uncleaned
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # users get those of the answer
         try:
             found = _of_recording(problem, run)
         except ScaleError as error:

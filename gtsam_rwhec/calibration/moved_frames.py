@@ -17,8 +17,9 @@ from scipy.spatial import cKDTree
 
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Spread, TrialFit, fitted
 from gtsam_rwhec.fitting.noise_rows import stations
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 
@@ -94,7 +95,7 @@ def residuals_at_stations(refined: Refined, measured: Mapping[Pair, Measured]) -
     found = {}
     for pair, one in measured.items():
         A = one.A[one.kept]
-        twists = _residual_twists(refined, pair, A, one.B[one.kept])
+        twists = residual_twists(refined, pair, A, one.B[one.kept])
         if len(twists[0]):
             station = stations_of(A)
             first, visits = np.unique(station, return_index=True)[1], np.bincount(station)
@@ -122,12 +123,12 @@ def two_poses(at: Mapping[Pair, AtStations]) -> TwoPoses | None:
     return max(found, key=lambda one: one[0], default=(0.0, None))[1]
 
 
-def _residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
+def residual_twists(refined: RefinedPoses, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
     """Residuals (N, 6) of some measurements, in the target's axes and in the sensor's; lengths are true ones."""
     X, Y = refined.X.get(pair.target), refined.Y.get(pair.sensor)
     if X is None or Y is None or not len(A):
         return np.zeros((0, 6)), np.zeros((0, 6))
-    scale = refined.scale[pair.target] if isinstance(refined.scale, Mapping) else refined.scale
+    scale = scale_at(refined.scale, pair.target)
     measured = B.copy()
     measured[:, :3, 3] /= scale
     predicted = se3.inverse(Y.matrix()) @ A @ X.matrix()
@@ -308,7 +309,7 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
     """
     if all(one.kept.all() for one in measured.values()):
         return None
-    twists = {pair: _residual_twists(refined, pair, one.A, one.B) for pair, one in measured.items()}
+    twists = {pair: residual_twists(refined, pair, one.A, one.B) for pair, one in measured.items()}
     frames = dict.fromkeys(name for pair in measured for name in pair.frames)
     steps = []
     for name in frames:
@@ -343,7 +344,7 @@ def mixed_sensors(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPos
     None where none is. The outliers do not agree in their targets' axes as well: those would be one view, seen twice.
     """
     for sensor in dict.fromkeys(pair.sensor for pair in measured):
-        rows = [(of, _residual_twists(refined, of, one.A, one.B), one.kept) for of, one in measured.items()]
+        rows = [(of, residual_twists(refined, of, one.A, one.B), one.kept) for of, one in measured.items()]
         rows = [(pair, twists, kept) for pair, twists, kept in rows if pair.sensor == sensor and len(twists[0])]
         if not rows:
             continue

@@ -22,6 +22,7 @@ from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.robust_solution import NoiseScale, robust_solution
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import LONGEST_GAP_S
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -57,9 +58,7 @@ class LeftOut:
         return twice > self.measurements or (share < HALF and twice == self.measurements > 0)
 
 
-def contradicted_frames(
-    counts: Mapping[Pair, tuple[int, int]], nearly_half: float = NEARLY_HALF
-) -> tuple[LeftOut, ...]:
+def contradicted_frames(counts: Mapping[Pair, tuple[int, int]]) -> tuple[LeftOut, ...]:
     """The sensors and targets with mostly outliers: more than half, half of few measurements, or nearly half of many.
 
     ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
@@ -71,13 +70,13 @@ def contradicted_frames(
     rest = counts
     everything = _by_frame(counts)
     names: list[str] = []
-    for share in (HALF, nearly_half):
+    for share in (HALF, NEARLY_HALF):
         while beyond := [frame for frame in _by_frame(rest).values() if frame.is_beyond(share)]:
             names.append(max(beyond, key=lambda frame: frame.left_out).frame)
             rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
     # A frame that has measurements only with contradicted frames depends on these.
     known = {*names, *_by_frame(rest)}
-    names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(nearly_half)]
+    names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(NEARLY_HALF)]
     return tuple(everything[name] for name in names)
 
 
@@ -236,7 +235,7 @@ def more_consistent(problem: Problem, inliers: Inliers) -> Inliers | None:
     spread = np.array([of_other.residual.rotation_rad, of_other.residual.translation_m]) / MEDIAN_OF_CHI
     found: Inliers = {}
     for pair in inliers:
-        scale = of_other.scale[pair.target] if isinstance(of_other.scale, dict) else of_other.scale
+        scale = scale_at(of_other.scale, pair.target)
         errors = residuals(of_other.frames, scale, pair, raw[pair].A, raw[pair].B)
         found[pair] = np.asarray((errors < AGREES_SIGMAS * spread[:, None]).all(axis=0))
     return found if sum(int(mask.sum()) for mask in found.values()) >= left_out // 2 else None

@@ -107,8 +107,7 @@ def _sizes_as_seen(run: Run, inliers: Inliers, near: Refined) -> tuple[TargetSiz
     free = with_free_sizes(kept, kept.targets)
     how = run.options.refinement(_asked(kept, run), noise_groups="all", carrier_model="propagated")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)  # the answer takes the stated sizes
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # the answer takes the stated sizes
             return tuple(sizes_in(refine(free, solve(free, options=run.options.solve), how, near=near)))
     except RwhecError:  # harmless: the stated sizes are compared with the answer then
         return ()
@@ -128,8 +127,7 @@ def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled 
     noise: NoiseScale = "given" if run.options.noise == "given" else "estimate"
     how = run.options.refinement(asked, noise_groups="all", carrier_model="propagated")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)  # users get those of the answer
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # users get those of the answer
             for _ in range(ROUNDS):
                 solution, inliers, agree = _first(run, problem), Inliers(), None
                 if run.options.robust != "none":

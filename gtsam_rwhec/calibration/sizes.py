@@ -16,18 +16,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import expit
 
-from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, NoiseError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions, Walk
 from gtsam_rwhec.fitting.noise_in_data import NoiseInData
 from gtsam_rwhec.fitting.noise_refinement import refine_under_noise
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import Refined, sigma_of
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.geometry.real_numbers import check_kind
+from gtsam_rwhec.problem.knowledge import ScaleMode, scale_at
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected, summed_again
 from gtsam_rwhec.solver.solution import Solution, solve
@@ -212,8 +213,7 @@ def sizes(
         known, the measurements were not kept, or no positive sizes fit: then the motion says nothing about them.
     """
     check_progress(progress)
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     if problem.scale != "known" or not problem.has_measurements or not problem.pairs:
         return ()
     (progress or silent)("looking at the targets' sizes")
@@ -226,8 +226,7 @@ def sizes(
         T = free.fixed.pop(name)
         free.priors.pop(name, None)
         free.add_prior(name, T, FIXED_M, 0.5 / FIXED_RAD**2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # they are about sizes that nobody uses
         try:
             start = solve(free)
             scales = start.scale.values() if isinstance(start.scale, dict) else [start.scale]
@@ -295,14 +294,12 @@ def _under_all_noise(
 def sizes_in(refined: Refined) -> list[TargetSize]:
     """The sizes of an answer with a scale of each target, or one of all."""
     if not isinstance(refined.scale, Mapping):
-        variance = float(refined.covariance("scale")[0, 0])
-        sigma = math.sqrt(variance) if math.isfinite(variance) else None
+        sigma = sigma_of(refined, "scale")
         moves = _moves(refined, Unknown.of("scale"))
         return [TargetSize(name, refined.scale, sigma, moves=moves) for name in refined.X]
-    variances = {name: float(refined.covariance(Unknown(UnknownKind.SCALE, name))[0, 0]) for name in refined.scale}
-    sigmas = {name: math.sqrt(of) if math.isfinite(of) else None for name, of in variances.items()}
+    unknowns = {name: Unknown(UnknownKind.SCALE, name) for name in refined.scale}
     return [
-        TargetSize(name, scale, sigmas[name], moves=_moves(refined, Unknown(UnknownKind.SCALE, name)))
+        TargetSize(name, scale, sigma_of(refined, unknowns[name]), moves=_moves(refined, unknowns[name]))
         for name, scale in refined.scale.items()
     ]
 
@@ -372,8 +369,7 @@ def doubted_lengths(problem: Problem, solution: Solution) -> str:
     need the raw measurements.
     """
     distances = [
-        np.linalg.norm(batch.B[:, :3, 3], axis=1)
-        / (solution.scale[pair.target] if isinstance(solution.scale, Mapping) else solution.scale)
+        np.linalg.norm(batch.B[:, :3, 3], axis=1) / scale_at(solution.scale, pair.target)
         for pair in problem.pairs
         if not pair.is_motion
         for batch in problem.batches(*pair)

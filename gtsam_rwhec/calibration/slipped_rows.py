@@ -22,7 +22,9 @@ from rwhec_factors.se3 import expmap, inverse, logmap
 from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.row_shifts import AS_GIVEN, SHIFTS, cheapest, costs_of, errors_at_shifts, likely_shifts
 from gtsam_rwhec.calibration.trial_fits import SLOW_SHARE, Sample, Sampled, Spread, TrialFit, angles, fitted, signal_of
+from gtsam_rwhec.files.terminal_text import counted, some
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution
@@ -73,9 +75,9 @@ class Slip:
         at = "" if self.stamp_ns is None else f", {self.stamp_ns} ns"
         begin = f"row {self.from_row}" if first == last else f"row {self.from_row} ({first} to {last} fit as well)"
         many = abs(self.shift)
-        whose = f"{many} row{'s' if many > 1 else ''} {'later' if self.shift > 0 else 'earlier'}"
+        whose = f"{counted(many, 'row')} {'later' if self.shift > 0 else 'earlier'}"
         belongs = f"belongs to the A that is {whose}" if many else "belongs to its own A again"
-        return f"from {begin} of {self.pair}{at} on, B {belongs} ({self.number} row{'s' if self.number > 1 else ''})"
+        return f"from {begin} of {self.pair}{at} on, B {belongs} ({counted(self.number, 'row')})"
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,7 @@ class Slips:
     @property
     def words(self) -> str:
         """Where the rows of each pair slip, as a sentence's part; at most `NAMED` places."""
-        more = len(self.slips) - NAMED
-        return "; ".join(map(str, self.slips[:NAMED])) + (f"; and {more} more" if more > 0 else "")
+        return some(list(map(str, self.slips)), NAMED, between="; ")
 
 
 def with_rows_shifted(problem: Problem, shifts: Mapping[Pair, np.ndarray]) -> Problem:
@@ -227,7 +228,7 @@ class _Trial:
         frames = {name: T.matrix() for name, T in (solution.X | solution.Y).items()}
         errors, steps = {}, []
         for pair, one in self.rows.items():
-            scale = solution.scale[pair.target] if isinstance(solution.scale, dict) else solution.scale
+            scale = scale_at(solution.scale, pair.target)
             errors[pair] = one.errors(frames[pair.sensor], frames[pair.target], scale)
             twists = one.residuals(frames[pair.sensor], frames[pair.target], scale, 0)
             steps.append(np.diff(twists, axis=0) / math.sqrt(2.0))
@@ -250,11 +251,7 @@ class _Trial:
     def _errors(self, fit: TrialFit) -> dict[Pair, Array]:
         scale = fit.scale
         return {
-            pair: one.errors(
-                fit.frames[pair.sensor],
-                fit.frames[pair.target],
-                scale[pair.target] if isinstance(scale, dict) else scale,
-            )
+            pair: one.errors(fit.frames[pair.sensor], fit.frames[pair.target], scale_at(scale, pair.target))
             for pair, one in self.rows.items()
         }
 
@@ -358,7 +355,7 @@ class _Trial:
         products = squares = 0.0
         for pair, one in self.rows.items():
             X, Y = best.fit.frames[pair.target], best.fit.frames[pair.sensor]
-            scale = best.fit.scale[pair.target] if isinstance(best.fit.scale, dict) else best.fit.scale
+            scale = scale_at(best.fit.scale, pair.target)
             twists = one.residuals(Y, X, scale, SHIFTS[best.shifts[pair]])
             size = np.maximum(np.median(np.abs(twists), axis=0), 1e-9)
             z = np.clip(twists / size, -4.0, 4.0)

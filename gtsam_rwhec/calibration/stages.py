@@ -43,6 +43,7 @@ from gtsam_rwhec.errors import OptionError, RwhecError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import aligned_at
@@ -164,11 +165,9 @@ def calibrate(
         The input cannot be used: there are fewer equations than unknowns, options contradict the problem, a sensor's
         name is unknown.
     """
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     options = CalibrateOptions() if options is None else options
-    if not isinstance(options, CalibrateOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.CalibrateOptions")
+    check_kind(options, CalibrateOptions, "options", "a gtsam_rwhec.CalibrateOptions")
     check_progress(progress)
     problem.require_pairs()
     if options.noise == "given" and problem.is_relative:

@@ -22,7 +22,7 @@ from gtsam_rwhec.calibration.other_readings import OtherReading
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode, scale_at
 from gtsam_rwhec.problem.measurements import Measurements, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.answers import answer_of, scales_of
@@ -101,8 +101,7 @@ def fitted(
     if not sample:
         return None  # a shift of rows leaves nothing of pairs with one row each
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # the words of trials are for nobody
+        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):  # the words of trials are for nobody
             return _fitted(problem, sample, mode, rounds)
     except (RwhecError, np.linalg.LinAlgError):
         return None  # too few measurements for this scale, or no finite answer: this reading explains nothing
@@ -193,7 +192,7 @@ def residual_of(problem: Problem, solution: Solution) -> Spread | None:
     frames = {name: T.matrix() for name, T in (solution.X | solution.Y).items()}
     found = []
     for pair in problem.pairs:
-        scale = solution.scale[pair.target] if isinstance(solution.scale, dict) else solution.scale
+        scale = scale_at(solution.scale, pair.target)
         found += [residuals(frames, scale, pair, batch.A, batch.B) for batch in problem.batches(*pair)]
     return Spread.of(*np.concatenate(found, axis=1)) if found else None
 

@@ -18,6 +18,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.intrinsics_evidence import change_test, different
 from gtsam_rwhec.cameras.targets import Charuco, Target
 from gtsam_rwhec.cameras.unknown_intrinsics import board_rows, poses_eliminated
+from gtsam_rwhec.files.terminal_text import counted, some
 from gtsam_rwhec.geometry.poses import Array
 
 #: A hypothesis needs this many views that show moved corners beside other corners.
@@ -213,8 +214,7 @@ def never_seen(board: Target, camera: Camera, views: Sequence[BoardView]) -> str
     names = [str(i) for i, is_missing in zip(board.ids, missing, strict=True) if is_missing]
     if not names:
         return ""
-    listed = ", ".join(names[:6]) + (" and others" if len(names) > 6 else "")
-    return f"tag{'s' * (len(names) > 1)} {listed}"
+    return f"tag{'s' * (len(names) > 1)} {some(names, 6)}"
 
 
 def _shown(camera: Camera, corners: Array, T: Array) -> np.ndarray:
@@ -243,7 +243,7 @@ def _lines(board: Charuco, seen: np.ndarray, expected: np.ndarray) -> str:
         if 0 < count < len(unseen):
             left[axis] -= count
             what = "row" if axis == 1 else "column"
-            parts.append(f"{words} {count} {what}{'s' * (count > 1)} of corners")
+            parts.append(f"{words} {counted(count, what)} of corners")
     if not parts:
         return ""
     return f"{' and '.join(parts)} (if they are not there, write squares: [{left[2] + 1}, {left[1] + 1}])"

@@ -98,8 +98,7 @@ def _starts(points: Array, x: Array) -> Array:
     found, turn, t = cv2.solvePnP(points[:, None], x[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
     if not found or not np.isfinite(turn).all() or not t[2, 0] > 0.0:
         return T
-    best = np.eye(4)
-    best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], t[:, 0]
+    best = se3.pose(cv2.Rodrigues(turn)[0], t[:, 0])
     # The plane's pose that is further from SQPnP's may lead to another minimum.
     likeness = np.nan_to_num(np.einsum("cij,ij->c", T[:, :3, :3], best[:3, :3]), nan=np.inf)
     return np.stack([best, T[int(np.argmin(likeness))]])

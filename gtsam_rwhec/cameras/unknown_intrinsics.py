@@ -19,6 +19,7 @@ from gtsam_rwhec.cameras.distortion import coefficient_jacobian
 from gtsam_rwhec.cameras.target_poses import stacked
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.optional_packages import extra_named
+from gtsam_rwhec.files.terminal_text import counted
 from gtsam_rwhec.geometry.poses import Array
 
 #: Which coefficients of distortion are estimated: none; k1 and k2; or k1, k2, p1 and p2.
@@ -208,7 +209,7 @@ def estimated_intrinsics(
     views = [(p, u) for p, u in zip(corners_m, corners_px, strict=True) if len(p) >= CORNERS]
     if len(views) < VIEWS:
         raise CameraError(
-            f"cannot be estimated from {len(views)} view{'' if len(views) == 1 else 's'} of a flat target with "
+            f"cannot be estimated from {counted(len(views), 'view')} of a flat target with "
             f"{CORNERS} corners and more; at least {VIEWS} are needed, at different tilts"
         )
     views = _well_read(different_views(views), size)

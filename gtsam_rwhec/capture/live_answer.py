@@ -111,25 +111,24 @@ def answer_of(takes: Sequence[Path], rig: Rig, wanted: Accuracy | None) -> Answe
     rule = _RULES.setdefault((takes[0].parent, wanted), None if wanted is None else StoppingRule(wanted))
     cameras: Mapping[str, Camera] = {}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)  # the verdict and the report say them
-            with open_log(takes) as log:
-                found = detected(log, rig, workers=1, keep=lambda cameras: known)
-                cells, pairs, cameras = _cells(found), _pairs(found), found.stages.cameras
-                solved = solve_log(cleaned(found, rig), None)
-                proposal, outlook = next_pose(solved.calibration, rig, cameras, wanted)
-                return Answer(
-                    len(takes),
-                    time.monotonic() - begun_s,
-                    solved.judgement.verdict.value,
-                    solved.judgement.reason,
-                    points=_points(solved, wanted),
-                    pairs=_pairs(found, solved),
-                    free=tuple(f"{one}. {CURES[one.reason]}" for one in _free(solved)),
-                    cells=cells,
-                    proposal=proposal,
-                    decision=stop_decision(rule, solved.calibration, len(takes), outlook),
-                )
+        # the verdict and the report say the warnings
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning), open_log(takes) as log:
+            found = detected(log, rig, workers=1, keep=lambda cameras: known)
+            cells, pairs, cameras = _cells(found), _pairs(found), found.stages.cameras
+            solved = solve_log(cleaned(found, rig), None)
+            proposal, outlook = next_pose(solved.calibration, rig, cameras, wanted)
+            return Answer(
+                len(takes),
+                time.monotonic() - begun_s,
+                solved.judgement.verdict.value,
+                solved.judgement.reason,
+                points=_points(solved, wanted),
+                pairs=_pairs(found, solved),
+                free=tuple(f"{one}. {CURES[one.reason]}" for one in _free(solved)),
+                cells=cells,
+                proposal=proposal,
+                decision=stop_decision(rule, solved.calibration, len(takes), outlook),
+            )
     except RwhecError as error:
         proposal, outlook = next_pose(None, rig, cameras, wanted)
         return Answer(
@@ -140,8 +139,7 @@ def answer_of(takes: Sequence[Path], rig: Rig, wanted: Accuracy | None) -> Answe
 
 def calibrated(recorded: Path, rig: Rig, out: Path) -> Judgement:
     """Calibrate from the recorded log into a folder, as ``gtsam-rwhec calibrate`` does; in this process."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # the report has them
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # the report has them
         return calibrate_log(recorded, rig, out).judgement
 
 

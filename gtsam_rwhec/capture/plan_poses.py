@@ -22,6 +22,7 @@ from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import check_kind, finite_or_none
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.result_file import Result
@@ -188,10 +189,8 @@ def plan(
         The problem keeps moments only.
     """
     options = options or PlanOptions()
-    if not isinstance(options, PlanOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a PlanOptions")
-    if source is not None and not isinstance(source, (Problem, Calibration, Result)):
-        raise OptionError(f"source is a {type(source).__name__}; give a Problem, a Calibration, or a Result")
+    check_kind(options, PlanOptions, "options", "a PlanOptions")
+    check_kind(source, Problem | Calibration | Result | None, "source", "a Problem, a Calibration, or a Result")
     cell = cell_of(source, options, rig, cameras or {}, boards or {})
     if not cell.pairs:
         raise OptionError(
@@ -292,7 +291,7 @@ def _outlook(
         freedom += (ranking.degrees_of_freedom - freedom) * measurements / count if np.isfinite(freedom) else 0.0
         return task.radius_mm(cell, np.linalg.inv(cell.known + rough + measurements / count * added), freedom)[0]
 
-    wanted = 1e3 * options.wanted.radius_m if np.isfinite(options.wanted.radius_m) else None
+    wanted = finite_or_none(1e3 * options.wanted.radius_m)
     needed, free = None, free_frames(cell, np.linalg.inv(ranking.information))
     least = after(ENDLESS) if number else now
     floor = max(1e3 * ball_radius(np.maximum(of, 0.0), task.level) for of in task.variances(cell.floor))

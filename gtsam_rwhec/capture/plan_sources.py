@@ -239,8 +239,7 @@ def _of_problem(problem: Problem, kit: Kit, options: PlanOptions) -> Cell:
             if name not in problem.fixed:
                 rad, m = deviations.get(name, (UNKNOWN_RAD, UNKNOWN_M))
                 stated.add_prior(name, Y[name] if name in Y else X[name], m, 0.5 / rad**2)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             solution = solve(stated)
         X |= {name: pose.matrix() for name, pose in solution.X.items()}
         Y |= {name: pose.matrix() for name, pose in solution.Y.items()}

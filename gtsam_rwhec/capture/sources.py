@@ -16,6 +16,7 @@ from mcap.records import Channel, Schema
 
 from gtsam_rwhec.errors import BudgetError, LogError
 from gtsam_rwhec.files.budgets import MIB, Spending
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.foxglove_messages import Decoder, decoder_for
 from gtsam_rwhec.logs.mcap_file import Block, GrowingFile, McapFile
@@ -129,8 +130,8 @@ class Source(ABC):
         elif poses.topic is None and not has_poses:
             lacking.append(f"{self.rig.source.place(('carriers', 'poses'))}: {self.name} has no topic of transforms")
         named = [f"{topic} ({schema})" for topic, schema in sorted(self.topics.items())]
-        there = ", ".join(named[:MOST_NAMED]) + (f" and {len(named) - MOST_NAMED} others" * (len(named) > MOST_NAMED))
-        return [f"{words}. Topics there: {there or 'none'}" for words in lacking]
+        there = some(named, MOST_NAMED) or "none"
+        return [f"{words}. Topics there: {there}" for words in lacking]
 
 
 def is_of_transforms(topic: str, schema: str) -> bool:

@@ -57,8 +57,7 @@ class FolderSource(Source):
                     raise LogError(f"{self.rig.source.place(('sensors', name))}: a folder needs images and poses")
                 files = [file for file in images_in(self.folder / sensor.images) if _is_settled(file)]
                 poses = read_poses(self.folder / sensor.poses, stated)
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", LogWarning)  # what has no pose yet waits
+                with warnings.catch_warnings(action="ignore", category=LogWarning):  # what has no pose yet waits
                     matched = match(files, poses, f"{self.folder}, {name}") if files else None
             except FileFormatError as error:
                 self.state = f"waiting: {error}"

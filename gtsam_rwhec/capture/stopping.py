@@ -46,7 +46,7 @@ from gtsam_rwhec.capture.stream_update import StreamUpdate
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import is_whole
+from gtsam_rwhec.geometry.real_numbers import check_kind, is_whole
 
 #: With fewer degrees of freedom the rule does not stop: F quantiles are large there, and models of noise undecided.
 FEWEST_FREEDOM = 12
@@ -147,8 +147,7 @@ class StoppingRule:
             The wanted accuracy names a sensor that has no answer.
         """
         self._takes = takes if takes is not None else self._takes + 1
-        if not isinstance(answer, Calibration | StreamUpdate):
-            raise OptionError(f"answer is a {type(answer).__name__}; give a Calibration or a StreamUpdate")
+        check_kind(answer, Calibration | StreamUpdate, "answer", "a Calibration or a StreamUpdate")
         refined = answer.refined
         if isinstance(answer, Calibration):
             refused = (Verdict.DO_NOT_USE,) if self.accepts_care else (Verdict.DO_NOT_USE, Verdict.CARE)

@@ -29,7 +29,7 @@ from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind, rows_of, slots_of
 from gtsam_rwhec.fitting.weighted_fit import WeightedFit
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
-from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
+from gtsam_rwhec.geometry.real_numbers import check_kind, is_real, is_whole
 from gtsam_rwhec.problem.additions import seen_pair
 from gtsam_rwhec.problem.measurements import GivenMeasurements, Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -104,8 +104,7 @@ class Stream:
         knowledge = Problem() if knowledge is None else knowledge
         if not isinstance(knowledge, Problem) or knowledge.pairs:
             raise OptionError("knowledge is a gtsam_rwhec.Problem without measurements; give these to Stream.add")
-        if options is not None and not isinstance(options, StreamOptions):
-            raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.StreamOptions")
+        check_kind(options, StreamOptions | None, "options", "a gtsam_rwhec.StreamOptions")
         self.options = options or StreamOptions()
         self._store = Store(knowledge, None if self.options.keep == "measurements" else self.options.window)
         self._weights: VarianceFactors = AS_STATED

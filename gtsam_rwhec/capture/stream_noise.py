@@ -28,8 +28,7 @@ def under_shared_noise(problem: Problem) -> Refined | None:
     data = [PairData.of(problem, pair, HOW, None) for pair in problem.pairs]
     if Instants.of(data).count == problem.number_of_measurements:
         return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # an update says what it lacks
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # an update says what it lacks
         try:
             return under_noise(problem, solve(problem), HOW, KINDS).refined()[0]
         except (CountError, UnderdeterminedError, ScaleError):

@@ -12,7 +12,7 @@ from gtsam_rwhec.cli.failures import ExitStatus
 from gtsam_rwhec.cli.shared_options import McapOption, refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.terminal_text import say, shown_path
+from gtsam_rwhec.files.terminal_text import say, shown_path, some
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 
@@ -113,6 +113,5 @@ def messages_not_read(log: Path) -> str:
                 counts[topic.schema] = counts.get(topic.schema, 0) + topic.count
     if not counts:
         return ""
-    named = ", ".join(f"{schema} ({counts[schema]})" for schema in sorted(counts)[:MOST_NAMED])
-    more = f" and {len(counts) - MOST_NAMED} more types" if len(counts) > MOST_NAMED else ""
-    return f". The next step does not read {named}{more}; they are kept in the log"
+    named = some([f"{schema} ({counts[schema]})" for schema in sorted(counts)], MOST_NAMED)
+    return f". The next step does not read {named}; they are kept in the log"

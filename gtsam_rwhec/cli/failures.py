@@ -38,8 +38,7 @@ def failures_in_words() -> Iterator[None]:
 
     console = SafeConsole(stderr=True, soft_wrap=True)
     told: set[str] = set()
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", RwhecWarning)
+    with warnings.catch_warnings(action="always", category=RwhecWarning):
         in_python = warnings.showwarning
 
         def show(
@@ -80,8 +79,7 @@ def _indented(message: str) -> str:
 @contextmanager
 def said_in_the_report() -> Iterator[None]:
     """Hide the warnings that the report explains better: not certified, and not unique."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
         warnings.simplefilter("ignore", NotCertifiedWarning)
         yield
 

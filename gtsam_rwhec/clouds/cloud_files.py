@@ -119,8 +119,7 @@ def _text_table(text: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndar
     if count * 2 > len(text):  # a number and a blank at least
         raise CloudError(f"{path} is cut: {count} points, and {len(text)} bytes of text")
     widths = [int(prod(dtype[name].shape)) for name in dtype.names or ()]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of no lines at all, which the next line says
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # of no lines at all, which the next line says
         try:
             numbers = np.loadtxt(io.BytesIO(text), np.float64, max_rows=count, ndmin=2)
         except ValueError as error:

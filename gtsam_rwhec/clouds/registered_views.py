@@ -230,9 +230,8 @@ def _by_motions(pairs: Registrations, of_A: Array) -> tuple[Array, bool]:
     problem = Problem()
     covariances = pairs.covariances + np.diag(of_A + TINY)
     problem.add_motion(SENSOR, pairs.A, pairs.B, covariances=covariances, directional=True)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         # The caller's own problem is judged by `calibrate`, with A's noise.
-        warnings.simplefilter("ignore", RwhecWarning)
         solution = solve(problem)
     return np.asarray(solution.Y[SENSOR].matrix()), solution.certificate.status is Status.CERTIFIED
 

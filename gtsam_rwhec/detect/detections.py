@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.cameras.board_turns import turns_about_z
 from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid
@@ -145,8 +146,7 @@ def turned_detection(detection: Detection, board: Checkerboard | CircleGrid, tur
     apart = np.linalg.norm((corners[detection.indices] @ R)[:, None] - corners, axis=2)
     indices = np.argmin(apart, axis=1)
     order = np.argsort(indices)
-    T = np.eye(4)
-    T[:3, :3] = R
+    T = pose(R, np.zeros(3))
     back = np.kron(np.eye(2), R.T)
     return replace(
         detection,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import reprlib
 import sys
+from collections.abc import Sequence
 
 #: A message has at most this many characters. Longer messages are cut in the middle.
 LONGEST = 10_000
@@ -84,6 +85,23 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     """A sorting key that compares numbers inside names as numbers."""
     parts = [part for part in re.split(r"(\d+)", name) if part]
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts], name
+
+
+def some(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first names, and how many more there are: "a, b and 3 more", or with semicolons "a; b; and 3 more"."""
+    left = len(names) - most
+    last = f"{' ' if between == ', ' else between}and {left} more" if left > 0 else ""
+    return between.join(names[:most]) + last
+
+
+def listed(words: Sequence[str]) -> str:
+    """One word or more as people list them: "a", "a and b", "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+
+
+def counted(number: int, word: str) -> str:
+    """A number of things: "1 row", "3 rows"."""
+    return f"{number} {word}{'s' * (number != 1)}"
 
 
 def rounded(value: float, digits: int = 2) -> str:

@@ -11,7 +11,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, OptionError, OutlierError, UnderdeterminedError
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, counted
 from gtsam_rwhec.fitting.corner_model import Model, Point
 from gtsam_rwhec.fitting.corner_noise import Noise, Reduced, errors_px
 from gtsam_rwhec.fitting.corner_residuals import Stack
@@ -193,7 +193,7 @@ def _what_there_is(model: Model) -> str:
     poses = len(model.A)
     at = "one pose" if poses == 1 else f"{poses} different poses"
     few = few_corners(model)
-    return f"{images} image{'s' * (images != 1)} at {at} of the carriers{few and f' ({few})'}"
+    return f"{counted(images, 'image')} at {at} of the carriers{few and f' ({few})'}"
 
 
 def few_corners(model: Model) -> str:

@@ -402,6 +402,5 @@ def calibrate_corners(
 
 def _refined(problem: Problem, options: RefineOptions, tell: Progress) -> Refined:
     """Poses of the images, refined: a start. What they warn of, the answer's residuals show."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         return refine(problem, solve(problem, progress=tell), options, progress=tell)

@@ -12,7 +12,7 @@ import numpy as np
 from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, check_kind, is_one_of, is_real, is_whole
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import ByPair
 
@@ -110,13 +110,9 @@ class PoseOptions:
     def __post_init__(self) -> None:
         check_choices(self, {"noise": NoiseSource, "noise_groups": NoiseGroups})
         self.check_share("inlier_confidence", 0.5)
-        for name, kind, how in (
-            ("carrier_noise", CarrierNoise, "CarrierNoise(rotation_rad=..., translation_m=...)"),
-            ("carrier_path", Trajectory, "a Trajectory"),
-        ):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise OptionError(f"{type(self).__name__}.{name} is a {type(value).__name__}; give {how}")
+        own, noise = type(self).__name__, "CarrierNoise(rotation_rad=..., translation_m=...)"
+        check_kind(self.carrier_noise, CarrierNoise | None, f"{own}.carrier_noise", noise)
+        check_kind(self.carrier_path, Trajectory | None, f"{own}.carrier_path", "a Trajectory")
 
     def check_share(self, name: str, least: float) -> None:
         """OptionError for an option that is no number between a least one and 1."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -19,7 +20,7 @@ from gtsam_rwhec.fitting.reprojection_record import Intrinsics, Reprojection
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
 from gtsam_rwhec.geometry.poses import Array, PoseLike
-from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
+from gtsam_rwhec.geometry.real_numbers import finite_or_none, is_real, is_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.free_directions import FreeDirection
@@ -297,3 +298,8 @@ class Refined(RefinedPoses):
             "a Refined has a GTSAM graph with Python factors, which cannot be pickled or copied; rw.write_refined "
             "writes everything except the graph"
         )
+
+
+def sigma_of(refined: RefinedPoses, scalar: str | Unknown) -> float | None:
+    """The standard deviation of a scale or of a time offset, None where it is infinite."""
+    return finite_or_none(math.sqrt(refined.covariance(scalar)[0, 0]))

@@ -103,8 +103,8 @@ def refine(
     check_corners_can_hold(problem)
     if solution is not None:
         problem, _ = nearer_poses(problem, solution.X, solution.Y)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # of poses, whose noise is not that of the answer
+    # of poses, whose noise is not that of the answer
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         base = refine_poses(problem, solution, poses, progress=progress)
     refined = from_corners(problem, base, corners or _like(options), progress or silent)
     return replace(refined, options=options)

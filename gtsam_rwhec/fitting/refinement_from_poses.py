@@ -32,6 +32,7 @@ from gtsam_rwhec.fitting.unknowns import State, Unknown, UnknownKind, Variables
 from gtsam_rwhec.fitting.weighted_fit import as_of_six
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.geometry.trajectory import WINDOW_S
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -179,8 +180,7 @@ def _chosen_under_full_noise(
     threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
     factors: FactorsByPair = {}
     solution, chosen = start, inliers
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # the last fit has its own
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):  # the last fit has its own
         for step in range(1, MAX_CHOICES + 1):
             tell(f"choosing the inliers under the full noise, step {step} of at most {MAX_CHOICES}")
             problem = selected(whole, chosen)
@@ -199,8 +199,8 @@ def _chosen_under_full_noise(
 
 def _any_inliers(problem: Problem, options: RefineOptions, tell: Progress) -> Solution:
     """A start from the measurements that agree under isotropic noise, whatever its size."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)  # the inliers are chosen again under the full noise
+    # the inliers are chosen again under the full noise
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         return robust_solution(
             problem, confidence=options.inlier_confidence, noise_scale="estimate", progress=tell
         ).solution
@@ -347,15 +347,13 @@ def inliers_of(
 
 def check_inputs(problem: Problem, solution: Solution | None, options: RefineOptions) -> None:
     """Refuse a problem that cannot be refined from this solution with these options; ``refine`` lists the errors."""
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     if not isinstance(solution, Solution) and (solution is not None or getattr(options, "robust", "") != "gnc"):
         raise OptionError(
             f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned (or None with "
             "robust='gnc')"
         )
-    if not isinstance(options, RefineOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
+    check_kind(options, RefineOptions, "options", "a gtsam_rwhec.RefineOptions")
     if options.observations == "corners":
         raise OptionError("observations='corners': call gtsam_rwhec.refine, which refines on from here by the corners")
     problem.require_pairs()

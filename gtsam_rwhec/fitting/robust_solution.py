@@ -31,6 +31,7 @@ from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.fitting.admission import DOF, inlier_threshold, judged
 from gtsam_rwhec.fitting.weighted_fit import Measured, Squares, WeightedFit, by_vote, weighted_fit
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -175,9 +176,8 @@ def _doubts(work: TruncatedLeastSquares, inliers: Inliers, noise_scale: NoiseSca
             "kappa may be too small"
         )
     elif named:
-        more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
         said.append(
-            f"less than half of the measurements agree with the answer for {', '.join(named[:NAMED])}{more}. Check "
+            f"less than half of the measurements agree with the answer for {some(named, NAMED)}. Check "
             "whether the frame has moved, or has another frame's name. The poses rest on the measurements that agree"
         )
     turns = work.measured.told[:, 0] > 0.0

@@ -7,13 +7,13 @@ Times are UTC, as ISO 8601 text and as nanoseconds (``_ns``). docs/drift.md desc
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from gtsam_rwhec.files.terminal_text import rounded, shown
+from gtsam_rwhec.geometry.real_numbers import finite_or_none
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def event_fields(event: Event) -> dict[str, Any]:
         fields |= time_fields(name[:-3], value) if name.endswith("_ns") else {name: value}
     if isinstance(event, AlarmEvent):
         for frame in fields["frames"]:
-            frame["deviations"] = frame["deviations"] if math.isfinite(frame["deviations"]) else None
+            frame["deviations"] = finite_or_none(frame["deviations"])
         fields["words"] = str(event)
     return fields
 

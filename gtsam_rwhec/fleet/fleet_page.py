@@ -11,22 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.files.terminal_text import shown, some
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.fleet.drift_events import AlarmEvent, day_text
-from gtsam_rwhec.fleet.fleet_report import (
-    drift_remarks,
-    drift_verdict,
-    some,
-    summary,
-    tone_of,
-    verdict_cell,
-    worst_first,
-)
+from gtsam_rwhec.fleet.fleet_report import drift_remarks, drift_verdict, summary, tone_of, verdict_cell, worst_first
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.stores import write_once
 from gtsam_rwhec.fleet.tasks import below
 from gtsam_rwhec.fleet.watching import DAY_NS, RobotChart, Watched, watch
+from gtsam_rwhec.geometry.real_numbers import finite_or_none
 from gtsam_rwhec.report.figures import INK, VERMILLION, shortened, svg_figure
 from gtsam_rwhec.report.html_page import page_html, write_page
 from gtsam_rwhec.report.report_blocks import Block, Chart, Link, Listing, Number, Page, Paragraph, Section, Table, Words
@@ -121,7 +114,7 @@ def _failures(rows: Sequence[RobotRow]) -> tuple[Block, ...]:
         if row.verdict is None:
             reasons.setdefault(row.failure or row.reason or "no reason is known", []).append(shown(row.unit))
     if reasons:
-        cells = tuple((reason, some(names, most=MOST_NAMES)) for reason, names in reasons.items())
+        cells = tuple((reason, some(names, MOST_NAMES)) for reason, names in reasons.items())
         blocks.append(Table("Without a calibration, by reason", ("reason", "which"), cells))
     logs = tuple((shown(log.url), shown(row.unit), log.reason) for row in rows for log in row.failed_logs)
     if logs:
@@ -150,7 +143,7 @@ def _table(rows: Sequence[RobotRow], *, has_results: bool) -> Table:
         def number(field: str, value: float | None, times: float = 1.0, spec: str = ".3g") -> Number:
             return Number(f"{ROWS_FILE}#/rows/{i}/{field}", value, times, spec)
 
-        turned, moved = (value if math.isfinite(value) else None for value in row.largest_deviations())
+        turned, moved = map(finite_or_none, row.largest_deviations())
         known = row.covariance is not None and len(row.covariance) > 0
         return (
             _name(row, has_results),

@@ -11,7 +11,7 @@ from typing import Literal
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.files.terminal_text import brief, shown
+from gtsam_rwhec.files.terminal_text import brief, counted, shown, some
 from gtsam_rwhec.fleet.drift_events import NoAnswerEvent, day_text
 from gtsam_rwhec.fleet.fleet_rows import ROWS_FILE, RobotRow
 from gtsam_rwhec.fleet.fleet_run import FleetRun
@@ -68,8 +68,8 @@ def summary(rows: Sequence[RobotRow]) -> str:
     parts = [f"{counts[verdict]} {words}" for verdict, words in _WORDS.items() if counts[verdict]]
     parts += [f"{failed} failed"] if failed else []
     lost = sum(len(row.failed_logs) for row in rows)
-    logs = f" {lost} log{'s' * (lost != 1)} could not be used." if lost else ""
-    return f"{len(rows)} calibration{'s' * (len(rows) != 1)}: {', '.join(parts) or 'none'}.{logs}"
+    logs = f" {counted(lost, 'log')} could not be used." if lost else ""
+    return f"{counted(len(rows), 'calibration')}: {', '.join(parts) or 'none'}.{logs}"
 
 
 def worst_first(rows: Sequence[RobotRow]) -> list[RobotRow]:
@@ -149,12 +149,12 @@ def drift_verdict(watched: Watched, since_ns: int = 0) -> str:
         return "Nothing was watched: no robot has a night that says where its frames are."
     changed = list(dict.fromkeys(alarm.robot for alarm in watched.alarms if alarm.when_ns >= since_ns))
     nights = sum(len(robot.tests) for robot in watched.robots.values())
-    of = f"{len(watched.robots)} robot{'s' * (len(watched.robots) != 1)}, {nights} night{'s' * (nights != 1)}"
+    of = f"{counted(len(watched.robots), 'robot')}, {counted(nights, 'night')}"
     since = f" since {day_text(since_ns)}" if since_ns else ""
     if not changed:
         return f"Nothing moved by more than chance{since}: {of}."
     return (
-        f"Moved by more than chance{since}: {len(changed)} of {of}: {some(list(map(shown, changed)))}. "
+        f"Moved by more than chance{since}: {len(changed)} of {of}: {some(list(map(shown, changed)), SAID)}. "
         "Look at the mounts of the frames that are named, and use the calibrations since the date of the change."
     )
 
@@ -183,13 +183,13 @@ def drift_remarks(watched: Watched) -> tuple[str, ...]:
             f"{'' if event.when_ns is None else f' {day_text(event.when_ns)}'} ({shown(event.reason)})"
             for event in missing
         ]
-        found.append(f"{len(missing)} nights say nothing and are left out: {some(named, '; ')}.")
+        found.append(f"{len(missing)} nights say nothing and are left out: {some(named, SAID, between='; ')}.")
     once = [name for name, robot in watched.robots.items() if len(robot.tests) == 1]
     if once:
-        found.append(f"One night only, so nothing is tested: {some(list(map(shown, once)))}.")
+        found.append(f"One night only, so nothing is tested: {some(list(map(shown, once)), SAID)}.")
     several = [name for name, count in Counter(alarm.robot for alarm in watched.alarms).items() if count > 2]
     if several:
-        found.append(f"More than two alarms: {some(list(map(shown, several)))}. Something moves again and again.")
+        found.append(f"More than two alarms: {some(list(map(shown, several)), SAID)}. Something moves again and again.")
     return tuple(found)
 
 
@@ -207,9 +207,3 @@ def day_ns_of(text: str | None) -> int:
     except ValueError as error:
         raise OptionError(f"since: {brief(text)} is no day; give one as 2026-11-23") from error
     return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * 1_000_000_000
-
-
-def some(names: Sequence[str], between: str = ", ", most: int = SAID) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - most
-    return between.join(names[:most]) + (f"{between}and {more} more" if more > 0 else "")

@@ -80,8 +80,7 @@ def _partial(task: LogTask, folder: Path) -> PartialResult:
             words = words.replace(place, shown(task.url))
         return words
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", RwhecWarning)
+    with warnings.catch_warnings(record=True, action="always", category=RwhecWarning) as caught:
         try:
             path = local_copy_of_topics(task.url, wanted_topics(rig), folder)
             places.append(str(path))

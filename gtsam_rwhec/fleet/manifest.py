@@ -300,8 +300,7 @@ class RigSource:
 @lru_cache(maxsize=8)
 def _parsed(text: str, where: str, folder: Path = Path()) -> Rig:
     """The rig; a worker parses a file that names no other files only once."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnfinishedRigWarning)
+    with warnings.catch_warnings(action="ignore", category=UnfinishedRigWarning):
         return parse_rig(text, where, folder)
 
 

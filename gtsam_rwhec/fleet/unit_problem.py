@@ -13,6 +13,7 @@ from scipy.special import chdtrc
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.fitting.fit_options import CarrierNoise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fleet.partial_result import LogFacts, PairMeasurements, PartialResult
@@ -213,10 +214,10 @@ def check_rigs(rigs: Mapping[str, Sequence[tuple[str, Rig]]]) -> None:
 
 def _refuse(found: list[str]) -> None:
     if found:
-        more = f"; and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
         raise RigError(
-            f"rig files or logs that are to be solved together contradict each other: {'; '.join(found[:MOST_NAMED])}"
-            f"{more}. Correct the wrong one, or solve them apart (robots of their own, --each log)"
+            "rig files or logs that are to be solved together contradict each other: "
+            f"{some(found, MOST_NAMED, between='; ')}. Correct the wrong one, or solve them apart (robots of their "
+            "own, --each log)"
         )
 
 

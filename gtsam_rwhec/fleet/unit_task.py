@@ -17,7 +17,7 @@ from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.stages import calibrate
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.fitting.refined import Refined
+from gtsam_rwhec.fitting.refined import Refined, sigma_of
 from gtsam_rwhec.fleet.fleet_rows import RobotRow, RowFrame, read_rows, rows_json
 from gtsam_rwhec.fleet.manifest import RigSource
 from gtsam_rwhec.fleet.partial_result import (
@@ -213,8 +213,7 @@ def _with_offsets(history: LogFields, found: Calibration) -> LogFields:
     for one in history.time_offsets:
         change_s = refined.time_offsets_s.get(one.sensor)
         if change_s is not None:
-            variance = float(refined.covariance(f"time_offset:{one.sensor}")[0, 0])
-            sigma_s = math.sqrt(variance) if math.isfinite(variance) else None
+            sigma_s = sigma_of(refined, f"time_offset:{one.sensor}")
             one = TimeOffsetFields(sensor=one.sensor, offset_s=one.offset_s + change_s, sigma_s=sigma_s)
         offsets.append(one)
     return history.model_copy(update={"time_offsets": tuple(offsets)})

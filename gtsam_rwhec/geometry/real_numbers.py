@@ -1,17 +1,27 @@
-"""Numbers as users give them: real ones, or a message about what they are instead."""
+"""What users give: numbers that are real, and objects of the right kind; or a message about what they are instead."""
 
 from __future__ import annotations
 
+import math
 from numbers import Integral, Real
+from types import UnionType
 from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gtsam_rwhec.errors import OptionError
+
 #: Seeds and numbers of iterations are handed to libraries that have integers of 32 bits.
 LARGEST_WHOLE = 2**31 - 1
 #: NumPy's kinds of numbers, and of objects, which may be numbers.
 _KINDS = "biufO"
+
+
+def check_kind(value: object, kind: type | UnionType, what: str, give: str) -> None:
+    """An OptionError where a value is of another kind: ``what`` it is called, and what to give in its place."""
+    if not isinstance(value, kind):
+        raise OptionError(f"{what} is a {type(value).__name__}; give {give}")
 
 
 def is_real(value: object) -> TypeGuard[float]:
@@ -22,6 +32,11 @@ def is_real(value: object) -> TypeGuard[float]:
 def is_between(value: object, least: float, largest: float) -> TypeGuard[float]:
     """Whether a value is one real number from ``least`` to ``largest``; NaN is not."""
     return is_real(value) and bool(least <= value <= largest)
+
+
+def finite_or_none(value: float) -> float | None:
+    """The same number, or None where it is infinite or NaN: files in JSON have neither."""
+    return value if math.isfinite(value) else None
 
 
 def is_whole(value: object, least: int) -> TypeGuard[int]:

@@ -21,7 +21,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError, LogError, LogWarning
 from gtsam_rwhec.files.budgets import MESSAGE
-from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key, some
 from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.pose_tables import (
@@ -148,7 +148,7 @@ def _folders_near(folder: Path) -> str:
         return ""
     beside = sorted((each for each in above.iterdir() if each.is_dir()), key=lambda each: natural_key(each.name))
     names = [each.name for each in beside[:100] if any(file.suffix.lower() in FORMATS for file in each.glob("*"))]
-    return f"; {above} has images in {_some(names)}" if names else ""
+    return f"; {above} has images in {some(names, MOST_NAMED)}" if names else ""
 
 
 def image_stamps(files: Sequence[Path]) -> list[int] | None:
@@ -242,14 +242,10 @@ def _say_the_rest(
     has_pose = set(matched.images)
     alone = [file.name for i, file in enumerate(files) if i not in has_pose]
     idle = [poses.names[i] for i, name in enumerate(of_poses) if name not in known]
-    said = [f"{len(alone)} of {len(files)} {_word(files)}s have no pose ({_some(alone)})"] if alone else []
-    said += [f"{len(idle)} of {len(poses.T)} poses have no {_word(files)} ({_some(idle)})"] if idle else []
+    said = [f"{len(alone)} of {len(files)} {_word(files)}s have no pose ({some(alone, MOST_NAMED)})"] if alone else []
+    said += [f"{len(idle)} of {len(poses.T)} poses have no {_word(files)} ({some(idle, MOST_NAMED)})"] if idle else []
     if said:
         warnings.warn(f"{where}: {', and '.join(said)}; they are left out", LogWarning, stacklevel=4)
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:MOST_NAMED]) + (", ..." if len(names) > MOST_NAMED else "")
 
 
 #: Files of tables of poses.
@@ -293,7 +289,7 @@ def _of_one_kind(folder: Path, files: list[Path]) -> list[Path]:
     others = [file.name for file in files if file.suffix.lower() != ending]
     if others:
         count = len(files) - len(others)
-        words = f"{folder}: poses are read from the {count} files {ending}, and not from {_some(others)}"
+        words = f"{folder}: poses are read from the {count} files {ending}, and not from {some(others, MOST_NAMED)}"
         warnings.warn(words, LogWarning, stacklevel=4)
     return [file for file in files if file.suffix.lower() == ending]
 

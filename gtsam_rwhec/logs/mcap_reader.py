@@ -19,6 +19,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, MessageError
 from gtsam_rwhec.files.budgets import MIB, LogBudget
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.files.whole_files import checked_path
 from gtsam_rwhec.logs.foxglove_messages import Decoder, decoder_for
 from gtsam_rwhec.logs.mcap_file import Block, McapFile, Messages
@@ -101,9 +102,7 @@ class Log:
 
     def topics_in_words(self) -> str:
         """The topics and their schemas, for messages. At most `MOST_NAMED` are named, as logs may have thousands."""
-        known = self.topics()
-        there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known[:MOST_NAMED]) or "none"
-        return there + (f" and {len(known) - MOST_NAMED} others" if len(known) > MOST_NAMED else "")
+        return some([f"{topic.name} ({topic.schema})" for topic in self.topics()], MOST_NAMED) or "none"
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records of all files by name; the last record of a name counts.

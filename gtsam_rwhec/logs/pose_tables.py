@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import FileFormatError, LogError
@@ -162,9 +163,7 @@ def _of_angles(rows: list[PoseRow], stated: PoseStatement) -> Array:
         if rows[0].is_named:  # about x, y and z: in the order of the turns
             angles = angles[:, ["xyz".index(axis) for axis in stated.euler.lower()]]
         turned = Rotation.from_euler(stated.euler, angles)
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = turned.as_matrix(), numbers[:, :3]
-    return T
+    return pose(turned.as_matrix(), numbers[:, :3])
 
 
 def _of_rotation_vectors(rows: list[PoseRow], stated: PoseStatement) -> Array:

@@ -28,6 +28,7 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.geometry.real_numbers import finite_or_none
 from gtsam_rwhec.methods.certified import CERTIFIED, outcome_of, quiet_solution
 from gtsam_rwhec.methods.hand_eye import solve_hand_eye
 from gtsam_rwhec.methods.method import (
@@ -335,7 +336,7 @@ def comparison_fields(comparison: Comparison) -> dict[str, Any]:
         "objective": None if certificate is None else str(certificate.objective),
         "certificate": None if certificate is None else str(certificate),
         "no_certificate": None if comparison.error is None else str(comparison.error),
-        "lower_bound": None if certificate is None else _finite(certificate.lower_bound),
+        "lower_bound": None if certificate is None else finite_or_none(certificate.lower_bound),
         "tolerance": None if certificate is None else certificate.tolerance,
         "methods": [_row(comparison, row) for row in comparison.rows],
         "chained": [_chained_row(row) for row in comparison.chained],
@@ -371,8 +372,8 @@ def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
             "cost": estimate.cost,
             "gap": comparison.gap(row),
             "is_optimal": comparison.is_optimal(row),
-            "translation_rms_m": _finite(row.translation_rms_m),
-            "rotation_rms_rad": _finite(row.rotation_rms_rad),
+            "translation_rms_m": finite_or_none(row.translation_rms_m),
+            "rotation_rms_rad": finite_or_none(row.rotation_rms_rad),
             "seconds": estimate.seconds,
             "starts_from": estimate.starts_from,
             "notes": list(estimate.notes),
@@ -391,12 +392,8 @@ def _chained_row(row: Chained) -> dict[str, Any]:
         "failed": {str(pair): why for pair, why in row.failed.items()},
         "unreached": list(row.unreached),
         "cost": None if row.estimate is None else row.estimate.cost,
-        "off_mm": _finite(row.off_mm),
-        "off_deg": _finite(row.off_deg),
+        "off_mm": finite_or_none(row.off_mm),
+        "off_deg": finite_or_none(row.off_deg),
         "targets": pose_rows(TARGET_CARRIER, row.X),
         "sensors": pose_rows(SENSOR_CARRIER, row.Y),
     }
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from rich.console import Console
 
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.methods.comparison import Compared, Comparison
 from gtsam_rwhec.report.advice import advice_of, certificate_sentence
 from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Table, Words
@@ -84,24 +85,17 @@ def _chained(comparison: Comparison) -> Iterator[Block]:
     yield Table.of(title, "method", headings, rows, CHAINED_LEGEND)
     said: dict[str, list[str]] = {}
     if comparison.undetermined:
-        few = f"{_first(map(str, comparison.undetermined))}: their own measurements do not determine their frames"
-        said[f"No tree takes {few}."] = []
+        few = some(list(map(str, comparison.undetermined)), MOST_NAMED)
+        said[f"No tree takes {few}: their own measurements do not determine their frames."] = []
     for row in comparison.chained:
         reasons: dict[str, list[str]] = {}
         for pair, why in row.failed.items():
             reasons.setdefault(why, []).append(str(pair))
         for why, pairs in reasons.items():
-            said.setdefault(f"the tree avoids {_first(pairs)}: {why}", []).append(row.method)
+            said.setdefault(f"the tree avoids {some(pairs, MOST_NAMED)}: {why}", []).append(row.method)
         if row.unreached:
-            said.setdefault(f"no pair that can be used has {_first(row.unreached)}.", []).append(row.method)
+            said.setdefault(f"no pair that can be used has {some(row.unreached, MOST_NAMED)}.", []).append(row.method)
     yield from (Paragraph(f"{', '.join(names)}: {words}" if names else words) for words, names in said.items())
-
-
-def _first(names: Iterable[str]) -> str:
-    """The first of many names, and how many more there are."""
-    all_ = list(names)
-    more = len(all_) - MOST_NAMED
-    return ", ".join(all_[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _remarks(comparison: Comparison) -> list[str]:

@@ -234,8 +234,7 @@ def frames_of(p: Array, parameterisation: Parameterisation) -> tuple[Array, Arra
     k = p.shape[1] - 3
     R, by_p = chart(p[:, :k])
     n = len(p)
-    frames = np.tile(np.eye(4), (n, 1, 1))
-    frames[:, :3, :3], frames[:, :3, 3] = R, p[:, k:]
+    frames = se3.pose(R, p[:, k:])
     # vec stacks columns: entry 3 c + r is R[r, c]
     turned = np.einsum("nri,nrck->nick", R, by_p.reshape(n, 3, 3, k).transpose(0, 2, 1, 3))  # R' dR
     tangents = np.zeros((n, 6, k + 3))

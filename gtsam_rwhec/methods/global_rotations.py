@@ -15,7 +15,7 @@ from typing import Literal
 import clarabel
 import numpy as np
 import scipy.sparse
-from rwhec_factors.se3 import so3_nearest
+from rwhec_factors.se3 import pose, so3_nearest
 from scipy.linalg import block_diag
 
 from gtsam_rwhec.errors import FrameError, OptionError, ScaleError
@@ -99,9 +99,7 @@ class UnitForm:
                 f"the scale of least cost is {answer.scale:.6g}; a real scale is positive. Check the conventions of "
                 "the poses, or move along more than one circle or sphere"
             )
-        T: Array = np.tile(np.eye(4), (len(R), 1, 1))
-        T[:, :3, :3] = answer.R
-        T[:, :3, 3] = answer.t + np.array([self.part.frame_shift(name) for name in self.part.free])
+        T: Array = pose(answer.R, answer.t + np.array([self.part.frame_shift(name) for name in self.part.free]))
         if self.turned:
             T = np.linalg.inv(T)
         poses = dict(zip(self.part.free, T, strict=True))

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from rwhec_factors.se3 import so3_nearest
+from rwhec_factors.se3 import pose, so3_nearest
 
 from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
@@ -96,8 +96,7 @@ class Stack:
         self, R: Array, t: Array, scale: float = 1.0, *, starts_from: str | None = None, notes: Iterable[str] = ()
     ) -> Outcome[Poses]:
         """Rotations (n, 3, 3) and translations (n, 3), metres, as a method's outcome."""
-        T = np.tile(np.eye(4), (len(R), 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = R, t
+        T = pose(R, t)
         poses = dict(zip(self.names, T, strict=True))
         X, Y = ({name: poses[name] for name in names} for names in (self.targets, self.sensors))
         return Outcome(X, Y, scale, starts_from=starts_from, notes=tuple(notes))

@@ -16,9 +16,9 @@ from typing import Any, Generic, Literal, ParamSpec, TypeVar
 import gtsam
 
 from gtsam_rwhec.errors import CountError, FrameError, OptionError, PriorError, RwhecError, ScaleError
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, counted
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_whole
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, check_kind, is_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -182,8 +182,7 @@ class MethodOptions:
 
 def checked_options(options: MethodOptions | None) -> MethodOptions:
     """The options, or the usual ones; an OptionError for options of another type."""
-    if options is not None and not isinstance(options, MethodOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
+    check_kind(options, MethodOptions | None, "options", "a gtsam_rwhec.methods.MethodOptions")
     return options or MethodOptions()
 
 
@@ -226,11 +225,9 @@ def check_problem(method: Method[Any], problem: Problem) -> None:
     Raises CountError, FrameError, MeasurementsNotKeptError, OptionError, PriorError or ScaleError, or what the method's
     own check raises.
     """
-    if not isinstance(method, Method):
-        raise OptionError(f"the method is a {type(method).__name__}; give a record of gtsam_rwhec.methods.METHODS")
+    check_kind(method, Method, "the method", "a record of gtsam_rwhec.methods.METHODS")
     takes = method.takes
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     problem.require_pairs()
     if not takes >= _FOR_SCALE[problem.scale]:
         scales = [mode for mode, needed in _FOR_SCALE.items() if takes >= needed]
@@ -265,10 +262,9 @@ def _check_frames(method: Method[Any], problem: Problem) -> None:
         "Xs and Ys": (True, ""),
     }["Xs and Ys" if Takes.CORNERS in method.takes else method.properties.multiple]
     if not can:
-        pairs = len(problem.pairs)
         raise FrameError(
-            f"this method solves for {what}; the problem has {targets} target{'s' * (targets != 1)}, {sensors} "
-            f"sensor{'s' * (sensors != 1)} and {pairs} pair{'s' * (pairs != 1)}"
+            f"this method solves for {what}; the problem has {counted(targets, 'target')}, "
+            f"{counted(sensors, 'sensor')} and {counted(len(problem.pairs), 'pair')}"
         )
     if targets == sensors == 1 and Takes.PRIORS not in method.takes and problem.number_of_measurements < FEWEST:
         raise CountError(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError, PoseError, UnderdeterminedError
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, counted
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms, checked_rows
 from gtsam_rwhec.geometry.quaternions import left, right
 from gtsam_rwhec.geometry.real_numbers import is_between, real_array
@@ -212,7 +212,7 @@ def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None)
         )
     if count < 2:
         raise CountError(
-            f"{count} motion{'s' * (count != 1)} given; AX = XB needs two or more, about axes that are not parallel"
+            f"{counted(count, 'motion')} given; AX = XB needs two or more, about axes that are not parallel"
         )
     rows = np.empty((14, count))
     sums = np.empty((2, count))

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from rwhec_factors.se3 import so3_nearest
+from rwhec_factors.se3 import pose, so3_nearest
 
 from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.geometry.poses import Array
@@ -90,8 +90,7 @@ class JointForm:
         R = y[: 9 * K].reshape(K, 3, 3).transpose(0, 2, 1)
         scale = np.ones(K)
         scale[self.scaled] = y[12 * K : -1]
-        T = np.tile(np.eye(4), (K, 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = R, y[9 * K : 12 * K].reshape(K, 3) / scale[:, None]
+        T = pose(R, y[9 * K : 12 * K].reshape(K, 3) / scale[:, None])
         return T, scale
 
 

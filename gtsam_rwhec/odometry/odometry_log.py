@@ -35,25 +35,16 @@ from gtsam_rwhec.odometry.odometry_result import (
 from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig, RigFrames
 from gtsam_rwhec.rig.exported_files import FILES, export_all
-from gtsam_rwhec.runs.changed_rig import changes, rig_for_solving
+from gtsam_rwhec.runs.changed_rig import rig_for_solving
 from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import detected
 from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.odometry_cleaning import gates_of
 from gtsam_rwhec.runs.odometry_tracks import files_of, read_odometry, records_of_files
-from gtsam_rwhec.runs.output_folder import (
-    check_is_not_read,
-    list_written,
-    log_name,
-    made_folder,
-    made_output_folder,
-    output_folder,
-)
+from gtsam_rwhec.runs.output_folder import list_written, log_name, made_folder, made_output_folder, output_folder
 from gtsam_rwhec.runs.run_log import (
     CALIBRATION_LOG,
-    CLEANING_METADATA,
     OF_DETECTION,
-    RECORDED_LOG,
     REPORT_FILE,
     RESULT_FILE,
     SOLUTION_TOPIC,
@@ -64,6 +55,7 @@ from gtsam_rwhec.runs.run_log import (
     topics_up_to_detection,
     write_run_log,
 )
+from gtsam_rwhec.runs.whole_runs import checked_sources, is_cleaned, log_of_files
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,19 +250,10 @@ def calibrate_odometry_log(
     if rig is not None and source.is_dir() and not any(source.glob("*.mcap")):
         return _calibrate_files(source, rig, out, anyway=anyway, replace=replace, progress=progress)
     with open_log(source) as log:
-        files = [file.path for file in log.files]
-        is_raw = not is_from_stage(log)
-        if is_raw and rig is None:
-            raise LogError(f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
-        if is_raw:
-            check_is_not_read(log, Path(out) / CALIBRATION_LOG)
-        is_cleaned = CLEANING_METADATA in log.metadata() and (
-            rig is None or not changes(read_embedded_rig(log), rig).cleaning
-        )
-        sources = tuple(file.name for file in files) if is_raw else read_metadata(log).detection.sources
+        sources, files = checked_sources(log, rig, out), [file.path for file in log.files]
     with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
         output.begin()
-        return _stages(files, rig, output.path, is_raw=is_raw, is_cleaned=is_cleaned, anyway=anyway, progress=progress)
+        return _stages(files, rig, output.path, anyway=anyway, progress=progress)
 
 
 def _calibrate_files(
@@ -285,39 +268,24 @@ def _calibrate_files(
             f"{folder} has no MCAP file, and {rig.source.place(('sensors', others[0], 'odometry'))} is of a log; write "
             "odometry: {file: NAME} for a file of poses in this folder"
         )
-    name = f"{folder.resolve().name}{RECORDED_LOG}"
-    with output_folder(out, name, replace=replace) as output:
-        recorded = output.path / name
-        output.begin()
-        try:
-            with LogWriter(recorded) as log:
-                for pose in chain.from_iterable(records_of_files(rig).values()):
-                    log.pose(pose.topic, pose.stamp_ns, pose.parent, pose.T)
-            return _stages(
-                [recorded], rig, output.path, is_raw=True, is_cleaned=False, anyway=anyway, progress=progress
-            )
-        finally:
-            recorded.unlink(missing_ok=True)
+    with log_of_files(folder, out, replace=replace) as (output, recorded):
+        with LogWriter(recorded) as log:
+            for pose in chain.from_iterable(records_of_files(rig).values()):
+                log.pose(pose.topic, pose.stamp_ns, pose.parent, pose.T)
+        return _stages([recorded], rig, output.path, anyway=anyway, progress=progress)
 
 
 def _stages(
-    files: list[Path],
-    rig: Rig | None,
-    out: Path,
-    *,
-    is_raw: bool,
-    is_cleaned: bool,
-    anyway: bool,
-    progress: Progress | None,
+    files: list[Path], rig: Rig | None, out: Path, *, anyway: bool, progress: Progress | None
 ) -> OdometrySolved:
-    if not is_cleaned:
-        with open_log(files) as log:
+    with open_log(files) as log:
+        if not is_cleaned(log, rig):
             found = log
-            if is_raw:
+            if not is_from_stage(log):
                 assert rig is not None
                 found = detected(log, rig, progress=progress)
             write_run_log(cleaned(found, rig, progress), out / CALIBRATION_LOG, "leave_out")
-        files = [out / CALIBRATION_LOG]
+            files = [out / CALIBRATION_LOG]
     solved = solve_odometries_into(files[0], rig, out, progress=progress)
     export_odometries(out / CALIBRATION_LOG, out, anyway=anyway, progress=progress)
     return solved

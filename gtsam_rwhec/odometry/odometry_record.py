@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement
 from gtsam_rwhec.clouds.lidar_pair import LidarsTogether
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.geometry.odometry_track import OdometryNoise
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.log_history import Removed
@@ -212,9 +213,8 @@ def _contradicted(found: OdometryCalibration) -> list[Finding]:
     wrong = sorted((one for one in found.influences if one.is_contradicted), key=lambda one: -one.off_by)
     if not wrong:
         return []
-    named = ", ".join(f"{one.what} = {one.value:g} {one.unit} ({one.off_by:.1f})" for one in wrong[:NAMED])
-    more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
-    words = f"what is given contradicts the motions (by so many standard deviations): {named}{more}"
+    named = some([f"{one.what} = {one.value:g} {one.unit} ({one.off_by:.1f})" for one in wrong], NAMED)
+    words = f"what is given contradicts the motions (by so many standard deviations): {named}"
     return [Finding(Ground.POSE_DOUBTED, words)]
 
 

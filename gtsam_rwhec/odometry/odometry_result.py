@@ -14,14 +14,17 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.errors import FileFormatError, FrameError
 from gtsam_rwhec.files.whole_files import read_whole, write_atomically
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import of_rotations
+from gtsam_rwhec.geometry.real_numbers import finite_or_none
 from gtsam_rwhec.odometry.odometry_record import OdometryCalibration, free_in_words
+from gtsam_rwhec.results.file_record import FileRecord
+from gtsam_rwhec.results.json_tree import in_words
 
 FORMAT: Final = "gtsam-rwhec odometry result"
 FORMAT_VERSION: Final = 1
@@ -37,11 +40,7 @@ Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class NoiseRecord(_Record):
+class NoiseRecord(FileRecord):
     """How the errors of an odometry grow."""
 
     rotation_deg_per_sqrt_s: float
@@ -49,7 +48,7 @@ class NoiseRecord(_Record):
     was_found: bool
 
 
-class SensorRecord(_Record):
+class SensorRecord(FileRecord):
     """The pose of one sensor in the frame of the reference, its scale and its clock."""
 
     sensor: str
@@ -67,7 +66,7 @@ class SensorRecord(_Record):
     time_offset_sigma_s: float | None
 
 
-class TrackRecord(_Record):
+class TrackRecord(FileRecord):
     """What one sensor measured, the reference too: its noise, its residuals, and what is not used."""
 
     sensor: str
@@ -78,7 +77,7 @@ class TrackRecord(_Record):
     removed: dict[str, int] = Field(description="poses and windows that are not used, by reason")
 
 
-class FreeRecord(_Record):
+class FreeRecord(FileRecord):
     """One direction in which the answer may move while the motions fit as well."""
 
     kind: str
@@ -88,7 +87,7 @@ class FreeRecord(_Record):
     sentence: str
 
 
-class GivenRecord(_Record):
+class GivenRecord(FileRecord):
     """A number that a person gave, and how the answer depends on it."""
 
     what: str
@@ -101,7 +100,7 @@ class GivenRecord(_Record):
     turned_deg_per_sigma: dict[str, float]
 
 
-class TogetherRecord(_Record):
+class TogetherRecord(FileRecord):
     """What the clouds of two LiDARs tell of their pose to each other."""
 
     first: str
@@ -119,7 +118,7 @@ class TogetherRecord(_Record):
     sentence: str
 
 
-class OtherRecord(_Record):
+class OtherRecord(FileRecord):
     """Another answer that fits as well."""
 
     why: str
@@ -127,7 +126,7 @@ class OtherRecord(_Record):
     T_reference_sensor: dict[str, tuple[Row4, Row4, Row4, Row4]]
 
 
-class CertificateRecord(_Record):
+class CertificateRecord(FileRecord):
     """The proof of the joint cost."""
 
     status: str
@@ -138,7 +137,7 @@ class CertificateRecord(_Record):
     sentence: str
 
 
-class OdometryResult(_Record):
+class OdometryResult(FileRecord):
     """A result file."""
 
     format: Literal["gtsam-rwhec odometry result"] = FORMAT
@@ -248,9 +247,9 @@ def result_of(
         certificate=CertificateRecord(
             status=found.certificate.status.value,
             cost=found.certificate.cost,
-            lower_bound=_finite(found.certificate.lower_bound),
+            lower_bound=finite_or_none(found.certificate.lower_bound),
             tolerance=found.certificate.tolerance,
-            region_m=_finite(found.certificate.region_m),
+            region_m=finite_or_none(found.certificate.region_m),
             sentence=str(found.certificate),
         ),
         sources=sources,
@@ -277,9 +276,7 @@ def parse_odometry_result(content: bytes, path: str | Path) -> OdometryResult:
     try:
         return OdometryResult.model_validate_json(content)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"])) or "$"
-        raise FileFormatError(f"{path} is no result of a calibration of odometries: {place}: {first['msg']}") from error
+        raise FileFormatError(f"{path} is no result of a calibration of odometries: {in_words(error)}") from error
 
 
 def is_odometry_result(content: bytes) -> bool:
@@ -294,7 +291,7 @@ def _sensor(found: OdometryCalibration, name: str, frames: Mapping[str, str]) ->
     scale_sigma = None
     if name in found.scales:
         at = 6 * len(found.order) + list(found.scales).index(name)
-        scale_sigma = _finite(found.scales[name] * float(np.sqrt(found.covariance[at, at])))
+        scale_sigma = finite_or_none(found.scales[name] * float(np.sqrt(found.covariance[at, at])))
     return SensorRecord(
         sensor=name,
         parent=frames.get(found.reference, found.reference),
@@ -308,7 +305,7 @@ def _sensor(found: OdometryCalibration, name: str, frames: Mapping[str, str]) ->
         scale=found.scales.get(name),
         scale_sigma=scale_sigma,
         time_offset_s=found.time_offsets_s.get(name, 0.0),
-        time_offset_sigma_s=_finite(found.time_offset_sigmas_s.get(name, np.inf)),
+        time_offset_sigma_s=finite_or_none(found.time_offset_sigmas_s.get(name, np.inf)),
     )
 
 
@@ -333,8 +330,4 @@ def _rows(T: Array) -> tuple[tuple[float, ...], ...]:
 
 
 def _finites(numbers: Array) -> tuple[float | None, ...]:
-    return tuple(map(_finite, numbers.tolist()))
-
-
-def _finite(number: float) -> float | None:
-    return number if np.isfinite(number) else None
+    return tuple(map(finite_or_none, numbers.tolist()))

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.errors import FileFormatError, RwhecWarning
-from gtsam_rwhec.files.terminal_text import brief, natural_key, shown
+from gtsam_rwhec.files.terminal_text import brief, natural_key, shown, some
 from gtsam_rwhec.files.whole_files import checked_path, read_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import GivenMeasurements, LongTranslations, Pair, warn_of_millimetres
@@ -225,10 +225,9 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
         sides[side] = path
     if unknown:
         unknown.sort(key=natural_key)
-        more = f" and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
         warnings.warn(
             f"{folder}: {len(unknown)} {'entry' if len(unknown) == 1 else 'entries'} not read, with other names than "
-            f"{example}: {', '.join(map(shown, unknown[:MOST_NAMED]))}{more}",
+            f"{example}: {some(list(map(shown, unknown)), MOST_NAMED)}",
             CsvWarning,
             stacklevel=3,
         )

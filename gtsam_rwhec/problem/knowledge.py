@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -58,6 +58,11 @@ def checked_scale(scale: object, what: str) -> float:
             "(measured / true length)"
         )
     return float(scale)
+
+
+def scale_at(scale: float | Mapping[str, float], target: str) -> float:
+    """An answer's scale of one target: its own, or the one of all."""
+    return scale[target] if isinstance(scale, Mapping) else scale
 
 
 def _check_agreement(name: str, first: Prior, second: Prior) -> None:

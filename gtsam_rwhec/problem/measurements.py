@@ -11,10 +11,10 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, NoiseError, OptionError, StampError, UnitsWarning
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.errors import CountError, NoiseError, StampError, UnitsWarning
+from gtsam_rwhec.files.terminal_text import brief, some
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms
-from gtsam_rwhec.geometry.real_numbers import real_array
+from gtsam_rwhec.geometry.real_numbers import check_kind, real_array
 from gtsam_rwhec.problem.moments import Gauge
 
 Value = TypeVar("Value")
@@ -130,8 +130,7 @@ class GivenMeasurements:
 
     def check_source(self) -> None:
         """Raise an OptionError for a source that is no text."""
-        if self.source is not None and not isinstance(self.source, str):
-            raise OptionError(f"source is a {type(self.source).__name__}; give text: the name of a file or topic")
+        check_kind(self.source, str | None, "source", "text: the name of a file or topic")
 
     @property
     def has_noise(self) -> bool:
@@ -310,14 +309,13 @@ def warn_of_millimetres(found: Sequence[LongTranslations], stacklevel: int) -> N
         return
     sides = sorted({name for each in long for name in each.sizes})
     sizes = [f"{np.median([each.sizes[name] for each in long if name in each.sizes]):.4g}" for name in sides]
-    named = ", ".join(each.where for each in long[:MOST_NAMED])
-    more = f" and {len(long) - MOST_NAMED} more" if len(long) > MOST_NAMED else ""
+    named = some([each.where for each in long], MOST_NAMED)
     cure = "Give metres: divide by 1000"
     if "B" in sides and all(each.from_corners for each in long):
         also = ", and A too" if "A" in sides else ""
         cure = f"B is made of board_points: give these in metres, divided by 1000{also}"
     warnings.warn(
-        f"{named}{more}: translations of {' and '.join(sides)} have a median size of {' and '.join(sizes)}; this looks "
+        f"{named}: translations of {' and '.join(sides)} have a median size of {' and '.join(sizes)}; this looks "
         f"like millimetres. {cure}. (This is said once for all pairs of a problem)",
         UnitsWarning,
         stacklevel=stacklevel + 1,

@@ -20,6 +20,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.accumulation import Accumulator, Row
 from gtsam_rwhec.problem.corners import candidates_of_each
 from gtsam_rwhec.problem.directions import aligned, common_slides, scaled, slides_of
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.many_measurements import KeptMeasurements
 from gtsam_rwhec.problem.measurements import ByPair, Measurements, Pair
 from gtsam_rwhec.problem.moment_stack import MomentStack
@@ -137,7 +138,7 @@ def aligned_at(
     every = {pair: problem.measurements(*pair) for pair in problem.pairs}
     for pair in pairs:
         of_target = (Y if pair.is_motion else X)[pair.target].matrix()
-        alpha = scale[pair.target] if isinstance(scale, Mapping) else scale
+        alpha = scale_at(scale, pair.target)
         every[pair] = aligned(every[pair], of_target, Y[pair.sensor].matrix(), alpha)
     slid = problem.with_measurements(every)
     for name in dict.fromkeys(pair.target for pair in pairs if not pair.is_motion):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Ground, Judgement
-from gtsam_rwhec.files.terminal_text import natural_key
+from gtsam_rwhec.files.terminal_text import natural_key, some
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.certificate import Basis, Certificate, Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
@@ -60,8 +60,7 @@ def _not_determined(free: Sequence[FreeDirection]) -> list[str]:
     said = [f"Not determined: {direction}" for direction in free if len(few) < 2 or direction not in few]
     if len(few) > 1:
         frames = sorted({name for direction in few for name in direction.frames}, key=natural_key)
-        named = f"{', '.join(frames[:MOST_NAMED])}{' and others' if len(frames) > MOST_NAMED else ''}"
-        said.insert(0, f"Not determined: {len(few)} directions of {named}: {FreeReason.FEW.words}")
+        said.insert(0, f"Not determined: {len(few)} directions of {some(frames, MOST_NAMED)}: {FreeReason.FEW.words}")
     return said
 
 
@@ -88,8 +87,8 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
         advice += _sizes(log, are_said=bool(SIZES.intersection(grounds)))
     advice += log.detection.remarks
     if log.detection.strangers:
-        names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
-        advice.append(f"The images show tags that the rig file does not name: {', '.join(names)}.")
+        names = [f"{name} ({count} times)" for name, count in log.detection.strangers.items()]
+        advice.append(f"The images show tags that the rig file does not name: {some(names, MOST_NAMED)}.")
     return advice
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gtsam_rwhec.files.terminal_text import listed
 from gtsam_rwhec.report.choices_section import log_blocks
 from gtsam_rwhec.report.figures import (
     GREY,
@@ -299,7 +300,7 @@ def empty_in_words(cells: Sequence[Sequence[int]]) -> str:
     for name, edge in EDGES.items():
         if not has[edge].any() and not told[edge].all():
             nothing.append(f"along the {name} edge")
-    said = [f"{words} was seen {_and(where)}" for words, where in (("nothing", nothing), ("hardly anything", hardly))
+    said = [f"{words} was seen {listed(where)}" for words, where in (("nothing", nothing), ("hardly anything", hardly))
             if where]  # fmt: skip
     if said:
         return f"{'; '.join(said)}."
@@ -318,10 +319,6 @@ def _parts(shape: tuple[int, ...]) -> dict[str, tuple[slice, slice]]:
     halves: dict[str, tuple[slice, slice]] = {f"{x} half": (every, columns) for x, columns in across.items()}
     halves |= {f"{y} half": (rows, every) for y, rows in down.items()}
     return halves | {f"{y} {x} quarter": (down[y], across[x]) for y in down for x in across}
-
-
-def _and(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 #: Signs of what was removed, by stage.

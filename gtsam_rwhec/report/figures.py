@@ -121,8 +121,7 @@ def _drawn(
     from matplotlib.figure import Figure
 
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of what it draws otherwise no reader needs to hear
-    with warnings.catch_warnings(), style.context(["default", STYLE, dict(style_too)]):
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), style.context(["default", STYLE, dict(style_too)]):
         figure = Figure(figsize=size_in, layout="constrained", dpi=72 if form == "svg" else FILE_DPI)
         stream = io.BytesIO()
         # figure.savefig goes over everything twice.

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import RwhecError
@@ -72,9 +73,7 @@ def frames_of_tree(tree: Mapping[str, Any]) -> RigFrames:
 
 
 def _matrix(row: Mapping[str, Any]) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = row["rotation_matrix"], row["translation_m"]
-    return T
+    return pose(row["rotation_matrix"], row["translation_m"])
 
 
 def _inputs(shown: ShownResult) -> Iterator[Block]:

@@ -8,6 +8,7 @@ from typing import Literal
 
 import gtsam
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.figures import round_down
@@ -227,8 +228,7 @@ def _frames(shown: ShownResult, side: Side, placed: Array) -> Iterator[Frame]:
     parts = shown.tree.get("refined", {}).get("frames", {})
     kind: Kind = "sensor" if side == "sensors" else "target"
     for row in shown.tree[side]:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = row["rotation_matrix"], row["translation_m"]
+        T = pose(row["rotation_matrix"], row["translation_m"])
         name, known = row["child"], parts.get(row["child"])
         words, covariance = list(_words(T, row["parent"])), None
         if known is not None:
@@ -300,9 +300,7 @@ def _magnification(frames: list[Frame], radius: float, extent: float) -> float:
 
 
 def _pose(row: tuple[float, ...]) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = gtsam.Rot3.Quaternion(*row[3:]).matrix(), row[:3]
-    return T
+    return pose(gtsam.Rot3.Quaternion(*row[3:]).matrix(), row[:3])
 
 
 #: Sizes as shares of the scene: a line to each side, and its arrowheads and circles.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gtsam_rwhec.files.terminal_text import counted
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.figures import (
     AXIS_COLOURS,
@@ -81,7 +82,7 @@ def scene_section(shown: ShownResult) -> Section:
         scene = scene_of_carrier(shown, kind)
         lines = lines_of(shown, scene)
         says = (
-            f"{_count(len(shown.tree[kind]), kind[:-1])} on {scene.world}, in its axes. {_of_ellipsoids(scene, lines)}"
+            f"{counted(len(shown.tree[kind]), kind[:-1])} on {scene.world}, in its axes. {_of_ellipsoids(scene, lines)}"
         )
         blocks += [_drawing(kind, f"The {kind}", scene, lines, says), *_list_of(lines)]
     return Section("scene", TITLE, (*blocks, Paragraph(WITHOUT_PATH, "absent"), *_heights(shown)))
@@ -218,10 +219,6 @@ def _heights(shown: ShownResult) -> list[Block]:
         )
     title = f"Where the targets are on {where}"
     return [Table(title, ("target", "x m", "y m", "above mm", *more), tuple(found), legend)]
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"
 
 
 WIDTH_IN, HEIGHT_IN = 7.0, 5.6

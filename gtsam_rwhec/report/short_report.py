@@ -18,7 +18,7 @@ from rich.text import Text
 
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty, is_of_no_sensor
 from gtsam_rwhec.calibration.verdict import Judgement
-from gtsam_rwhec.files.terminal_text import LONGEST_LINE, rounded, shown, shown_path
+from gtsam_rwhec.files.terminal_text import LONGEST_LINE, counted, rounded, shown, shown_path
 from gtsam_rwhec.report.advice import Styled
 from gtsam_rwhec.report.report_blocks import Table, plain_text
 from gtsam_rwhec.report.terminal_report import STYLES, TerminalTable, print_heading, print_sentence, report_console
@@ -59,7 +59,7 @@ class PoseTables:
             spare -= 1
         tables = tuple(_first_rows(table, count, marked) for table, count in zip(self.tables, kept, strict=True))
         left = [
-            f"{all_ - count} more {table.headings[0]}{'s' if all_ - count > 1 else ''}"
+            counted(all_ - count, f"more {table.headings[0]}")
             for table, all_, count in zip(self.tables, wanted, kept, strict=True)
             if all_ > count
         ]

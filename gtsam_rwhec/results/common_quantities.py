@@ -17,6 +17,7 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import scale_at
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def numbers_of(refined: RefinedPoses, unknown: Unknown) -> Array:
     if unknown.kind is UnknownKind.TIME_OFFSET:
         return np.array([refined.time_offsets_s[unknown.owner]])
     scale = refined.scale
-    return np.array([scale[unknown.owner] if isinstance(scale, Mapping) else scale])
+    return np.array([scale_at(scale, unknown.owner)])
 
 
 #: An eigenvalue of correlations below zero by more than this is not a rounding error.

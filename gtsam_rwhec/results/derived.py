@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Literal
 
 import gtsam
@@ -11,9 +11,11 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.files.terminal_text import natural_key
-from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.fitting.refined import RefinedPoses, sigma_of
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
+from gtsam_rwhec.geometry.real_numbers import finite_or_none
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.results.file_record import FileRecord, NotNegative, Positive, Triple, triple
 
 Deviations = tuple[float | None, float | None, float | None]
@@ -97,9 +99,9 @@ def derived_of(calibration: Calibration) -> Derived:
 def scalars_of(refined: RefinedPoses) -> Iterator[Scalar]:
     """Scales and clock offsets with their deviations."""
     for unknown in refined.unknowns:
-        deviation = _finite(math.sqrt(refined.covariance(unknown)[0, 0]))
+        deviation = sigma_of(refined, unknown)
         if unknown.kind is UnknownKind.SCALE:
-            value = refined.scale[unknown.owner] if isinstance(refined.scale, Mapping) else refined.scale
+            value = scale_at(refined.scale, unknown.owner)
             yield Scalar(kind="scale", owner=unknown.owner, value=value, deviation=deviation)
         elif unknown.kind is UnknownKind.TIME_OFFSET:
             value = refined.time_offsets_s[unknown.owner]
@@ -122,7 +124,7 @@ def _points(calibration: Calibration) -> Iterator[PointAt]:
                 seen_from=point.seen_from,
                 distance_m=distance,
                 is_seen=distance == typical,
-                radius_mm=_finite(point.radius_mm),
+                radius_mm=finite_or_none(point.radius_mm),
             )
 
 
@@ -165,9 +167,5 @@ def _rpy_deg(pose: gtsam.Pose3) -> Triple:
 
 
 def _deviations(values: np.ndarray) -> Deviations:
-    x, y, z = (_finite(float(value)) for value in values)
+    x, y, z = (finite_or_none(float(value)) for value in values)
     return x, y, z
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -10,8 +10,8 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
-from rwhec_factors import se3
 
+from gtsam_rwhec.calibration.moved_frames import residual_twists
 from gtsam_rwhec.errors import CountError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
@@ -122,8 +122,7 @@ def _settled(
     state, parts = _start(old, variables), parts_of(problem)
     space = free_space_of(parts, variables, state, data)
     if space.directions:  # the motion is poor; or residuals are so large that it looks so, and another start is needed
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             there = variables.start(solve(problem))
         other = free_space_of(parts, variables, there, data)
         if len(other.directions) < len(space.directions):
@@ -175,12 +174,8 @@ def without_gross_errors(old: RefinedPoses, problem: Problem) -> dict[Pair, np.n
     result = {}
     for pair in problem.pairs:
         one = problem.measurements(*pair)
-        scale = old.scale[pair.target] if isinstance(old.scale, dict) else old.scale
-        B = one.B.copy()
-        B[:, :3, 3] /= scale
-        predicted = se3.inverse(old.Y[pair.sensor].matrix()[None]) @ one.A @ old.X[pair.target].matrix()
-        seen = predicted @ se3.inverse(B), se3.inverse(B) @ predicted
-        result[pair] = ~(_far_off(se3.logmap(seen[0])) & _far_off(se3.logmap(seen[1])))
+        of_target, of_sensor = residual_twists(old, pair, one.A, one.B)
+        result[pair] = ~(_far_off(of_target) & _far_off(of_sensor))
     return result
 
 

@@ -18,11 +18,12 @@ from pydantic_core import to_json as json_of
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
-from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
+from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.files.whole_files import checked_path, read_whole, write_atomically
 from gtsam_rwhec.fitting.refined import Refined, RefinedPoses
 from gtsam_rwhec.fitting.refinement_from_poses import movements
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.results.acceptance_record import Acceptance
 from gtsam_rwhec.results.json_tree import MOST_BYTES, POSED, from_json, in_words, parse_json, to_json
 from gtsam_rwhec.results.log_history import LogFields
@@ -288,8 +289,7 @@ def write_refined(refined: Refined, path: str | Path, log: LogFields | None = No
         What became of the measurements, if they come from a log.
     """
     path = checked_path(path)
-    if not isinstance(refined, Refined):
-        raise OptionError(f"refined is a {type(refined).__name__}; give what gtsam_rwhec.refine returned")
+    check_kind(refined, Refined, "refined", "what gtsam_rwhec.refine returned")
     write_atomically(path, result_json(refined, log, path))
 
 
@@ -308,8 +308,7 @@ def write_calibration(calibration: Calibration, path: str | Path, log: LogFields
         What became of the measurements, if they come from a log.
     """
     path = checked_path(path)
-    if not isinstance(calibration, Calibration):
-        raise OptionError(f"calibration is a {type(calibration).__name__}; give what gtsam_rwhec.calibrate returned")
+    check_kind(calibration, Calibration, "calibration", "what gtsam_rwhec.calibrate returned")
     write_atomically(path, result_json(calibration, log, path))
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME, MANY, LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import counted
 from gtsam_rwhec.fitting.refined import RefinedPoses
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.solution import Solution
 
@@ -46,8 +47,7 @@ def judge(
     findings : sequence of Finding, optional
         What ``calibrate`` found besides: misreadings, sizes, sensors without an answer.
     """
-    if not isinstance(solution, Solution):
-        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    check_kind(solution, Solution, "the solution", "what gtsam_rwhec.solve returned")
     found = [*findings_of(solution, refined), *findings]
     if log is not None:
         sensors = {count.sensor for count in log.outliers}
@@ -104,8 +104,8 @@ def short_of_measurements(log: LogFields, poses: Mapping[str, int]) -> list[Find
 def shortage(log: LogFields, name: str, poses: int = 0) -> str:
     """``camera3: 2 measurements at 2 poses (of 9 detections in 40 images; ...), at least 3 poses ... are needed``."""
     count = sum(count.used for count in log.outliers if name in count.pair)
-    at = f" at {poses} pose{'s' * (poses != 1)}" if count and poses else ""
-    return f"{name}: {count} measurement{'s' * (count != 1)}{at} ({_history(log, name)}), {NEEDED}"
+    at = f" at {counted(poses, 'pose')}" if count and poses else ""
+    return f"{name}: {counted(count, 'measurement')}{at} ({_history(log, name)}), {NEEDED}"
 
 
 def _history(log: LogFields, name: str) -> str:
@@ -121,4 +121,4 @@ def _history(log: LogFields, name: str) -> str:
     removed["outlier"] += sum(count.left_out for count in log.outliers if name in count.pair)
     reasons = [f"{why.split(' (')[0]}: {number}" for why, number in removed.most_common(MOST_REASONS) if number]
     where = "" if images is None else f" in {images} images"
-    return "; ".join([f"of {seen} detection{'s' * (seen != 1)}{where}", *reasons])
+    return "; ".join([f"of {counted(seen, 'detection')}{where}", *reasons])

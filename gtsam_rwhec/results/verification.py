@@ -9,13 +9,14 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibration_record import Calibration
 from gtsam_rwhec.calibration.cross_validation import PredictionError, prediction_errors
-from gtsam_rwhec.errors import CountError, FrameError, OptionError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, FrameError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded, shown
 from gtsam_rwhec.fitting.fit_options import CarrierNoise, Component, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -231,8 +232,7 @@ def verify(
     """
     checked_level(level)
     result = as_result(old)
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
     if result.refined is None:
         raise UnderdeterminedError(
             "the old calibration has no covariances, because it was not refined, so nothing can be tested; calibrate "

@@ -20,7 +20,7 @@ from gtsam_rwhec.clouds.registered_views import ObjectOptions, prepared
 from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, RigError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.terminal_text import natural_key, rounded
+from gtsam_rwhec.files.terminal_text import natural_key, rounded, some
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.trajectory import Trajectory
@@ -112,7 +112,7 @@ def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress
     if not usable:
         whys = [words for clouds in found for words in _why_none(folder, clouds)][:3]
         raise RigError(
-            f"{folder}: clouds in {', '.join(each.path for each in found[:5])}, and no file of poses that fits them"
+            f"{folder}: clouds in {some([each.path for each in found], 5)}, and no file of poses that fits them"
             f"{''.join(f'; {each}' for each in whys)}. "
             "Put the robot's pose at each cloud beside them, as poses.csv with a line a cloud: name, x, y, z, qx, qy, "
             "qz, qw (metres)"

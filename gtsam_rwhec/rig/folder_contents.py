@@ -225,8 +225,7 @@ def why_not_read(folder: Path, files: Sequence[Path], path: Path, statements: It
 def _poses_for(
     folder: Path, files: Sequence[Path], path: Path, poses: NamedPoses, stated: PoseStatement
 ) -> FolderPoses | None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what is left over: calibration says it
+    with warnings.catch_warnings(action="ignore"):  # of what is left over: calibration says it
         T = np.full((len(files), 4, 4), math.nan)
         stamps, of_poses = image_stamps(files), pose_stamps(poses)
         if stamps is not None and of_poses is not None:

@@ -14,6 +14,7 @@ from gtsam_rwhec.detect.detections import Detection
 from gtsam_rwhec.detect.detector import Detector
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.geometry.trajectory import Trajectory
 from gtsam_rwhec.logs.image_folder import pose_stamps
 from gtsam_rwhec.logs.pose_tables import PoseStatement
@@ -98,7 +99,7 @@ def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPo
         )
     with_poses = [(camera, camera.poses) for camera in found if camera.poses is not None]
     if not with_poses:
-        named = ", ".join(f"{camera.path} ({len(camera.files)} images)" for camera in found[:5])
+        named = some([f"{camera.path} ({len(camera.files)} images)" for camera in found], 5)
         raise RigError(
             f"{folder}: images in {named}, and no file of poses that fits them. Put the robot's pose at each image "
             "beside them, as poses.csv with a line an image: name, x, y, z, qx, qy, qz, qw (metres)"

@@ -14,7 +14,7 @@ import numpy as np
 
 from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, family_named
 from gtsam_rwhec.detect.tags import SeenTag
-from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.files.terminal_text import rounded, some
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.rig.guessed_boards import BoardSeen
@@ -264,7 +264,7 @@ def _squares(markers: int) -> tuple[int, int]:
 def _listed(ids: list[int]) -> str:
     if len(ids) > 3 and ids[-1] - ids[0] == len(ids) - 1:
         return f"{ids[0]} to {ids[-1]}"
-    return ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
+    return some([str(i) for i in ids], 10)
 
 
 #: A ChArUco board is counted by squares, the others by tags.

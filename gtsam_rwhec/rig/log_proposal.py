@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gtsam_rwhec.cameras.unknown_intrinsics import CORNERS
 from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs import IntrinsicsRecord, Log, Topic
 from gtsam_rwhec.rig.carrier_roles import Origin, Role, evidence_of_log, first_time_offset
@@ -266,7 +267,7 @@ def _pair_words(pair: MovingPair) -> str:
 
 
 def _where(log: Log) -> str:
-    return ", ".join(str(file.path) for file in log.files[:3]) + (", ..." if len(log.files) > 3 else "")
+    return some([str(file.path) for file in log.files], 3)
 
 
 def _topics(contents: LogContents) -> str:

@@ -15,6 +15,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from gtsam_rwhec.cameras.targets import Checkerboard, CircleGrid, Target, print_of
 from gtsam_rwhec.detect.detections import DetectionOptions
 from gtsam_rwhec.errors import OptionError, TargetError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.files.yaml_lines import KeyPath, dotted, suggestion
 from gtsam_rwhec.fitting.fit_options import Stated
 from gtsam_rwhec.rig.odometry_sections import GivenSection, OdometrySensor, odometry_contradictions, with_what_follows
@@ -335,9 +336,9 @@ def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
             if other != target.name:
                 shared.setdefault(other, []).append(id_)
         for other, ids in shared.items():
-            some = ", ".join(map(str, sorted(ids)[:5])) + (", ..." if len(ids) > 5 else "")
+            tags = some([str(i) for i in sorted(ids)], 5)
             yield (
                 ("targets", target.name),
-                f"tags {some} of {target.family} also belong to target {other}: the targets look the same in "
+                f"tags {tags} of {target.family} also belong to target {other}: the targets look the same in "
                 "images; print targets with different ids",
             )

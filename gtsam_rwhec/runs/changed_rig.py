@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_sections import OdometrySensor
@@ -48,8 +49,8 @@ def rig_for_cleaning(log: Log, rig: Rig | None) -> Rig:
     keys = changes(made_with, rig).detection
     if keys:
         raise LogError(
-            f"{log.files[0].path} was made with another rig file. The rig files differ in {_named(keys)}, and the "
-            "detections depend on this: begin with the raw log, or leave --rig out"
+            f"{log.files[0].path} was made with another rig file. The rig files differ in "
+            f"{some(keys, MOST_NAMED)}, and the detections depend on this: begin with the raw log, or leave --rig out"
         )
     return rig
 
@@ -64,8 +65,9 @@ def rig_for_solving(log: Log, rig: Rig | None) -> Rig:
     keys = changes(read_embedded_rig(log), chosen).cleaning
     if keys:
         raise LogError(
-            f"{log.files[0].path} was cleaned with another rig file. The rig files differ in {_named(keys)}. Clean the "
-            "log again with this rig file (gtsam-rwhec clean LOG --rig ..., or calibrate), or leave --rig out"
+            f"{log.files[0].path} was cleaned with another rig file. The rig files differ in "
+            f"{some(keys, MOST_NAMED)}. Clean the log again with this rig file (gtsam-rwhec clean LOG --rig ..., or "
+            "calibrate), or leave --rig out"
         )
     return chosen
 
@@ -112,8 +114,3 @@ def _of_cleaning(made_with: Rig, rig: Rig) -> Iterator[str]:
         yield "reference"
     if made_with.cleaning.model_copy(update={"robust": rig.cleaning.robust}) != rig.cleaning:
         yield "cleaning"
-
-
-def _named(keys: tuple[str, ...]) -> str:
-    others = f" and {len(keys) - MOST_NAMED} others" if len(keys) > MOST_NAMED else ""
-    return ", ".join(keys[:MOST_NAMED]) + others

@@ -25,6 +25,7 @@ from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.detect.detections import Detection, ImageDetections, Rejection
 from gtsam_rwhec.detect.many_images import DetectedImage, Kept
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.files.whole_files import appending_stream, write_atomically
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.results.log_history import ObjectReport
@@ -66,10 +67,7 @@ def inputs_of(log: Log, rig: Rig, cameras: Mapping[str, Camera], folder: Path | 
 def differences(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """A message with the inputs that changed, their values before and now; empty if none changed."""
     other = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    said = [_difference(name, before.get(name), now.get(name)) for name in other[:MOST_SAID]]
-    if len(other) > MOST_SAID:
-        said.append(f"{len(other) - MOST_SAID} others")
-    return "; ".join(said)
+    return some([_difference(name, before.get(name), now.get(name)) for name in other], MOST_SAID, between="; ")
 
 
 def _difference(name: str, before: str | None, now: str | None) -> str:

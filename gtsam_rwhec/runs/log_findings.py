@@ -13,6 +13,7 @@ from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.point_uncertainty import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.log_history import SizeFields
@@ -203,11 +204,10 @@ def turned_images(
     for sensor, found in stamps.items():
         if not found:
             continue
-        named = [image_name(names, str(rig.sensors[sensor].images), stamp) for stamp in sorted(found)[:MOST_NAMED]]
-        more = f" and {len(found) - MOST_NAMED} others" if len(found) > MOST_NAMED else ""
+        named = [image_name(names, str(rig.sensors[sensor].images), stamp) for stamp in sorted(found)]
         words = (
             f"{len(found)} of the {len(of_all[sensor])} images of {sensor} in which a target is read "
-            f"{'is' if len(found) == 1 else 'are'} upside down and not used: {', '.join(named)}{more}"
+            f"{'is' if len(found) == 1 else 'are'} upside down and not used: {some(named, MOST_NAMED)}"
         )
         findings.append(Finding(Ground.IMAGE_TURNED, words))
     return findings

@@ -23,6 +23,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict
 
 from gtsam_rwhec.errors import LogError, RwhecError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.files.whole_files import why_not_writable, write_atomically
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, SUFFIX
@@ -270,8 +271,8 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
     others = [name for name in there if name not in own]
     if others and (before is None or not replace):
         raise LogError(
-            f"{folder} has files that are not of a calibration, and nothing was changed: {_named(others)}. Give "
-            "another folder"
+            f"{folder} has files that are not of a calibration, and nothing was changed: "
+            f"{some(others, MOST_NAMED)}. Give another folder"
         )
     if before is not None and before.state == "unfinished" and before.log != log and not replace:
         earlier = _named_log(before.log)
@@ -292,7 +293,7 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
         if changed:
             raise LogError(
                 f"{folder} has files that no earlier calibration wrote there, or that were changed since, and nothing "
-                f"was changed: {_named(changed)}. Give another folder, or remove them"
+                f"was changed: {some(changed, MOST_NAMED)}. Give another folder, or remove them"
             )
     return before
 
@@ -334,11 +335,6 @@ def _is_as_written(path: Path, sha256: str | None) -> bool:
 def _named_log(log: str) -> str:
     """A log's name for messages; that of the folder if the log was made of a folder."""
     return log.removesuffix(RECORDED_LOG)
-
-
-def _named(names: Sequence[str]) -> str:
-    more = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + (f" and {more} others" if more > 0 else "")
 
 
 def _read_list(folder: Path) -> _Written | None:

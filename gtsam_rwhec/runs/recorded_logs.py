@@ -277,8 +277,8 @@ def samples_problem(path: str | Path) -> SamplesProblem:
             ("which the file does not say: with a fixed camera the answer is the same, with base and hand exchanged"),
         )
     else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotUniqueWarning)  # whoever calibrates this problem says it again
+        # whoever calibrates this problem says it again
+        with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
             costs = {each: solve(_problem(samples, each)).certificate.cost for each in (True, False)}
         on_hand = costs[True] < costs[False]
         if max(costs.values()) < CLEARLY * min(costs.values()):

@@ -221,8 +221,7 @@ def usual_size(log: Log, topic: str) -> Size | None:
 
 def images_of_topic(log: Log, topic: str) -> Iterator[ImageRecord]:
     """The images of a topic. Detection says later which messages cannot be read."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LogWarning)
+    with warnings.catch_warnings(action="ignore", category=LogWarning):
         for record in log.records([topic]):
             if not isinstance(record, ImageRecord):
                 raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")

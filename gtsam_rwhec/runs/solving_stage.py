@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from gtsam_rwhec.cameras.intrinsics_evidence import IntrinsicsEvidence
 from gtsam_rwhec.errors import CameraError, LogError, RwhecError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.fit_options import CornerOptions, RefineOptions
-from gtsam_rwhec.fitting.refined import PairNoise, Refined, RefinedPoses
+from gtsam_rwhec.fitting.refined import PairNoise, Refined, RefinedPoses, sigma_of
 from gtsam_rwhec.fitting.refinement_from_poses import refine
 from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -284,8 +283,7 @@ def with_comparable_noise(
         noise="estimate", robust=rig.cleaning.robust, carrier_noise=motion.noise, carrier_model="propagated"
     )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             noise = refine(problem, solve(problem), options, progress=tell).noise
     except RwhecError as error:
         words = (
@@ -315,8 +313,7 @@ def _for_pictures(found: Calibration, options: CalibrateOptions, progress: Progr
         carrier_model="propagated",
     )
     problem, inliers = found.problem, found.outliers.inliers
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         kept = selected(problem, inliers) if inliers else problem
         return refine(kept, found.solution or solve(kept), how, progress=progress)
 
@@ -397,12 +394,6 @@ def _sizes(rig: Rig, found: Calibration, refined: Refined) -> tuple[SizeFields, 
         if one.name in told
         for scale, sigma, is_free in [told[one.name]]
     )
-
-
-def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
-    """The standard deviation of a scalar, or None if it is infinite."""
-    variance = float(refined.covariance(unknown)[0, 0])
-    return math.sqrt(variance) if math.isfinite(variance) else None
 
 
 def _with_outliers_marked(pairs: Pairs, outliers: Outliers) -> Pairs:

@@ -113,7 +113,6 @@ def _frame_of(log: Log, topic: str) -> str:
     if any(each.name == topic and each.unreadable for each in log.topics()):
         return ""
     kinds = (ImageRecord, IntrinsicsRecord, DetectionRecord, CloudRecord)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LogWarning)  # the reader of the whole topic warns
+    with warnings.catch_warnings(action="ignore", category=LogWarning):  # the reader of the whole topic warns
         first = next((record for record in log.records([topic]) if isinstance(record, kinds)), None)
     return "" if first is None else first.frame

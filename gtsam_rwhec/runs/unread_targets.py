@@ -19,6 +19,7 @@ from gtsam_rwhec.detect.clues import About, Clue, clues, edge_blur_px, motion_bl
 from gtsam_rwhec.detect.detections import Rejection
 from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.files.terminal_text import some
 from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
@@ -312,8 +313,7 @@ def no_detections(log: Log, report: DetectionReport) -> str:
 
 
 def _named(tags: dict[str, int]) -> str:
-    some = [f"{name} ({count} times)" for name, count in list(tags.items())[:MOST_STRANGERS]]
-    return ", ".join(some) + (f" and {len(tags) - MOST_STRANGERS} others" if len(tags) > MOST_STRANGERS else "")
+    return some([f"{name} ({count} times)" for name, count in tags.items()], MOST_STRANGERS)
 
 
 #: Motion blur may hide targets if at least this many images of a sensor, and this share of them, have no used target.

@@ -19,6 +19,7 @@ from gtsam_rwhec.fitting.refined import RefinedPoses
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.results.acceptance import LEVEL as PROBABILITY
 from gtsam_rwhec.results.acceptance import accept
@@ -229,8 +230,7 @@ def _cleaned(detections: Log, given: Rig | None, old: OldCalibration, tell: Prog
     free = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in before]
     found: RunLog | None = None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LogWarning)
+        with warnings.catch_warnings(action="ignore", category=LogWarning):
             found = cleaned(detections, rig, tell)
     except StampError:
         if not free:
@@ -365,7 +365,7 @@ def pixel_errors(
         seen, pixels = corners.seen(measured)
         if not len(seen):
             continue
-        scale = answer.scale[pair.target] if isinstance(answer.scale, dict) else answer.scale
+        scale = scale_at(answer.scale, pair.target)
         T = answer.Y[sensor].inverse().matrix() @ measured.A[seen] @ answer.X[pair.target].matrix()
         points = np.einsum("nij,kj->nki", T[:, :3, :3], corners.targets[pair.target] / scale) + T[:, None, :3, 3]
         projected = cameras[sensor].project(points.reshape(-1, 3)).reshape(pixels.shape)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from pathlib import Path
@@ -151,25 +153,40 @@ def calibrate_log(
         source = Path(str(log_path))
         return _calibrate_files(source, rig, out, choices, replace=replace, progress=progress)
     with open_log(log_path) as log:
+        sources = checked_sources(log, rig, out)
+        check_image_options(log, None if is_from_stage(log) else rig, images=images, workers=workers)
         files = [file.path for file in log.files]
-        is_raw = not is_from_stage(log)
-        if is_raw:
-            if rig is None:
-                raise LogError(
-                    f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one"
-                )
-            check_is_not_read(log, Path(out) / CALIBRATION_LOG)
-            sources = tuple(file.name for file in files)
-        elif len(files) > 1:
-            raise LogError(
-                f"{', '.join(map(str, files[:10]))}: a stage wrote at least one of these files; give that file alone, "
-                "or only raw logs"
-            )
-        else:
-            sources = read_metadata(log).detection.sources
-        check_image_options(log, rig if is_raw else None, images=images, workers=workers)
         with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
             return _stages(log, rig, output, choices, progress=progress)
+
+
+def checked_sources(log: Log, rig: Rig | None, out: str | Path) -> tuple[str, ...]:
+    """The names of the recorded files of a log; a `LogError` where it cannot be calibrated into a folder."""
+    files = [file.path for file in log.files]
+    if not is_from_stage(log):
+        if rig is None:
+            raise LogError(f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
+        check_is_not_read(log, Path(out) / CALIBRATION_LOG)
+        return tuple(file.name for file in files)
+    if len(files) > 1:
+        raise LogError(
+            f"{', '.join(map(str, files[:10]))}: a stage wrote at least one of these files; give that file alone, or "
+            "only raw logs"
+        )
+    return read_metadata(log).detection.sources
+
+
+@contextmanager
+def log_of_files(source: Path, out: str | Path, *, replace: bool) -> Iterator[tuple[OutputFolder, Path]]:
+    """The folder of a calibration, and where a log of files is written in it, which is removed at the end."""
+    name = f"{source.resolve().name}{RECORDED_LOG}"
+    with output_folder(out, name, replace=replace) as output:
+        recorded = output.path / name
+        output.begin()
+        try:
+            yield output, recorded
+        finally:
+            recorded.unlink(missing_ok=True)
 
 
 def _is_folder_of_clouds(path: Path) -> bool:
@@ -199,19 +216,13 @@ def _calibrate_files(
     if folder is not None:
         rig = rig.model_copy(update={"folder": folder})
     check_intrinsics_files(rig)  # before anything is copied
-    name = f"{source.resolve().name}{RECORDED_LOG}"
-    with output_folder(out, name, replace=replace) as output:
-        recorded = output.path / name
-        output.begin()
-        try:
-            if folder is not None:
-                write_folder_log(folder, rig, recorded, progress=progress)
-            else:
-                (progress or silent)(write_samples_log(source, rig, recorded))
-            with open_log(recorded) as log:
-                return _stages(log, rig, output, choices, folder, progress=progress)
-        finally:
-            recorded.unlink(missing_ok=True)
+    with log_of_files(source, out, replace=replace) as (output, recorded):
+        if folder is not None:
+            write_folder_log(folder, rig, recorded, progress=progress)
+        else:
+            (progress or silent)(write_samples_log(source, rig, recorded))
+        with open_log(recorded) as log:
+            return _stages(log, rig, output, choices, folder, progress=progress)
 
 
 def _stages(
@@ -242,7 +253,7 @@ def _stages(
         )
         if folder is not None:
             sources = sorted(path for path in folder.rglob("*") if path.is_file())
-    if not _is_cleaned(found, rig):
+    if not is_cleaned(found, rig):
         found = cleaned(found, rig, progress)
     calibrated = solve_log(found, rig, progress=progress)
     result = _write_solution(found, calibrated, out, choices.images)
@@ -253,7 +264,7 @@ def _stages(
     return calibrated
 
 
-def _is_cleaned(log: Log, rig: Rig | None) -> bool:
+def is_cleaned(log: Log, rig: Rig | None) -> bool:
     """Whether a log was cleaned as the rig file says."""
     return CLEANING_METADATA in log.metadata() and (rig is None or not changes(read_embedded_rig(log), rig).cleaning)
 

@@ -8,6 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from gtsam_rwhec.files.terminal_text import listed
 from gtsam_rwhec.geometry.poses import Array
 
 #: A turn, a shift or a change takes no part in a direction if it is at most this part of the direction's largest. A
@@ -101,7 +102,7 @@ class FreeDirection:
         what = {FreeKind.ROTATION: "rotation of ", FreeKind.TRANSLATION: "translation of "}.get(self.kind, "change of ")
         more = len(others) + 1 - NAMED
         named = others[: NAMED - 1] + ([f"{more} more"] if more > 0 else [])
-        together = f", together with {_listed(named)}" if named else ""
+        together = f", together with {listed(named)}" if named else ""
         return f"{what}{first}{together}: {self.reason.words}"
 
     def _movements(self) -> Iterator[str]:
@@ -248,7 +249,3 @@ def _axis(direction: Array) -> str:
         return f"its own {'xyz'[k]} axis"
     rounded = np.round(direction * np.sign(direction[k]), 2) + 0.0  # no -0.00
     return "(" + ", ".join(f"{x:.2f}" for x in rounded) + ") in its own frame"
-
-
-def _listed(words: list[str]) -> str:
-    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

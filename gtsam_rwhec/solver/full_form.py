@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma, gammas
@@ -138,10 +139,7 @@ def as_variable(T: Array, part: Part) -> Array:
     """A pose as variables of the form: itself, or its inverse in the inverse form."""
     if part.kind == "direct":
         return T
-    inverse = np.eye(4)
-    inverse[:3, :3] = T[:3, :3].T
-    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return inverse
+    return pose(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
 
 
 def _make_symmetric(blocks: Array) -> None:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from gtsam_rwhec.files.terminal_text import counted
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
@@ -88,8 +89,8 @@ class Identifiability:
 
     def __str__(self) -> str:
         if not self.is_unique:
-            number = len(self.free_directions)
-            return f"The measurements leave {number} direction{'s' if number > 1 else ''} free; see free_directions."
+            left = counted(len(self.free_directions), "direction")
+            return f"The measurements leave {left} free; see free_directions."
         alone, number = sum(pair.is_unique for pair in self.pairs.values()), len(self.pairs)
         if number == 1:
             return "The pair's measurements determine both of its frames."

@@ -70,8 +70,8 @@ def gram(family: Array, W: Array, V: Array) -> Array:
     return result.reshape(n * c, n * c)
 
 
-#: Where Z is above this much of P, the verified test succeeds despite rounding.
-ENOUGH = 1e-2
+#: Where Z is above this much of P, the verified test succeeds despite rounding: then no more steps are made.
+ENOUGH, MOST_STEPS = 1e-2, 60
 
 
 def null_multipliers(R: Array) -> Array:
@@ -99,7 +99,7 @@ def stationary_multipliers(gradient: Array, R: Array, multipliers: Array) -> Arr
     return result
 
 
-def improve(Q: Array, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
+def improve(Q: Array, R: Array, multipliers: Array) -> tuple[Array, float]:
     """Maximise t with z'Z z >= t z'P z for all z with z'P x = 0, over the multipliers that keep Z x = 0.
 
     R (n, 3, 3) is a critical point. Z x is zero at the given multipliers (n, 20) and at the returned ones. A positive t
@@ -110,16 +110,11 @@ def improve(Q: Array, R: Array, multipliers: Array, max_iterations: int = 60) ->
     Z = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z = 0.5 * (Z + Z.T)
     Z[-1, -1] -= float(x @ Z @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
-    return maximise(Z, Q, R, multipliers, max_iterations)
+    return maximise(Z, Q, R, multipliers)
 
 
-def maximise(
-    Z: Array, Q: Array, R: Array, multipliers: Array, max_iterations: int = 60, enough: float = ENOUGH
-) -> tuple[Array, float]:
-    """The same for any Z with Z x = 0, over x = [vec R, 1], which is Z at the given multipliers; P is made of Q.
-
-    It stops when t is above ``enough``.
-    """
+def maximise(Z: Array, Q: Array, R: Array, multipliers: Array) -> tuple[Array, float]:
+    """The same for any Z with Z x = 0, over x = [vec R, 1], which is Z at the given multipliers; P is made of Q."""
     n = len(R)
     null = null_multipliers(R)
     family = np.einsum("nmk,kpq->nmpq", null, CONSTRAINTS)
@@ -143,7 +138,7 @@ def maximise(
     y = np.zeros(14 * n)
     weight = 0.0  # of the barrier
     best = (multipliers, -np.inf)
-    for _ in range(max_iterations):
+    for _ in range(MOST_STEPS):
         Z = Z0 + scatter(np.einsum("nm,nmpq->npq", y.reshape(n, 14), family))
         try:
             factor = scipy.linalg.cho_factor(Z - t * P, lower=True, check_finite=False)
@@ -154,7 +149,7 @@ def maximise(
         if t > best[1]:
             added = np.einsum("nm,nmk->nk", y.reshape(n, 14), null)
             best = (multipliers - scale * added, t)
-        if t > enough:
+        if t > ENOUGH:
             break
         # Newton on -t - weight log det(Z(y) - t P).
         WP = W @ P

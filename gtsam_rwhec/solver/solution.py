@@ -12,6 +12,7 @@ from scipy.special import chdtr, chdtrc
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError, WeightsWarning
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.terminal_text import counted
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.knowledge import ScaleMode, checked_scale
@@ -81,7 +82,7 @@ class Solution:
         """The size of the problem: "16 targets, 8 sensors, 73 pairs, 3230 measurements"."""
         of_pairs = [residual.number_of_measurements for residual in self.residuals.values()]
         counts = {"target": len(self.X), "sensor": len(self.Y), "pair": len(of_pairs), "measurement": sum(of_pairs)}
-        return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for word, number in counts.items())
+        return ", ".join(counted(number, word) for word, number in counts.items())
 
     def __str__(self) -> str:
         if isinstance(self.scale, dict):

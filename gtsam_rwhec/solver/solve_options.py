@@ -11,9 +11,9 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, some
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
-from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, check_kind, is_one_of, is_real, is_whole
 from gtsam_rwhec.problem.knowledge import checked_scale, difference
 from gtsam_rwhec.problem.problem import Problem
 
@@ -67,18 +67,15 @@ ROUNDING = 1e-9
 
 def check_types(problem: Problem, options: SolveOptions | None, progress: Progress | None = None) -> None:
     """Raise an ``OptionError`` for a problem, options or progress of a wrong type."""
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
-    if options is not None and not isinstance(options, SolveOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.SolveOptions")
+    check_kind(problem, Problem, "the problem", "a gtsam_rwhec.Problem")
+    check_kind(options, SolveOptions | None, "options", "a gtsam_rwhec.SolveOptions")
     check_progress(progress)
 
 
 def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
     """Raise an error for an answer that lacks a frame, or contradicts a fixed frame or scale of the problem."""
     for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
-        if not isinstance(poses, Mapping):
-            raise OptionError(f"{what} is a {type(poses).__name__}; give poses by name: {{name: pose}}")
+        check_kind(poses, Mapping, what, "poses by name: {name: pose}")
         strange = [name for name in poses if not isinstance(name, str)]
         if strange:
             raise FrameError(f"{what} has the name {brief(strange[0])}; names are strings: {{name: pose}}")
@@ -134,6 +131,4 @@ def _check_scale(problem: Problem, scale: Scale) -> None:
 
 def _listed(names: Iterable[object]) -> str:
     """Names for a message: the first ten."""
-    known = list(map(brief, names))
-    more = f" and {len(known) - 10} more" if len(known) > 10 else ""
-    return (", ".join(known[:10]) + more) or "none"
+    return some(list(map(brief, names)), 10) or "none"

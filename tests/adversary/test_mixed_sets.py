@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from mixed_sets import exact_cost, mixed_set
+from mixed_sets import exact_cost, mixed_set, solved
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import NotUniqueWarning
 from gtsam_rwhec.solver.answers import parts_about
 
 RUN = 10
 #: Mixed sets are proven to this relative gap.
 PROVEN = 1e-12
-
-
-def solved(problem: rw.Problem) -> rw.Solution:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
-        return rw.solve(problem)
 
 
 @pytest.mark.parametrize("first", range(0, 40, RUN))

@@ -57,8 +57,7 @@ def solved(seeds: range, *, sane: bool, kind: str = "", most: int = 1000) -> Ite
         size = sum(len(batch.A) for batch in case.batches)
         if not case.is_exact or not case.keep_measurements or size > most or (kind and case.kind != kind):
             continue
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             try:
                 problem = case.problem()
                 solution = case.solution(problem)

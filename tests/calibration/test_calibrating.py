@@ -20,8 +20,7 @@ from gtsam_rwhec.simulate import Noise
 
 def test_a_good_problem_is_to_be_used_and_its_truth_is_inside() -> None:
     simulated = rig()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         calibration = rw.calibrate(simulated.problem)
     assert calibration.verdict is rw.Verdict.USE
     assert calibration.judgement.grounds == ()
@@ -283,8 +282,7 @@ def test_motions_alone_say_nothing_of_an_empty_mean() -> None:
     problem = rw.Problem()
     noise = 1e-3 * np.random.default_rng(4).normal(size=(len(A), 6))
     problem.add_motion("camera", A, np.linalg.inv(Y) @ A @ Y @ se3.expmap(noise))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
+    with warnings.catch_warnings(action="error", category=RuntimeWarning):
         calibration = rw.calibrate(problem)
     assert calibration.contains("camera", Y, 0.9999)
 

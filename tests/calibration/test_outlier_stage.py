@@ -163,8 +163,7 @@ def test_outliers_that_pull_the_fit_of_all_beyond_any_sensor_are_left_out() -> N
         return B
 
     problem = copied(simulated.problem, B=exchanged)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.WeightsWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.WeightsWarning):
         assert implausible(problem, rw.solve(problem)) is not None
     calibration = rw.calibrate(problem)
     assert calibration.implausible is None

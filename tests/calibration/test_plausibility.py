@@ -84,8 +84,7 @@ def test_millimetres_in_both_are_seen_in_the_lengths_alone() -> None:
 def test_a_distant_origin_is_no_doubt() -> None:
     good = general(2, 1, seed=0, noise=NOISE).problem
     far = rw.Problem()
-    T = np.eye(4)
-    T[:3, 3] = [2e5, -1e6, 3e5]
+    T = se3.pose(np.eye(3), [2e5, -1e6, 3e5])
     for pair in good.pairs:
         raw = good.measurements(*pair)
         far.add(*pair, raw.A @ T, raw.B, raw.sigma, raw.kappa)

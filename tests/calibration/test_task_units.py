@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from refinement_problems import rig
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, ball_radius, ellipsoid, point_sentence, views_of
@@ -196,8 +197,7 @@ def test_a_point_behind_a_camera_is_refused() -> None:
     mean = raw.B[:, :3, 3].mean(axis=0)
     z = mean / np.linalg.norm(mean)
     x = np.linalg.svd(z[None])[2][1]
-    turn = np.eye(4)
-    turn[:3, :3] = np.stack([x, np.cross(z, x), z])
+    turn = se3.pose(np.stack([x, np.cross(z, x), z]), np.zeros(3))
     ahead = turn @ raw.B
     kept = ahead[:, 2, 3] > 0.0
     problem = rw.Problem(sensor_carrier="hand", target_carrier="base")

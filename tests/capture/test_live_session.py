@@ -6,6 +6,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,12 @@ def words(session: Session) -> str:
     return "\n".join(each for _, _, each in session.state()["said"])
 
 
-async def ended(session: Session, running: asyncio.Task[None]) -> None:
+@asynccontextmanager
+async def at_work(source: Given, folder: Path) -> AsyncIterator[Session]:
+    """A session while it runs; at the end it is stopped, and has ended."""
+    session = Session(source, source.rig, folder, LiveOptions())
+    running = asyncio.create_task(session.run())
+    yield session
     session._stopping.set()
     await running
 
@@ -132,31 +138,29 @@ def test_taken_undone_and_gone_on_with(tmp_path: Path) -> None:
 
     async def first() -> None:
         source = Given(rig_file, messages[:100], messages[100:])
-        session = Session(source, rig_file, tmp_path, LiveOptions())
-        running = asyncio.create_task(session.run())
-        await until(session, lambda s: s.streams.number == 100)
-        with pytest.raises(RwhecError, match="there is no take to undo"):
+        async with at_work(source, tmp_path) as session:
+            await until(session, lambda s: s.streams.number == 100)
+            with pytest.raises(RwhecError, match="there is no take to undo"):
+                await session.command("undo")
+            with pytest.raises(RwhecError, match="there is no command 'jump'"):
+                await session.command("jump")
+            await session.command("take")
+            source.go_on.set()
+            await until(session, lambda s: take_count(s) == 1)
+            with pytest.raises(LogError, match="another session"):
+                Takes(tmp_path)
+            (take,) = session.takes.all
+            with open_log(take.path) as log:
+                topics = {topic.name: topic.count for topic in log.topics()}
+                assert topics["/cam_0/tags"] == topics["/cam_1/tags"] == 1
+                assert topics["/live/cam_0/detections"] == 1
+                assert topics["/tf"] >= 25
+                assert log.losses == []
             await session.command("undo")
-        with pytest.raises(RwhecError, match="there is no command 'jump'"):
-            await session.command("jump")
-        await session.command("take")
-        source.go_on.set()
-        await until(session, lambda s: take_count(s) == 1)
-        with pytest.raises(LogError, match="another session"):
-            Takes(tmp_path)
-        (take,) = session.takes.all
-        with open_log(take.path) as log:
-            topics = {topic.name: topic.count for topic in log.topics()}
-            assert topics["/cam_0/tags"] == topics["/cam_1/tags"] == 1
-            assert topics["/live/cam_0/detections"] == 1
-            assert topics["/tf"] >= 25
-            assert log.losses == []
-        await session.command("undo")
-        assert not take.path.exists()
-        assert "take 1 undone" in words(session)
-        await session.command("take")
-        source.go_on.set()  # nothing more comes, so nothing is taken
-        await ended(session, running)
+            assert not take.path.exists()
+            assert "take 1 undone" in words(session)
+            await session.command("take")
+            source.go_on.set()  # nothing more comes, so nothing is taken
 
     asyncio.run(first())
     unfinished = tmp_path / "takes" / ".0001.mcap.1.part"
@@ -178,16 +182,14 @@ def test_a_take_without_targets_and_one_of_another_time_are_refused(tmp_path: Pa
     async def run() -> Session:
         seen = tag(0, np.eye(4), corners_px=np.array([[0, 0], [9, 0], [9, 9], [0, 9.0]]))
         source = Given(rig_file, at(10, seen), at(11, stranger), at(12, seen), at(5, seen))
-        session = Session(source, rig_file, tmp_path, LiveOptions())
-        running = asyncio.create_task(session.run())
-        await until(session, lambda s: s.streams.number == 4)
-        for reason in ("no camera sees a target that counts", "take 1", "a clock was set back"):
-            await session.command("take")
-            source.go_on.set()
-            await until(session, lambda s, reason=reason: reason in words(s))
-        assert take_count(session) == 1
-        assert any("clock set back" in each for each in session.state()["counted"])
-        await ended(session, running)
+        async with at_work(source, tmp_path) as session:
+            await until(session, lambda s: s.streams.number == 4)
+            for reason in ("no camera sees a target that counts", "take 1", "a clock was set back"):
+                await session.command("take")
+                source.go_on.set()
+                await until(session, lambda s, reason=reason: reason in words(s))
+            assert take_count(session) == 1
+            assert any("clock set back" in each for each in session.state()["counted"])
         return session
 
     asyncio.run(run())
@@ -199,20 +201,18 @@ def test_a_full_disk_is_said_and_leaves_nothing(tmp_path: Path, monkeypatch: pyt
 
     async def run() -> None:
         source = Given(rig_file, messages[:60], messages[60:])
-        session = Session(source, rig_file, tmp_path, LiveOptions())
-        running = asyncio.create_task(session.run())
-        await until(session, lambda s: s.streams.number == 60)
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
-        try:
-            await session.command("take")
-            source.go_on.set()
-            await until(session, lambda s: "not taken" in words(s))
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        assert "cannot be written: File too large" in words(session)
-        assert list((tmp_path / "takes").glob("*.mcap")) == []
-        await ended(session, running)
+        async with at_work(source, tmp_path) as session:
+            await until(session, lambda s: s.streams.number == 60)
+            before = resource.getrlimit(resource.RLIMIT_FSIZE)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
+            try:
+                await session.command("take")
+                source.go_on.set()
+                await until(session, lambda s: "not taken" in words(s))
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, before)
+            assert "cannot be written: File too large" in words(session)
+            assert list((tmp_path / "takes").glob("*.mcap")) == []
 
     asyncio.run(run())
 
@@ -232,12 +232,12 @@ def test_a_rig_file_of_another_robot_is_named(tmp_path: Path) -> None:
 
     async def run() -> None:
         source = Given(other, [transform(stamp, "world", "tool0", np.eye(4))])
-        session = Session(source, other, tmp_path, LiveOptions())
-        running = asyncio.create_task(session.run())
-        await until(session, lambda s: any("is the rig file of this robot?" in each for each in s.state()["troubles"]))
-        session._lacks_since_s -= 10.0
-        lacking = session.state()["troubles"]
-        assert any("no topic /cam_0/tags. Topics there: /tf (foxglove.FrameTransforms)" in each for each in lacking)
-        await ended(session, running)
+        async with at_work(source, tmp_path) as session:
+            await until(
+                session, lambda s: any("is the rig file of this robot?" in each for each in s.state()["troubles"])
+            )
+            session._lacks_since_s -= 10.0
+            lacking = session.state()["troubles"]
+            assert any("no topic /cam_0/tags. Topics there: /tf (foxglove.FrameTransforms)" in each for each in lacking)
 
     asyncio.run(run())

@@ -33,8 +33,7 @@ def measured(true: TrueCell, count: int) -> rw.Problem:
 def test_a_calibration_predicts_with_its_own_covariance_and_noise() -> None:
     true = cell("hand", 2)
     problem = measured(true, 9)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         calibration = rw.calibrate(problem, rw.CalibrateOptions(observations="poses"))
     plan = rw.plan(calibration, replace(true.options, present=None, candidates=60, wanted=rw.Accuracy(1e-6, 0.8)))
     now = calibration.uncertainty_at([0.0, 0.0, 0.8], "cam_0").radius_mm
@@ -54,8 +53,7 @@ def test_a_floor_of_constant_errors_is_the_reason_why_an_accuracy_is_never_reach
     constant = ((1e-3,) * 3 + (1e-3,) * 3, (1e-3,) * 3 + (1e-3,) * 3)
     floor = constant_covariance(refined, constant)
     assert np.linalg.matrix_rank(floor) == 12
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         calibration = rw.calibrate(problem, rw.CalibrateOptions(observations="poses"))
     assert calibration.refined is not None
     model = calibration.noise.model

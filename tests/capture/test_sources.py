@@ -17,6 +17,7 @@ from foxglove_robot import Robot, messages_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CELL, EXAMPLES
+from rwhec_factors import se3
 from stations import stations
 from synthetic_logs import rig, write
 from websockets.asyncio.server import ServerConnection, serve
@@ -130,8 +131,7 @@ def test_a_robot_s_messages_come_by_foxglove_s_own_server() -> None:
     ("encodings", "schema"), [(["cdr", "json"], "geometry_msgs/msg/PoseStamped"), (["json"], "foxglove.PoseInFrame")]
 )
 def test_a_pose_is_published(encodings: list[str], schema: str) -> None:
-    T = np.eye(4)
-    T[:3, 3] = 0.1, -0.2, 0.75
+    T = se3.pose(np.eye(3), (0.1, -0.2, 0.75))
     with Robot(messages_of(CELL / "eye_to_hand.mcap")[:5], supported_encodings=encodings) as robot:
 
         async def run() -> None:

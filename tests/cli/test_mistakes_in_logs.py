@@ -13,6 +13,7 @@ import pytest
 import synthetic_logs as made
 from given_commands import command
 from places import DEMO
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -35,8 +36,7 @@ def moved(message: made.Message) -> made.Message:
         if part["id"] == "1":
             at, turn = part["pose"]["position"], part["pose"]["orientation"]
             R = Rotation.from_quat([turn[key] for key in "xyzw"])
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R.as_matrix(), [at[key] for key in "xyz"]
+            T = se3.pose(R.as_matrix(), [at[key] for key in "xyz"])
             part = made.tag(1, T @ made.pose((0, 0, 25), (0.1, 0.03, 0.0)))
         parts.append(part)
     return dataclasses.replace(message, content=message.content | {"detections": parts})

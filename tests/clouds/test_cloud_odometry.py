@@ -206,8 +206,7 @@ def test_sweeps_without_times_or_out_of_order_are_said(recorded: dict[str, list[
                 assert cloud.stamp_ns is not None
                 plain = replace(cloud, times_s=None)
                 out.point_cloud(record_of_cloud(plain, f"/{name}/points", cloud.stamp_ns, name))
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as said:
         rig = parse_rig(RIG, "rig.yaml")
         detect_log(log, rig, tmp_path / "detected.mcap")
     assert any("points have no times. So" in str(each.message) for each in said)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import http.server
-import importlib.util
 import shutil
 import socket
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from places import DATA
+from places import DATA, script
 from web_server import served
 
 import gtsam_rwhec as rw
@@ -198,12 +197,7 @@ def test_a_destination_that_is_a_file(server: Server, tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def make_demo() -> ModuleType:
     """The script ``data/make_demo.py``."""
-    specification = importlib.util.spec_from_file_location("make_demo", DATA / "make_demo.py")
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+    return script(DATA / "make_demo.py")
 
 
 def test_the_script_makes_the_same_files_again(make_demo: ModuleType, tmp_path: Path) -> None:

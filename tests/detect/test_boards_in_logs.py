@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cells_of_others import UNKNOWN_LENS
 from rendered import PINHOLE, pose, printed, render
 from rwhec_factors import se3
 
@@ -85,15 +86,6 @@ def test_turns_that_a_camera_without_poses_cannot_tell_are_ambiguous(log_path: P
         assert {record.reason for record in found[sensor].records} == {Rejection.AMBIGUOUS}
 
 
-BENT_RIG = """\
-carriers: {sensors: hand, targets: base, poses: {frames: [base, hand]}}
-sensors:
-  camera: {images: images, poses: poses.csv, intrinsics: estimate}
-targets:
-  board: {type: checkerboard, inner_corners: [5, 4], square_m: 0.05}
-"""
-
-
 def test_boards_that_a_lens_bends_are_read(tmp_path: Path) -> None:
     """No image of the board passes as a pinhole's: its corners, although rejected, say how the lens bends."""
     lens = Camera.of(320, 240, "radtan", [[280, 0, 161], [0, 279, 119], [0, 0, 1]], (-0.28, 0.09, 8e-4, -5e-4), "test")
@@ -105,7 +97,7 @@ def test_boards_that_a_lens_bends_are_read(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("\n".join(rows) + "\n")
     for i, image in enumerate(images):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image)
-    rig = parse_rig(BENT_RIG, "rig.yaml")
+    rig = parse_rig(UNKNOWN_LENS, "rig.yaml")
     write_folder_log(tmp_path, rig, tmp_path / "log.mcap")
     pinhole = Camera.of(320, 240, "pinhole", lens.K, (), "test")
     (as_pinhole,) = Detector(pinhole, rig.target_list)(images[:1])

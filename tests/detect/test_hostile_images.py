@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -20,12 +20,6 @@ from gtsam_rwhec.logs.records import ImageRecord
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SIDE = 16_384
-
-
-@pytest.fixture(scope="module")
-def reader() -> Iterator[Reader]:
-    with Reader() as process:
-        yield process
 
 
 def part(kind: bytes, content: bytes) -> bytes:

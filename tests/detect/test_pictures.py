@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from rendered import PINHOLE
+from rwhec_factors import se3
 
 from gtsam_rwhec.detect.contact_sheet import (
     ACROSS,
@@ -92,8 +93,7 @@ def test_rejected_ones_have_another_form_too() -> None:
 
 
 def test_reasons_axes_and_captions_are_written() -> None:
-    T = np.eye(4)
-    T[:3, 3] = (0.0, 0.0, 0.5)
+    T = se3.pose(np.eye(3), (0.0, 0.0, 0.5))
     plain, posed = draw(GRAY, [record()], PINHOLE), draw(GRAY, [record(T=T)], PINHOLE)
     assert (posed != plain).any()
     assert (draw(GRAY, [record(reason="small")], PINHOLE) != draw(GRAY, [record(reason="grazing")], PINHOLE)).any()

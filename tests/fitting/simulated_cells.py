@@ -1,7 +1,7 @@
 """Cells with fixed cameras and a board on the hand, whose truth is known: corners are drawn with their noise.
 
-Then boards in other places, boards that were misprinted, carriers that move while images are taken, and a model of the
-corners with a point near the truth."""
+Then boards in other places, boards that were misprinted, carriers that move while images are taken, a model of the
+corners with a point near the truth, and what its graph and its sums are compared with."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors import se3
@@ -16,6 +17,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.cameras.targets import Checkerboard
 from gtsam_rwhec.fitting.corner_model import Model, Point
+from gtsam_rwhec.fitting.corner_noise import Reduced
 from gtsam_rwhec.fitting.corner_refinement import refine_corners
 from gtsam_rwhec.fitting.corner_residuals import shaped, stacks_of
 from gtsam_rwhec.fitting.corners_refined import CornersRefined
@@ -263,3 +265,34 @@ def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = 
     X, Y = small.near(rng, 1e-3)
     cameras_at = {name: cameras[name].parameters * (1.0 + 1e-3) for name in names}
     return model, Point(X, Y, moved, cameras_at, {"board": np.full(4, 5e-4)})
+
+
+def slopes(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, key: int, size: int = 6, step: float = 1e-7
+) -> Array:
+    """The derivative (size,) of a graph's cost by one variable, by differences."""
+    found = []
+    for direction in step * np.eye(size):
+        ends = []
+        for sign in (1.0, -1.0):
+            delta = gtsam.VectorValues()
+            delta.insert(key, sign * direction)
+            ends.append(graph.error(values.retract(delta)))
+        found.append((ends[0] - ends[1]) / (2.0 * step))
+    return np.array(found)
+
+
+def information_by_instant(reduced: Reduced) -> Array:
+    """(d, d): of all unknowns but A, whose errors are eliminated instant by instant."""
+    s2 = CORNER_PX**2
+    H = reduced.G / s2 + reduced.prior
+    for C, M in zip(reduced.C, reduced.M, strict=True):
+        H -= C.T @ np.linalg.solve(np.diag(A_NOISE**-2.0) + M / s2, C) / s2**2
+    return H
+
+
+def check_inverse(covariance: Array, information: Array) -> None:
+    """They are inverse to each other, in units of the deviations."""
+    size = np.sqrt(np.diagonal(covariance))
+    scale = np.outer(size, size)
+    np.testing.assert_allclose(covariance / scale, np.linalg.inv(information) / scale, rtol=1e-6, atol=1e-6)

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from refinement_problems import KAPPA, SIGMA_M, copied, distance, refined, rig
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.fitting.pair_data import PairData, carrier_covariances
@@ -119,8 +120,7 @@ def test_bad_carrier_noise(noise: object, error: type[Exception], words: str) ->
 
 
 def test_noise_about_an_origin_a_thousand_kilometres_away_is_refused() -> None:
-    far = np.eye(4)
-    far[:3, 3] = (1e6, -1e6, 1e6)
+    far = se3.pose(np.eye(3), (1e6, -1e6, 1e6))
     problem = copied(rig(2, 2, seed=3).problem, A=lambda pair, raw: raw.A @ np.linalg.inv(far))
     with pytest.raises(rw.errors.NoiseError, match="about the other carrier"):
         refined(problem, carrier_noise=rw.CarrierNoise(rotation_rad=1e-3, translation_m=1e-3))

@@ -18,8 +18,7 @@ KINDS = [("point_0",), ("plane_0",), ("tag_0", "point_1", "plane_2", "motions_3"
 
 
 def refined(problem: rw.Problem, **options: object) -> rw.Refined:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
         return rw.refine(problem, rw.solve(problem), rw.RefineOptions(**options))  # type: ignore[arg-type]
 
 
@@ -31,8 +30,7 @@ def squared_error(answer: rw.Refined, truth: np.ndarray) -> float:
 @pytest.mark.parametrize("things", KINDS)
 def test_the_refined_answer_is_the_certified_one_where_noise_is_given(things: tuple[str, ...]) -> None:
     of = mixed_set(1, things, scale="known")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
+    with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):
         found = rw.solve(of.problem)
     answer = refined(of.problem, noise="given")
     assert answer.cost == pytest.approx(found.cost, rel=1e-3)  # chords are not angles
@@ -80,8 +78,7 @@ def test_outliers_among_them_are_found(things: tuple[str, ...]) -> None:
     measurements = {pair: of.problem.measurements(*pair) for pair in of.problem.pairs}
     for raw in measurements.values():
         raw.B[:3, :3, 3] += 0.3 * raw.B[:3, :3, 2] + 0.1
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         for noise in ("given", "estimate"):
             options = rw.RefineOptions(robust="gnc", noise=noise)
             answer = rw.refine(of.problem.with_measurements(measurements), None, options)

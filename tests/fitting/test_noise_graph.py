@@ -265,8 +265,7 @@ def refined(task: Task, found: Settled, solution: rw.Solution, options: RefineOp
 
 def test_it_is_the_graphs_optimum() -> None:
     task, found, solution = of_two_targets()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         result = refined(task, found, solution)
     assert result.cost == pytest.approx(result.graph.error(result.values), rel=1e-6)
     assert result.cost < result.initial_cost
@@ -305,35 +304,29 @@ def test_noise_of_pairs_is_that_of_b() -> None:
         assert noise.degrees_of_freedom == (17.0, 17.0)
 
 
+def away(task: Task, found: Settled, rad: float) -> Settled:
+    """What was found, with the first frame turned."""
+    there = moved(found.state, task.variables, task.layout, np.r_[np.full(3, rad), np.zeros(len(task.layout.unit) - 3)])
+    return replace(found, state=there, model=task.model_like(found.model, there))
+
+
 def test_the_optimum_is_found_from_elsewhere() -> None:
     task, found, solution = of_two_targets()
-    change = np.zeros(len(task.layout.unit))
-    change[:3] = 0.05
-    there = moved(found.state, task.variables, task.layout, change)
-    result = refined(task, replace(found, state=there, model=task.model_like(found.model, there)), solution)
+    result = refined(task, away(task, found, 0.05), solution)
     for name, pose in (result.X | result.Y).items():
         assert pose.equals(result.values.atPose3(result.keys[name]), 1e-5)
 
 
 def test_steps_that_do_not_end_are_said() -> None:
     task, found, solution = of_two_targets()
-    change = np.zeros(len(task.layout.unit))
-    change[:3] = 0.5
-    there = moved(found.state, task.variables, task.layout, change)
     with pytest.warns(NotConvergedWarning, match="standard deviations"):
-        refined(
-            task, replace(found, state=there, model=task.model_like(found.model, there)), solution,
-            RefineOptions(max_iterations=1),
-        )  # fmt: skip
+        refined(task, away(task, found, 0.5), solution, RefineOptions(max_iterations=1))
 
 
 def test_steps_that_become_no_shorter_end(monkeypatch: pytest.MonkeyPatch) -> None:
     task, found, solution = of_two_targets()
-    change = np.zeros(len(task.layout.unit))
-    change[:3] = 0.05
-    there = moved(found.state, task.variables, task.layout, change)
-    model = task.model_like(found.model, there)
-    monkeypatch.setattr(Task, "model_like", lambda *_: model)  # so each step is as long as the first
+    found = away(task, found, 0.05)
+    monkeypatch.setattr(Task, "model_like", lambda *_: found.model)  # so each step is as long as the first
     with pytest.warns(NotConvergedWarning, match="standard deviations"):
-        result = refined(task, replace(found, state=there, model=model), solution)
+        result = refined(task, found, solution)
     assert result.iterations == graphs.IN_A_CIRCLE

@@ -187,8 +187,7 @@ def test_a_prior_makes_the_free_direction_finite() -> None:
     simulation = rig(1, 1, seed=2, motion="planar", number_of_measurements=40)
     simulation.problem.add_prior("target0", simulation.X["target0"], sigma=0.01)
     for residual in ("chordal", "geodesic"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", rw.errors.NotUniqueWarning)
+        with warnings.catch_warnings(action="error", category=rw.errors.NotUniqueWarning):
             r = rw.refine(simulation.problem, rw.solve(simulation.problem), rw.RefineOptions(residual=residual))
         deviations = r.standard_deviations("target0")[1]
         assert deviations.max() < 10.1  # no wider than the prior, in mm
@@ -234,8 +233,7 @@ def test_per_target_scales_under_the_exact_model(residual: str) -> None:
             noise=Noise(0.01, 0.5 / np.radians(5.0) ** 2),
             number_of_measurements=30,
         )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
             solution = rw.solve(simulation.problem)
             r = rw.refine(simulation.problem, solution, rw.RefineOptions(residual=residual))
         truth = simulation.scale["target0"]
@@ -263,8 +261,7 @@ def test_motions_and_mixed_problems() -> None:
 
 def test_a_world_origin_far_away_changes_nothing() -> None:
     problem = rig(seed=2).problem
-    shift = np.eye(4)
-    shift[:3, 3] = (4e5, -7e5, 2e5)
+    shift = se3.pose(np.eye(3), (4e5, -7e5, 2e5))
     far = copied(problem, A=lambda pair, raw: raw.A @ np.linalg.inv(shift))
     near, away = refined(problem, residual="chordal"), refined(far, residual="chordal")
     for name in ("sensor0", "sensor1"):
@@ -302,8 +299,7 @@ def test_noise_given_too_small_is_warned_of_and_estimated_noise_is_not() -> None
         solution = rw.solve(problem)
     with pytest.warns(rw.errors.WeightsWarning, match=r"standard deviations are too small by about \d"):
         rw.refine(problem, solution, rw.RefineOptions(noise="given"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         rw.refine(problem, solution, rw.RefineOptions(noise="estimate"))
         rw.refine(rig(seed=4).problem, rw.solve(rig(seed=4).problem))
 

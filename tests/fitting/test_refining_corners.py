@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from simulated_cells import CAMERA, Cell, cell
 
@@ -21,8 +20,6 @@ from gtsam_rwhec.fitting.held_out import held_out_errors
 from gtsam_rwhec.fitting.observations import Views
 from gtsam_rwhec.fitting.readmission import agreeing_by_corners
 from gtsam_rwhec.fitting.stated_intrinsics import CameraPrior, innovation_of, wider
-
-Array = NDArray[np.float64]
 
 
 def squared_deviations(given: Cell, result: rw.CornersRefined) -> tuple[float, int]:

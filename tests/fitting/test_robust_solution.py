@@ -178,8 +178,7 @@ def test_priors_decide_between_two_targets_that_are_seen_as_often() -> None:
         told = selected(problem, {})
         told.add_prior("target0", answer.X["target0"], sigma=0.002, kappa=1e5)
         told.add_prior("sensor0", answer.Y["sensor0"], sigma=0.002, kappa=1e5)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", OutliersWarning)
+        with warnings.catch_warnings(action="ignore", category=OutliersWarning):
             found = robust_solution(told)
         agreeing = found.inliers["target0", "sensor0"] == good["target0", "sensor0"]
         assert agreeing.mean() > 0.95 if wanted else agreeing.mean() < 0.05
@@ -224,8 +223,7 @@ def test_refine_needs_no_plain_solution() -> None:
 def test_from_three_measurements_all_count(scale: Any) -> None:
     """Graduation of three measurements, whose noise was estimated on the way, had not returned after 280 s."""
     problem = general(1, 1, seed=0, number_of_measurements=3, noise=NOISE, scale=scale).problem
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as told:
         found = robust_solution(problem, noise_scale="estimate")
     assert all(mask.all() for mask in found.inliers.values())
     words = [str(warning.message) for warning in told]
@@ -245,8 +243,7 @@ def test_nothing_is_certified_on_the_way_and_fits_are_bounded(monkeypatch: pytes
         fits.clear()
         simulation = general(3, 2, seed=seed, number_of_measurements=6, noise=noise)
         problem, _ = corrupted(simulation, 0.4, "random", seed, noise, weights="unit")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             robust_solution(problem, noise_scale="estimate")
         assert len(solved) == 1
         assert len(fits) <= MAX_GRADUATIONS + (4 + MAX_VOTES) * MAX_FITS + MAX_ADMISSIONS + 1
@@ -278,8 +275,7 @@ def test_identifiability_is_that_of_what_is_kept() -> None:
     problem, good = corrupted(simulation, 0.4, "random", 0, NOISE, weights="unit")
     with pytest.warns(NotUniqueWarning):
         assert not rw.solve(problem).certificate.is_certified
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", NotUniqueWarning)
+    with warnings.catch_warnings(action="error", category=NotUniqueWarning):
         found = robust_solution(problem, noise_scale="estimate")
     assert wrongly_classed(found, good) == (0, 0)
     assert found.solution.certificate.is_certified
@@ -364,8 +360,7 @@ def test_the_real_dataset_with_thirty_percent_corrupted(utias_folder: object) ->
         bad[pair] = generator.random(len(raw.B)) < 0.3
         wrong = random_poses(len(raw.B), 2.0, generator)
         spoilt.add(*pair, raw.A, np.where(bad[pair][:, None, None], wrong, raw.B))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OutliersWarning)
+    with warnings.catch_warnings(action="ignore", category=OutliersWarning):
         found = robust_solution(spoilt, noise_scale="estimate")
         clean = robust_solution(selected(spoilt, {pair: ~mask for pair, mask in bad.items()}), noise_scale="estimate")
     assert sum(int((found.inliers[pair] & bad[pair]).sum()) for pair in bad) == 0

@@ -118,11 +118,11 @@ def hand_at(t_s: Array, phase: Array) -> Array:
     """T_base_hand (N, 4, 4): above the table, looking down, swinging about all axes."""
     s = 2.0 * np.pi * t_s[:, None]
     swing = np.array([12.0, 11.0, 40.0]) * np.sin(np.array([0.31, 0.23, 0.17]) * s + phase[:3])
-    T = np.tile(np.eye(4), (len(t_s), 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("x", 180, degrees=True).as_matrix() @ (
-        Rotation.from_euler("xyz", swing, degrees=True).as_matrix()
+    T = se3.pose(
+        Rotation.from_euler("x", 180, degrees=True).as_matrix()
+        @ (Rotation.from_euler("xyz", swing, degrees=True).as_matrix()),
+        np.array([0.1, 0.1, 0.15]) * np.sin(np.array([0.19, 0.27, 0.13]) * s + phase[3:]),
     )
-    T[:, :3, 3] = np.array([0.1, 0.1, 0.15]) * np.sin(np.array([0.19, 0.27, 0.13]) * s + phase[3:])
     T[:, 2, 3] += 1.25
     return T
 
@@ -154,18 +154,16 @@ def write_log(path: Path, Y: list[Array], X: list[Array], images: int, night: in
 
 
 def _tags(count: int, rng: np.random.Generator) -> list[Array]:
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3] = Rotation.from_euler(
-        "xyz", rng.uniform([-15, -15, -90], [15, 15, 90], (count, 3)), degrees=True
-    ).as_matrix()
-    T[:, :3, 3] = rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.03], (count, 3))
+    T = se3.pose(
+        Rotation.from_euler("xyz", rng.uniform([-15, -15, -90], [15, 15, 90], (count, 3)), degrees=True).as_matrix(),
+        rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.03], (count, 3)),
+    )
     return list(T)
 
 
 def _cameras(count: int, rng: np.random.Generator) -> list[Array]:
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3] = Rotation.from_euler(
-        "xyz", rng.uniform([-5, -5, -40], [5, 5, 40], (count, 3)), degrees=True
-    ).as_matrix()
-    T[:, :3, 3] = rng.uniform(-0.06, 0.06, (count, 3))
+    T = se3.pose(
+        Rotation.from_euler("xyz", rng.uniform([-5, -5, -40], [5, 5, 40], (count, 3)), degrees=True).as_matrix(),
+        rng.uniform(-0.06, 0.06, (count, 3)),
+    )
     return list(T)

@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
@@ -18,8 +19,7 @@ from gtsam_rwhec.fleet.fleet_rows import COLUMNS
 
 def row() -> fleet.RobotRow:
     """One with a number that needs all digits, and with infinite variances."""
-    T = np.eye(4)
-    T[:3, 3] = 0.1, 1.0 / 3.0, -2e-17
+    T = se3.pose(np.eye(3), (0.1, 1.0 / 3.0, -2e-17))
     covariance = np.full((6, 6), 1.0 / 7.0)
     covariance[0, 0], covariance[0, 1], covariance[1, 0] = math.inf, -math.inf, -math.inf
     return fleet.RobotRow(

@@ -158,8 +158,7 @@ def test_parts_are_cut_out_of_common_requests() -> None:
     content = np.random.default_rng(0).bytes(100_000)
     places = [(0, 10_000), (10_100, 9_000), (40_000, 50), (40_060, 5_000), (50_000, 50_000)]
     assert [len(each[2]) for each in topic_copy._joined(places)] == [2, 1, 1, 1]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         url = "memory://parts/log"
         stores.write_once(url, content)
         assert list(topic_copy._parts(url, places)) == [content[a : a + n] for a, n in places]

@@ -253,16 +253,14 @@ assert counts() == before, counts()
 def test_warnings_point_to_the_caller() -> None:
     """The decorator is a frame of its own between a function and its caller."""
     problem = general(1, 1, seed=0, motion="planar", noise=Noise(0.01, 500.0)).problem
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         rw.refine(problem, rw.solve(problem))
     assert {warning.category for warning in caught} == {NotUniqueWarning}
     noisy = general(1, 1, seed=0, number_of_measurements=30, noise=Noise(0.01, 500.0)).problem
     raw = noisy.measurements(*noisy.pairs[0])
     told = rw.Problem()
     told.add(*noisy.pairs[0], raw.A, raw.B, 1e-4, 1e6)
-    with warnings.catch_warnings(record=True) as also:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as also:
         rw.refine(told, rw.solve(told), rw.RefineOptions(max_iterations=1))
     assert WeightsWarning in {warning.category for warning in also}
     for warning in [*caught, *also]:

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from places import REPOSITORY
+from places import REPOSITORY, script
 
-_SPEC = importlib.util.spec_from_file_location("frame_drawings", REPOSITORY / "docs" / "building" / "frame_drawings.py")
-assert _SPEC is not None
-assert _SPEC.loader is not None
-drawings = importlib.util.module_from_spec(_SPEC)
-sys.modules["frame_drawings"] = drawings
-_SPEC.loader.exec_module(drawings)
-
+drawings = script(REPOSITORY / "docs" / "building" / "frame_drawings.py")
 PICTURES: Path = drawings.PICTURES
 
 

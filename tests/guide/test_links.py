@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import pytest
-from places import REPOSITORY
+from places import REPOSITORY, script
 
-_SPEC = importlib.util.spec_from_file_location("links_of_the_guide", REPOSITORY / "docs" / "building" / "links.py")
-assert _SPEC is not None
-assert _SPEC.loader is not None
-guide = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(guide)
-
+guide = script(REPOSITORY / "docs" / "building" / "links.py")
 PAGES = sorted(
     path
     for folder in (REPOSITORY, REPOSITORY / "docs", REPOSITORY / "factors", REPOSITORY / "examples")

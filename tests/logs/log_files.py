@@ -133,10 +133,10 @@ def json_log(path: Path, messages: list[Message], **options: Any) -> Path:
 
 
 def foxglove_protobuf() -> dict[str, Any]:
-    """Message classes foxglove.FrameTransform and what it uses, with Foxglove's names and numbers of fields."""
-    double, string, message = 1, 9, 11
+    """Message classes foxglove.FrameTransform, PointCloud and what they use, with Foxglove's names and numbers."""
+    double, uint32, string, message, data, enum = 1, 13, 9, 11, 12, 5
     file = descriptor_pb2.FileDescriptorProto(
-        name="foxglove/FrameTransform.proto", package="foxglove", syntax="proto3",
+        name="foxglove/Messages.proto", package="foxglove", syntax="proto3",
         dependency=["google/protobuf/timestamp.proto"],
     )  # fmt: skip
     layouts = {
@@ -149,11 +149,22 @@ def foxglove_protobuf() -> dict[str, Any]:
             ("translation", message, ".foxglove.Vector3"),
             ("rotation", message, ".foxglove.Quaternion"),
         ],
+        "Pose": [("position", message, ".foxglove.Vector3"), ("orientation", message, ".foxglove.Quaternion")],
+        "PackedElementField": [("name", string, ""), ("offset", uint32, ""), ("type", enum, "")],
+        "PointCloud": [
+            ("timestamp", message, ".google.protobuf.Timestamp"),
+            ("frame_id", string, ""),
+            ("pose", message, ".foxglove.Pose"),
+            ("point_stride", uint32, ""),
+            ("fields", message, ".foxglove.PackedElementField"),
+            ("data", data, ""),
+        ],
     }
     for name, fields in layouts.items():
         made = file.message_type.add(name=name)
         for number, (field, type_, type_name) in enumerate(fields, start=1):
-            made.field.add(name=field, number=number, label=1, type=type_, type_name=type_name or None)
+            label = 3 if field == "fields" else 1  # repeated, optional
+            made.field.add(name=field, number=number, label=label, type=type_, type_name=type_name or None)
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(timestamp_pb2.DESCRIPTOR.serialized_pb)
     pool.Add(file)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
-from log_files import json_log
+from log_files import foxglove_protobuf, json_log
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from read_logs import T0, read
 from ros_messages import bag, header
@@ -130,43 +129,9 @@ def test_a_damaged_cloud_is_named(tmp_path: Path, changed: dict[str, Any], words
         assert read(path) == []
 
 
-def point_cloud_class() -> Any:
-    """The message class foxglove.PointCloud, with Foxglove's names and numbers of fields."""
-    double, uint32, string, message_type, data, enum = 1, 13, 9, 11, 12, 5
-    file = descriptor_pb2.FileDescriptorProto(
-        name="foxglove/PointCloud.proto", package="foxglove", syntax="proto3",
-        dependency=["google/protobuf/timestamp.proto"],
-    )  # fmt: skip
-    layouts = {
-        "Vector3": [("x", double, "", 1), ("y", double, "", 1), ("z", double, "", 1)],
-        "Quaternion": [("x", double, "", 1), ("y", double, "", 1), ("z", double, "", 1), ("w", double, "", 1)],
-        "Pose": [
-            ("position", message_type, ".foxglove.Vector3", 1),
-            ("orientation", message_type, ".foxglove.Quaternion", 1),
-        ],
-        "PackedElementField": [("name", string, "", 1), ("offset", uint32, "", 1), ("type", enum, "", 1)],
-        "PointCloud": [
-            ("timestamp", message_type, ".google.protobuf.Timestamp", 1),
-            ("frame_id", string, "", 1),
-            ("pose", message_type, ".foxglove.Pose", 1),
-            ("point_stride", uint32, "", 1),
-            ("fields", message_type, ".foxglove.PackedElementField", 3),
-            ("data", data, "", 1),
-        ],
-    }  # fmt: skip
-    for name, fields in layouts.items():
-        made = file.message_type.add(name=name)
-        for number, (field, type_, type_name, label) in enumerate(fields, start=1):
-            made.field.add(name=field, number=number, label=label, type=type_, type_name=type_name or None)
-    pool = descriptor_pool.DescriptorPool()
-    pool.AddSerializedFile(timestamp_pb2.DESCRIPTOR.serialized_pb)
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.PointCloud"))
-
-
 @pytest.mark.parametrize("times", [1, 20_000])
 def test_foxglove_s_cloud_in_protobuf(tmp_path: Path, times: int) -> None:
-    made = point_cloud_class()(frame_id="camera", point_stride=12, data=POINTS.tobytes() * times)
+    made = foxglove_protobuf()["PointCloud"](frame_id="camera", point_stride=12, data=POINTS.tobytes() * times)
     made.timestamp.FromNanoseconds(T0)
     for i, axis in enumerate("xyz"):
         made.fields.add(name=axis, offset=4 * i, type=7)
@@ -180,7 +145,7 @@ def test_foxglove_s_cloud_in_protobuf(tmp_path: Path, times: int) -> None:
 
 
 def test_a_message_of_many_lists_is_refused_however_its_bytes_stand(tmp_path: Path) -> None:
-    made = point_cloud_class()(data=b"1" * 2_000_000)
+    made = foxglove_protobuf()["PointCloud"](data=b"1" * 2_000_000)
     for _ in range(600_000):
         made.fields.add()
     with open(tmp_path / "a.mcap", "wb") as stream, ProtobufWriter(stream) as writer:

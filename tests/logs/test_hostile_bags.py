@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -21,12 +21,6 @@ MIB = 1 << 20
 IMPORTS = 100 * MIB
 COMPRESS: dict[str, Callable[[bytes], bytes]] = {"none": bytes, "bz2": bz2.compress, "lz4": lz4.frame.compress}
 STRING = "string data"
-
-
-@pytest.fixture(scope="module")
-def reader() -> Iterator[Reader]:
-    with Reader() as process:
-        yield process
 
 
 def record(data: bytes, **fields: bytes | int) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,13 +11,6 @@ from crafted_mcap import LITTLE_ENDIAN, Mcap, cdr, channel, chunk, described, me
 from hostile_records import CHUNKS, INDEX, MESSAGES, RECORDS
 from limited_process import MEMORY, SECONDS, Reader, Reading
 from log_files import definition
-
-
-@pytest.fixture(scope="module")
-def reader() -> Iterator[Reader]:
-    with Reader() as process:
-        yield process
-
 
 #: Topics that are asked for by name, since else what cannot be read is passed over.
 ASKED = {"types of protobuf": ["/a"], "long definition": ["/0"]}

@@ -78,8 +78,7 @@ def json_poses(count: int) -> list[Any]:
 @pytest.mark.parametrize("options", [LOOSE, BARE, {**LOOSE, **BARE}])
 def test_files_without_index(tmp_path: Path, options: dict[str, Any]) -> None:
     path = json_log(tmp_path / "a.mcap", json_poses(100), **options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert len(read(path)) == 100
     with open_log(path) as log:
         (topic,) = log.topics()
@@ -258,8 +257,7 @@ def test_any_bytes_give_records_or_an_error_of_ours(tmp_path: Path, seeds: list[
     content = content[: data.draw(st.integers(8, len(content)))] if data.draw(st.booleans()) else content
     path = tmp_path / "fuzzed.mcap"
     path.write_bytes(content)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LogWarning)
+    with warnings.catch_warnings(action="ignore", category=LogWarning):
         try:
             for record in read(path):
                 assert not isinstance(record, PoseRecord) or np.isfinite(record.T).all()

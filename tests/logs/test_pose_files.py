@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 from strategies import damaged, tables
 
@@ -22,8 +23,7 @@ from gtsam_rwhec.logs.pose_tables import PoseStatement
 
 RNG = np.random.default_rng(3)
 TURNS = Rotation.random(4, rng=RNG)
-T = np.tile(np.eye(4), (4, 1, 1))
-T[:, :3, :3], T[:, :3, 3] = TURNS.as_matrix(), RNG.uniform(-1.0, 1.0, (4, 3))
+T = se3.pose(TURNS.as_matrix(), RNG.uniform(-1.0, 1.0, (4, 3)))
 Q = TURNS.as_quat()
 NAMES = [f"im_{i}.png" for i in range(4)]
 

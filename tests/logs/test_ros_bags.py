@@ -7,7 +7,7 @@ import os
 import re
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -167,12 +167,6 @@ def odd_type(folder: Path) -> Path:
 def pipe(folder: Path) -> Path:
     os.mkfifo(folder / "in.bag")
     return folder / "in.bag"
-
-
-@pytest.fixture(scope="module")
-def reader() -> Iterator[Reader]:
-    with Reader() as process:
-        yield process
 
 
 BAD_BAGS: dict[str, tuple[Callable[[Path], Path], str]] = {

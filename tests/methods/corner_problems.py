@@ -23,9 +23,7 @@ def looking(eye: Array, at: Array, generator: np.random.Generator) -> Array:
     z = (at - eye) / np.linalg.norm(at - eye)
     x = np.cross(generator.standard_normal(3), z)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-    return T
+    return se3.pose(np.stack([x, np.cross(z, x), z], axis=1), eye)
 
 
 def seen(noise_px: float, seed: int, images: int = 12) -> tuple[Observations, dict[str, Array], dict[str, Array]]:

@@ -15,11 +15,6 @@ from gtsam_rwhec.methods.dual_quaternion_cost import from_transforms, motion_mom
 from gtsam_rwhec.methods.motions import Motions, cost_of, motions_of, squared_mahalanobis, squared_residuals
 
 
-def product(q: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Hamilton's product, xyzw, written out."""
-    return np.append(q[3] * p[:3] + p[3] * q[:3] + np.cross(q[:3], p[:3]), q[3] * p[3] - q[:3] @ p[:3])
-
-
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-12, 1e-6, 1.0, np.pi - 1e-9, np.pi]))
 def test_a_pose_and_back(seed: int, angle: float) -> None:
     rng = np.random.default_rng(seed)

@@ -194,8 +194,8 @@ def test_a_solution_from_corners_warns_of_images_only_where_no_arm_is_so_far_off
     A, _, pixels = images(20)
     rng = np.random.default_rng(2)
     off = A @ se3.expmap(rng.normal(scale=np.repeat([2e-3, 1e-3], 3), size=(20, 6)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", WeightsWarning)  # an arm's errors: many times what corner_px explains
+    # an arm's errors: many times what corner_px explains
+    with warnings.catch_warnings(action="error", category=WeightsWarning):
         solution = rw.solve(problem_of(off, pixels))
     ratio = contradicted_by(solution.cost, 6 * 20 - 12)
     assert ratio is not None

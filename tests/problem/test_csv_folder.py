@@ -194,8 +194,7 @@ def test_everything_that_is_not_read_is_counted_and_named(demo: Path) -> None:
 
 
 def test_nothing_is_warned_of_in_clean_data() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         rw.read_csv(DEMO)
 
 
@@ -252,7 +251,8 @@ def test_any_content_gives_rows_or_an_error_of_ours(tmp_path_factory: pytest.Tem
 def test_any_name_of_a_file_is_read_or_named_in_a_warning(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
     folder = tmp_path_factory.mktemp("names")
     (folder / f"{name.strip('.') or 'x'}.csv").write_text(GOOD)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CsvWarning)
-        with pytest.raises(FileFormatError, match=r"is missing|has no files named"):
-            rw.read_csv(folder)
+    with (
+        warnings.catch_warnings(action="ignore", category=CsvWarning),
+        pytest.raises(FileFormatError, match=r"is missing|has no files named"),
+    ):
+        rw.read_csv(folder)

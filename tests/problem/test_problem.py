@@ -277,8 +277,7 @@ def test_millimetres_are_told_from_metres() -> None:
 def test_a_far_world_is_no_millimetre(side: str) -> None:
     far = pose(np.eye(3), [2e5, -1e6, 3e5])
     moved = far @ A if side == "sensor carrier" else A @ far
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         rw.Problem().add("tag", "cam", moved, B)
 
 

@@ -172,12 +172,10 @@ def test_nothing_is_warned_of_again() -> None:
     off = raw.B.copy()
     off[:, :3, :3] *= 1.0 + 1e-7
     off[:, :3, 3] *= 1000.0
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         problem.add(*PAIR, raw.A, off)
     assert caught
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert reweighted(problem, {PAIR: np.linspace(0.0, 1.0, 12)}).is_relative
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
-from pathlib import Path
 
 import pytest
 from refined_corners import two_cameras
@@ -18,8 +17,6 @@ from gtsam_rwhec.report import print_corners
 from gtsam_rwhec.report.corners_section import corners_section, errors_table, intrinsics_sentences, intrinsics_table
 from gtsam_rwhec.report.report_blocks import Chart, Table
 from gtsam_rwhec.report.shown_result import ShownResult
-
-GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 @pytest.fixture(scope="module")

@@ -62,8 +62,7 @@ def test_no_numbers_end_a_run(numbers: tuple[float, float], scale: str) -> None:
         axes.plot(numbers, numbers, "o")
         axes.set(xscale=scale, yscale=scale)
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for content in (svg_figure(draw).in_page.encode(), svg_figure(draw).file("png")):
             assert b"<svg" in content or content.startswith(b"\x89PNG")
 
@@ -108,8 +107,7 @@ def test_ticks_do_not_come_from_the_extent(is_along_x: bool, caplog: pytest.LogC
         axes.set(xscale="log" if is_along_x else "linear", yscale="linear" if is_along_x else "log")
         figures.append(figure)
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert "cannot be drawn" not in svg_figure(draw).in_page
     (axes,) = figures[0].axes
     axis = axes.xaxis if is_along_x else axes.yaxis
@@ -135,7 +133,6 @@ def test_what_matplotlib_warns_of_reaches_nobody() -> None:
         warnings.warn("constrained_layout not applied", UserWarning, stacklevel=2)
         points(figure)
 
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard:
         assert "cannot be drawn" not in svg_figure(draw).in_page
     assert not heard

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -27,10 +28,10 @@ LENGTHS = st.one_of(st.floats(-20.0, 20.0), st.sampled_from([0.0, -0.0, 1e-5, 1.
 
 @st.composite
 def transforms(draw: st.DrawFn) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("ZYX", [draw(ANGLES), draw(ANGLES), draw(ANGLES)]).as_matrix()
-    T[:3, 3] = [draw(LENGTHS), draw(LENGTHS), draw(LENGTHS)]
-    return T
+    return se3.pose(
+        Rotation.from_euler("ZYX", [draw(ANGLES), draw(ANGLES), draw(ANGLES)]).as_matrix(),
+        [draw(LENGTHS), draw(LENGTHS), draw(LENGTHS)],
+    )
 
 
 def camera(model: str = "radtan", D: Any = (-0.28, 0.07, 1e-5, -2e-4), width: int = 640) -> Camera:

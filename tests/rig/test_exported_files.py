@@ -17,6 +17,7 @@ import yaml
 from exported_rigs import ONE, camera, frames_of, on_random_poses, transforms
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.cameras.camera import Camera
@@ -36,10 +37,7 @@ def expected(frames: RigFrames) -> dict[tuple[str, str], np.ndarray]:
 
 def composed(translation: Any, xyzw: Any) -> np.ndarray:
     assert abs(np.linalg.norm(xyzw) - 1.0) < 1e-15 * 8
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
-    T[:3, 3] = translation
-    return T
+    return se3.pose(Rotation.from_quat(xyzw).as_matrix(), translation)
 
 
 def assert_same(found: dict[Any, np.ndarray], wanted: dict[Any, np.ndarray]) -> None:
@@ -257,9 +255,10 @@ def joint_of(joint: ElementTree.Element) -> tuple[tuple[str, str], np.ndarray]:
     assert child is not None
     assert origin is not None
     roll, pitch, yaw = (float(angle) for angle in origin.attrib["rpy"].split())
-    T = np.eye(4)
-    T[:3, :3] = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
-    T[:3, 3] = [float(value) for value in origin.attrib["xyz"].split()]
+    T = se3.pose(
+        rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll),
+        [float(value) for value in origin.attrib["xyz"].split()],
+    )
     return (parent.attrib["link"], child.attrib["link"]), T
 
 

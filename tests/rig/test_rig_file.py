@@ -380,8 +380,7 @@ targets:
 def test_a_file_that_is_read_names_its_marks_and_a_finished_one_none(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(FULL, encoding="utf-8")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         finished = read_rig(path)
     path.write_text(FULL.replace("carriers:\n", "carriers:  # TODO look again\n"), encoding="utf-8")
     with pytest.warns(UnfinishedRigWarning, match=r"rig\.yaml has lines .* TODO.*\nline 2, carriers: TODO look again"):

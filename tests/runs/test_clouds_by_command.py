@@ -84,9 +84,7 @@ def out(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sensor(out: Path) -> np.ndarray:
     """T_sensorcarrier_sensor of the one sensor."""
     (row,) = json.loads((out / "result.json").read_text(encoding="utf-8"))["sensors"]
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = row["rotation_matrix"], row["translation_m"]
-    return T
+    return se3.pose(row["rotation_matrix"], row["translation_m"])
 
 
 def off(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cells_of_others import CIRCLES, WORKCELL
+from cells_of_others import CIRCLES, UNKNOWN_LENS, WORKCELL
 from intrinsics_samples import CAMCHAIN, ROS
 from places import CELL
 from rwhec_factors import se3
@@ -29,13 +29,6 @@ from gtsam_rwhec.runs.run_log import read_cameras, read_embedded_rig
 from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files, estimate_intrinsics, read_intrinsics
 
 UNKNOWN = CIRCLES.replace("{K: [550, 550, 320, 240], size: [640, 480]}", "estimate")
-BLANK = """\
-carriers: {sensors: hand, targets: base, poses: {frames: [base, hand]}}
-sensors:
-  camera: {images: images, poses: poses.csv, intrinsics: estimate}
-targets:
-  board: {type: checkerboard, inner_corners: [5, 4], square_m: 0.05}
-"""
 
 
 def part_of(folder: Path, cell: Path, numbers: list[int]) -> Path:
@@ -100,7 +93,7 @@ def write_cell(folder: Path, images: list[Gray]) -> None:
 )
 def test_images_that_show_no_board_are_refused_with_what_to_do(target: str | None, said: str, tmp_path: Path) -> None:
     write_cell(tmp_path, [np.full((48, 64), 200, np.uint8)] * 4)
-    text = BLANK if target is None else BLANK.partition("  board:")[0] + f"  {target}\n"
+    text = UNKNOWN_LENS if target is None else UNKNOWN_LENS.partition("  board:")[0] + f"  {target}\n"
     with pytest.raises(CameraError) as caught:
         detect_source(tmp_path, parse_rig(text, "rig.yaml"), tmp_path / "detected.mcap", workers=1)
     words = str(caught.value)

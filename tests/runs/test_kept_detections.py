@@ -128,4 +128,4 @@ def test_what_differs_is_named() -> None:
         "a.png is gone; b.png has another pose, or another place in its folder; c.png was changed; "
         "targets.board.square_m was 0.05 and is 0.06; d.png is new"
     )
-    assert differences({}, {f"file {n}": "" for n in range(9)}).endswith("4 is new; 4 others")
+    assert differences({}, {f"file {n}": "" for n in range(9)}).endswith("4 is new; and 4 more")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from given_commands import given
 from intrinsics_samples import CAMCHAIN, ROS
+from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 from typer.testing import Result
 
@@ -23,8 +24,7 @@ from gtsam_rwhec.runs.sensor_intrinsics import read_intrinsics
 COUNT = 4
 RNG = np.random.default_rng(11)
 TURNS = Rotation.random(COUNT, rng=RNG)
-T = np.tile(np.eye(4), (COUNT, 1, 1))
-T[:, :3, :3], T[:, :3, 3] = TURNS.as_matrix(), RNG.uniform(-1.0, 1.0, (COUNT, 3))
+T = se3.pose(TURNS.as_matrix(), RNG.uniform(-1.0, 1.0, (COUNT, 3)))
 Q = TURNS.as_quat()
 _, PNG = cv2.imencode(".png", np.zeros((4, 6), dtype=np.uint8))
 NS = [1_700_000_000_000_000_000 + i * 500_000_000 for i in range(COUNT)]

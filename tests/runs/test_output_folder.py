@@ -76,7 +76,7 @@ def test_a_folder_with_anything_else_is_refused(tmp_path: Path, replace: bool) -
     for number in range(MOST_NAMED + 2):
         (tmp_path / f"mine_{number}.txt").write_text("mine", encoding="utf-8")
     before = contents(tmp_path)
-    with pytest.raises(LogError, match=r"not of a calibration.*mine_0\.txt, mine_1\.txt.* and 2 others\. Give another"):
+    with pytest.raises(LogError, match=r"not of a calibration.*mine_0\.txt, mine_1\.txt.* and 2 more\. Give another"):
         run(tmp_path, *ALL, replace=replace)
     assert contents(tmp_path) == before
 

@@ -36,8 +36,7 @@ def check(folder: Path, text: str) -> None:
 
 
 def test_topics_that_are_there_and_of_their_own_frame(tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         check(tmp_path, made.rig_text(cam_0=INTRINSICS.format(0, 0), cam_1=INTRINSICS.format(1, 1)))
         # A frame that is no sensor's says nothing.
         check(

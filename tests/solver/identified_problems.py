@@ -18,8 +18,7 @@ FRAMES = random_poses(8, 1.0, np.random.default_rng(12))
 
 
 def identify(problem: rw.Problem) -> rw.Identifiability:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         return rw.solve(problem).identifiability
 
 

@@ -51,8 +51,7 @@ def searched(problem: rw.Problem, **options: Any) -> Search:
 
 def solved(problem: rw.Problem, method: str = "auto", **options: object) -> rw.Solution:
     """Solve without warnings: tests read the certificate."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         return rw.solve(problem, method, options=SolveOptions(**options))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import gtsam
@@ -10,20 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mixed_sets import MOVE_M, TURN_RAD, mixed_set, pose
+from mixed_sets import MOVE_M, TURN_RAD, mixed_set, pose, solved
 from rwhec_factors import se3
 from scipy.optimize import least_squares
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import (
-    CountError,
-    MeasurementsNotKeptError,
-    NoiseError,
-    NotUniqueWarning,
-    OptionError,
-    PoseError,
-    ScaleError,
-)
+from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, NoiseError, OptionError, PoseError, ScaleError
 from gtsam_rwhec.fitting.robust_solution import robust_solution
 from gtsam_rwhec.problem.directions import SLIDES, aligned, centres_of, motions_of_slides, scaled, with_common_slides
 from gtsam_rwhec.problem.measurements import Pair
@@ -31,12 +22,6 @@ from gtsam_rwhec.problem.selection import VarianceFactors, aligned_at, reweighte
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver.answers import PairPoses, given_answer, parts_about
 from gtsam_rwhec.solver.part_form import PartForm
-
-
-def solved(problem: rw.Problem) -> rw.Solution:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotUniqueWarning)
-        return rw.solve(problem)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -202,8 +187,7 @@ def test_a_sphere_counts_whole_wherever_its_frame_is() -> None:
     rng = np.random.default_rng(7)
     A, X, Y, centre = np.array([pose(rng) for _ in range(15)]), pose(rng), pose(rng, 0.3), np.array([0.2, -0.1, 0.4])
     B = se3.inverse(Y)[None] @ A @ X @ se3.expmap(np.c_[np.zeros((15, 3)), MOVE_M * rng.normal(size=(15, 3))])
-    at_centre = np.eye(4)
-    at_centre[:3, 3] = centre
+    at_centre = se3.pose(np.eye(3), centre)
     moved = se3.adjoint(at_centre[None])[0]
     covariance = moved @ np.diag([900.0, 900, 900, *[MOVE_M**2] * 3]) @ moved.T
     registered, points = rw.Problem(), rw.Problem()

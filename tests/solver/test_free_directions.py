@@ -187,8 +187,7 @@ def free_of(motion: Motion, R_cam: np.ndarray, noise: Noise | None, scale: Any =
     problem = rw.Problem(scale)
     weights = {} if noise is None else {"sigma": noise.sigma_m, "kappa": noise.kappa}
     problem.add("tag0", "cam0", A, B, **weights)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         solution = rw.solve(problem)
     # The pair alone and the whole are the same here.
     alone, whole = (

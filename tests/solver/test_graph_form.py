@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rwhec_factors import se3
 from small_problems import SCALES, part_of, simulated, solved, true_rotations, whole
 
 import gtsam_rwhec as rw
@@ -168,9 +169,7 @@ def test_a_local_minimum_is_not_certified() -> None:
 
 
 def _pose(R: Array, t: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
+    return se3.pose(R, t)
 
 
 @pytest.mark.usefixtures("by_graph")

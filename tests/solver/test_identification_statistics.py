@@ -162,8 +162,7 @@ DISTURBANCES = 5
 
 def facts(problem: rw.Problem) -> tuple[object, ...]:
     """What a solution says, without numbers."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=rw.errors.RwhecWarning):
         try:
             solution = rw.solve(problem)
         except rw.errors.RwhecError as error:

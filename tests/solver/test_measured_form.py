@@ -6,11 +6,15 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from exact_arithmetic import fractions
+from exact_cost import RationalPoses, exact_cost
+from given_rows import rows
+from rwhec_factors import se3
 from small_problems import optimum, simulated, whole
+from stated_cost import Poses
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import measured_form, residual_sums
 from gtsam_rwhec.solver import residual_sums as plain_residuals
@@ -46,42 +50,22 @@ def far_from_the_origin(seed: int, scale: str, offset_m: float, noise: Noise, *,
     return problem
 
 
-def exact_cost(problem: rw.Problem, form: PartForm, answer: Answer) -> Fraction:
+def exact(problem: rw.Problem, form: PartForm, answer: Answer) -> Fraction:
     """J of the poses as they are returned, exactly."""
-    part = form.part
-    poses = {name: T for name, T in problem.fixed.items()}
-    for i, name in enumerate(part.free):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = answer.R[i], answer.t[i] + part.frame_shift(name)
-        poses[name] = T
+    part, of = form.part, rows([(*pair, *batch(problem, pair)) for pair in problem.pairs], problem)
+    moved = zip(part.free, answer.R, answer.t, strict=True)
+    poses = {**problem.fixed, **{name: se3.pose(R, t + part.frame_shift(name)) for name, R, t in moved}}
     own = dict(zip(part.free, answer.own_scale.tolist(), strict=True))
-    total = Fraction(0)
-    for pair in problem.pairs:
-        raw = problem.measurements(*pair)
-        X, Y = (fractions(poses[name]) for name in pair)
-        R_X, t_X, R_Y, t_Y = X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3]
-        scale = answer.scale if problem.scale == "shared" else 1.0
-        if problem.scale == "per_target":
-            scale = own[pair.target] if pair.target in part.scale_owners else problem.fixed_scales[pair.target]
-        alpha = Fraction(scale)
-        c = fractions(part.gauge.sensor_carrier if pair.is_motion else part.gauge.target_carrier)
-        for A, B, sigma, kappa in zip(fractions(raw.A), fractions(raw.B), raw.sigma, raw.kappa, strict=True):
-            R_A, t_A, R_B, t_B = A[:3, :3], A[:3, 3], B[:3, :3], B[:3, 3]
-            off = R_A.dot(t_X) + t_A - t_Y
-            if part.kind == "direct":
-                t, R = alpha * off - R_Y.dot(t_B), R_A.dot(R_X) - R_Y.dot(R_B)
-            else:
-                turned = R_B.dot(R_X.T) - R_Y.T.dot(R_A)
-                t, R = t_B / alpha - R_Y.T.dot(off) - turned.dot(t_X - c), turned
-            total += (t.dot(t) / Fraction(float(sigma)) ** 2 + Fraction(float(kappa)) * (R * R).sum()) / 2
-    for name, priors in problem.priors.items():
-        for prior in priors:
-            off = fractions(poses[name]) - fractions(prior.transform)
-            if prior.sigma is not None:
-                total += off[:3, 3].dot(off[:3, 3]) / Fraction(prior.sigma) ** 2 / 2
-            if prior.kappa is not None:
-                total += Fraction(prior.kappa) * (off[:3, :3] * off[:3, :3]).sum() / 2
-    return total
+    centre = np.full((len(of.frames), 3), np.nan)
+    for x, y in zip(of.X, of.Y, strict=True):
+        centre[x] = part.gauge.sensor_carrier if x == y else part.gauge.target_carrier
+    given = Poses.of(of, poses, answer.scale if problem.scale == "shared" else own)
+    return exact_cost(of, part.kind, centre, RationalPoses.of(given))
+
+
+def batch(problem: rw.Problem, pair: Pair) -> tuple[Array, ...]:
+    raw = problem.measurements(*pair)
+    return raw.A, raw.B, raw.sigma, raw.kappa
 
 
 CASES = [
@@ -97,12 +81,12 @@ def test_the_cost_of_returned_poses_is_enclosed(scale: str, offset_m: float, noi
     problem = far_from_the_origin(3, scale, offset_m, noise, with_knowledge=known)
     form = whole(problem)
     answer, evaluation = form.answer_near(optimum(problem).R)
-    exact = exact_cost(problem, form, answer)
+    true = exact(problem, form, answer)
     # A prior's residual t' + R'(t_0 - c) has the length of t - t_0 for exact rotations: the stored ones are rounded.
-    allowed = Fraction(evaluation.cost_error) + (Fraction(1, 10**14) * exact if problem.priors else 0)
-    assert abs(Fraction(evaluation.cost) - exact) <= allowed
+    allowed = Fraction(evaluation.cost_error) + (Fraction(1, 10**14) * true if problem.priors else 0)
+    assert abs(Fraction(evaluation.cost) - true) <= allowed
     assert evaluation.cost_error <= 1e-8 * evaluation.cost
-    assert Fraction(evaluation.upper) * (1 + Fraction(1, 10**14)) >= exact
+    assert Fraction(evaluation.upper) * (1 + Fraction(1, 10**14)) >= true
 
 
 @pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
@@ -177,7 +161,7 @@ def test_pairs_that_were_added_many_at_once_are_enclosed_as_single_ones_are(
     many._learn(single)
     form = whole(many)
     answer, one = form.answer_near(optimum(many).R)
-    exact = exact_cost(many, form, answer)
+    true = exact(many, form, answer)
     found = [one]
     for pairs, enough in ((2, plain_residuals.MANY), (3, 1), (1, plain_residuals.MANY)):
         monkeypatch.setattr(measured_form, "PAIRS_AT_ONCE", pairs)
@@ -186,7 +170,7 @@ def test_pairs_that_were_added_many_at_once_are_enclosed_as_single_ones_are(
     V: Array = np.random.default_rng(0).standard_normal((len(one.gradient), 2))
     actions = [form.cost.action(each, V) for each in found]
     for each, action in zip(found, actions, strict=True):
-        assert abs(Fraction(each.cost) - exact) <= Fraction(each.cost_error) + Fraction(1, 10**14) * exact
+        assert abs(Fraction(each.cost) - true) <= Fraction(each.cost_error) + Fraction(1, 10**14) * true
         assert each.cost_error <= 1e-9 * each.cost
         assert (np.abs(each.gradient - one.gradient) <= each.gradient_error + one.gradient_error).all()
         for name in ("QV", "VQV", "VQx"):
@@ -200,8 +184,7 @@ def inputs(scale: rw.ScaleMode, *, uniform: bool, offset_m: float, sigma_m: floa
     simulated = general(2, 2, seed=3, noise=noise, number_of_measurements=3000, scale=scale).problem
     generator = np.random.default_rng(4)
     problem = rw.Problem(scale)
-    left = np.eye(4)
-    left[:3, 3] = offset_m, -offset_m, offset_m
+    left = se3.pose(np.eye(3), (offset_m, -offset_m, offset_m))
     for pair in simulated.pairs:
         raw = simulated.measurements(*pair)
         many = 1.0 if uniform else generator.uniform(0.5, 2.0, len(raw.A))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from naive_cost import naive_cost
+from rwhec_factors import se3
 from small_problems import SMALL_NOISE, flat, part_of, reduced, simulated, true_rotations
 
 import gtsam_rwhec as rw
@@ -111,9 +112,7 @@ def test_its_value_is_the_cost_by_plain_loops(name: str) -> None:
     assert answers
     for answer in answers:
         R = answer.R if part.kind == "direct" else answer.R.transpose(0, 2, 1)
-        T = np.tile(np.eye(4), (len(R), 1, 1))
-        T[:, :3, :3] = answer.R
-        T[:, :3, 3] = answer.t + [part.frame_shift(each) for each in part.free]
+        T = se3.pose(answer.R, answer.t + [part.frame_shift(each) for each in part.free])
         poses = dict(zip(part.free, T, strict=True))
         own = dict(zip(part.free, answer.own_scale, strict=True)) | part.fixed_scales
         scale = own if part.scale == "per_target" else answer.scale

@@ -7,7 +7,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import scipy.linalg
-from exact_arithmetic import basis_of, fractions, homogeneous, rank, rational_quaternion, rotation
+from exact_arithmetic import basis_of, homogeneous, rank, rational_quaternion, rotation
+from exact_cost import fractions
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from rwhec_factors.se3 import so3_nearest

@@ -117,8 +117,7 @@ class TestGrossNoise:
         gaps = 0
         for seed in range(28, 46):
             problem = simulated(1, 1, seed, noise=GROSS_NOISE, number_of_measurements=4).problem
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with warnings.catch_warnings(record=True, action="always") as caught:
                 solution = rw.solve(problem)
             certificate = solution.certificate
             said = any(issubclass(w.category, rw.errors.NotCertifiedWarning) for w in caught)

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from naive_cost import naive_cost
+from rwhec_factors import se3
 from rwhec_factors.se3 import pose
 from solved_problems import MODES, NOISE, matrices, simulated
 
@@ -94,8 +95,7 @@ def test_solving_does_not_change_the_problem() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_true_weights_raise_no_alarm(mode: str) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", WeightsWarning)
+    with warnings.catch_warnings(action="error", category=WeightsWarning):
         for seed in range(10):
             rw.solve(simulated(mode, seed=seed).problem)
 
@@ -118,8 +118,7 @@ def test_units_of_the_weights_do_not_matter(weight: float) -> None:
     for pair in simulation.problem.pairs:
         data = simulation.problem.measurements(*pair)
         heavy.add(*pair, data.A, data.B, data.sigma / np.sqrt(weight), data.kappa * weight)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         first, second = rw.solve(simulation.problem), rw.solve(heavy)
     assert second.certificate.is_certified
     assert second.cost == pytest.approx(weight * first.cost, rel=1e-9)
@@ -154,8 +153,7 @@ def test_exact_data_are_certified_wherever_the_origin_of_the_world_is(distance_m
     """What is left of the cost is the rounding of the poses, which is 1e-10 m where the origin is 1,000 km away."""
     near = general(2, 2, seed=1).problem
     problem = rw.Problem()
-    away = np.eye(4)
-    away[:3, 3] = distance_m * np.array([0.6, 0.8, 0.1])
+    away = se3.pose(np.eye(3), distance_m * np.array([0.6, 0.8, 0.1]))
     for pair in near.pairs:
         for batch in near.batches(*pair):
             problem.add(*pair, batch.A @ away, batch.B)
@@ -289,8 +287,7 @@ def with_local_minimum() -> tuple[rw.Problem, rw.Solution, rw.Solution]:
     generator = np.random.default_rng(0)
     for _ in range(20):
         X, Y = random_poses(2, 1.0, generator)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)
+        with warnings.catch_warnings(action="ignore", category=RwhecWarning):
             local = rw.solve(problem, method="local", initial=({"target0": X}, {"sensor0": Y}, 1.0))
         if local.cost > 2.0 * best.cost:
             return problem, best, local
@@ -304,8 +301,7 @@ def test_a_local_minimum_is_not_certified() -> None:
     assert not local.certificate.is_certified
     assert local.certificate.lower_bound <= best.cost < local.cost
     assert local.certificate.cause is Cause.LOCAL_MINIMUM_POSSIBLE
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
+    with warnings.catch_warnings(action="ignore", category=RwhecWarning):
         warnings.simplefilter("error", NotCertifiedWarning)
         with pytest.raises(NotCertifiedWarning, match="not proven optimal"):
             rw.solve(problem, method="local", initial=(local.X, local.Y, 1.0))
