@@ -28,13 +28,15 @@ from gtsam_rwhec.fitting.drift import DriftPrior, own_directions, unit_of
 from gtsam_rwhec.fitting.fit_options import SYSTEMATIC, C, Walk
 from gtsam_rwhec.fitting.noise_likelihood import NoiseModel
 from gtsam_rwhec.fitting.noise_rows import Rows
-from gtsam_rwhec.fitting.noise_search import Settled, Task
+from gtsam_rwhec.fitting.noise_search import Settled, Task, of_every
 from gtsam_rwhec.fitting.unknowns import UnknownKind
 from gtsam_rwhec.geometry.poses import Array
 
 #: At most so many measurements are compared with each other, evenly over the log. With fewer of a track, nothing is
 #: told.
 MOST, FEWEST = 80, 20
+#: Frames that none of these sees have this share of the information of all.
+HELD = 1e-6
 #: The shares of the errors that last.
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 #: How far errors reach: where their correlation is 1 / e, of views (rad, and a share of distance), and of instants
@@ -114,11 +116,11 @@ def lasting_errors(task: Task, found: Settled) -> LastingErrors | None:
         for unknown, place in task.layout.slots.items()
         if unknown.kind is UnknownKind.FRAME and not task.layout.free[place].any()
     ]
-    rows = model.rows.thinned(-(-len(model.rows.residual) // MOST))
-    tracks = np.unique(_tracks(rows))
-    if not frames or len(rows.residual) < FEWEST * len(tracks):
+    some = of_every(model, -(-len(model.rows.residual) // MOST), HELD)
+    rows = some.rows
+    if not frames or len(rows.residual) < FEWEST * len(np.unique(_tracks(rows))):
         return None
-    compared, share = _compared(model, rows, sigma)
+    compared, share = _compared(some, sigma)
     if drift is None:
         fading = np.eye(len(rows.residual))
         reaches = np.array(OF_TIME) * len(rows.residual)
@@ -156,16 +158,16 @@ def _tracks(rows: Rows) -> np.ndarray:
     return found
 
 
-def _compared(model: NoiseModel, rows: Rows, sigma: dict[C, float]) -> tuple[_Compared, float]:
-    """Some of the measurements, and the share of their errors that last under the model."""
-    kept = np.isin(model.rows.instants.order, rows.instants.order)
+def _compared(model: NoiseModel, sigma: dict[C, float]) -> tuple[_Compared, float]:
+    """Measurements as one dense system, and the share of their errors that last under the model."""
+    rows = model.rows
     n, index = len(rows.residual), rows.instants.index
     varying = np.repeat([sigma.get(c, 0.0) for c in SYSTEMATIC], 3)
     effects = rows.twist[model.side] * varying
-    arm = np.einsum("nia,nk,mk,mja->nimj", effects, model.features[kept], model.features[kept], effects, optimize=True)
-    carrier = model.carrier(sigma)[kept]
+    arm = np.einsum("nia,nk,mk,mja->nimj", effects, model.features, model.features, effects, optimize=True)
+    carrier = model.carrier(sigma)
     white = np.einsum("nia,nm,mja->nimj", carrier, index[:, None] == index, carrier, optimize=True)
-    white[np.arange(n), :, np.arange(n)] += model.white(sigma)[kept]
+    white[np.arange(n), :, np.arange(n)] += model.white(sigma)
     if model.drift is None:
         size = np.sqrt((rows.residual.reshape(n, 2, 3) ** 2).mean(axis=(0, 2))).repeat(3)
         states = own_directions(rows, DriftPrior.of(rows, OF_DETECTIONS))[:, :, :6] * size

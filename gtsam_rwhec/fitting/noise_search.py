@@ -45,7 +45,7 @@ INSTANTS = 300
 OTHER_SIDE: dict[About, About] = {"targetcarrier": "sensorcarrier", "sensorcarrier": "targetcarrier"}
 #: The rows at so many estimates are kept.
 KEPT = 3
-#: In fewer rows the unknowns have this share of the information of all rows on top.
+#: In fewer rows the unknowns have this share of the information of all rows on top: some see not every frame.
 HELD = 1e-3
 
 
@@ -231,15 +231,18 @@ def start_at(sizes: Sizes, near: Fitted | None) -> Array:
 
 def thinned(model: NoiseModel) -> NoiseModel:
     """The model of fewer instants, where there are very many."""
-    every = -(-model.rows.instants.count // INSTANTS)
+    return of_every(model, -(-model.rows.instants.count // INSTANTS), HELD)
+
+
+def of_every(model: NoiseModel, every: int, share: float) -> NoiseModel:
+    """The model of every so-many-th instant of each track; unknowns are held by a share of what all rows know."""
     if every == 1:
         return model
     rows = model.rows.thinned(every)
     kept = np.isin(model.rows.instants.order, rows.instants.order)
     drift = None if model.drift is None else DriftPrior.of(rows, model.drift.walk)
-    # Frames that are not seen in these rows are held by a little of what all rows know of them.
     size = np.sqrt((model.rows.residual**2).mean(axis=0)) + QUIETEST
-    held = model.prior_information + HELD * (model.basis.T @ model.rows.by_unknowns.gram(size) @ model.basis)
+    held = model.prior_information + share * (model.basis.T @ model.rows.by_unknowns.gram(size) @ model.basis)
     return replace(model, rows=rows, drift=drift, features=model.features[kept], prior_information=held)
 
 
