@@ -14,6 +14,7 @@ from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.cloud_odometry import LOST_S, MAP_HALF_S, MAPS_S, NEIGHBOURS, SPACING, moved_on
 from gtsam_rwhec.clouds.lidar_pair import ROUNDING, LidarsTogether
 from gtsam_rwhec.clouds.point_to_plane import (
+    CAUCHY,
     LEAST_SHARE,
     SHARED_BY_VIEWS,
     Known,
@@ -50,8 +51,8 @@ FREEDOM, ROUNDS = 4.0, 10
 #: Places that scatter by more than so many times what each claims do not show one pose.
 MOST_SCATTER = 400.0
 #: What a LiDAR's calibration leaves, one standard deviation: ranges that are off alike (m), by a factor, and elevations
-#: that are off alike (rad). An elevation that is off by 0.1 degrees was 20 mm with 3 mm claimed.
-OF_A_LIDAR = (0.01, 0.002, float(np.radians(0.05)))
+#: that are off alike (rad): 0.05 degrees, and a third for the paths that they bend (in simulated yards).
+OF_A_LIDAR = (0.01, 0.002, 4.0 / 3.0 * float(np.radians(0.05)))
 
 
 @dataclass(frozen=True)
@@ -182,11 +183,13 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
         words = f"places disagree by {np.sqrt(max(scatter)):.2g} times what each claims: both did not see the same"
         return replace(nothing, why_not=words)
     T = T @ se3.expmap(step[None])[0]
-    pulls = [_alike(*each, T, sigma_m) for each in told]
-    alike = inverse @ np.sum(pulls, axis=0)
-    alike *= (*OF_A_LIDAR, *OF_A_LIDAR, nothing.clock_sigma_s)
+    pulls, shown = (np.sum(each, axis=0) for each in zip(*(_alike(*each, T, sigma_m) for each in told), strict=True))
+    together = np.linalg.pinv(total, ROUNDING, hermitian=True)
+    # Elevations are as far off as residuals show, if that is more.
+    raised = max(OF_A_LIDAR[2], abs(float(shown[0])) / float(shown[1] + (sigma_m[0] / OF_A_LIDAR[2]) ** 2))
+    alike = together @ pulls * (*OF_A_LIDAR[:2], raised, *OF_A_LIDAR[:2], raised, nothing.clock_sigma_s)
     # What points of all places are off by together does not average out; what slides stays without weight.
-    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * np.linalg.pinv(total, ROUNDING, hermitian=True) @ total @ unit
+    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * together @ total @ unit
     covariance = inverse + alike @ alike.T + shared @ shared.T
     return replace(
         nothing,
@@ -217,6 +220,7 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
         scaled = information * unit[:, None] * unit
         off = steps - step
         weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
+        weights /= max(1.0, float(weights.mean()))
         weighted = weights[:, None, None] * scaled
         inverse = np.linalg.pinv(weighted.sum(axis=0), ROUNDING, hermitian=True)
         step = inverse @ np.einsum("nij,nj->i", weighted, steps)
@@ -246,20 +250,23 @@ def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], A
     return [replace(each, information=told.T @ each.information @ told) for each in tells], told.T @ total @ told
 
 
-def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> Array:
+def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> tuple[Array, Array]:
     """How one place pulls (6, 7) at the pose for what the first and the second LiDAR have off, and for a clock.
 
-    That are the ranges, by a length and by a factor, and the elevations, about the LiDAR's own z axis.
+    That are the ranges, by a length and by a factor, and the elevations, about the LiDAR's own z axis. To that sums
+    (2,): the first over the second is by how much elevations of one are too high and those of the other too low.
     """
     moved = found.points @ T[:3, :3].T + T[:3, 3]
     rays = -place.rays[0][place.first.faces.nearest(moved)[1]] @ T[:3, :3], place.rays[1][found.at]
-    pulls, little = [], 1e-3 * float(sigma_m[0])
+    rows, offs = 0.5 * (found.rows + found.own_rows), []
     for each, up in zip(rays, (T[2, :3], np.array([0.0, 0.0, 1.0])), strict=True):
         ranges = np.linalg.norm(each, axis=1, keepdims=True)
         around = np.cross(each, up)
         raised = np.cross(around, each) / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-9)
-        for pattern in (each / ranges, each, raised):
-            off = found.residuals + little * np.einsum("ni,ni->n", found.rows[:, 3:], pattern)
-            other = known(replace(found, residuals=off), sigma_m)
-            pulls.append((other.information @ other.step - tell.information @ tell.step) / little)
-    return np.column_stack([*pulls, tell.information @ place.velocity])
+        offs.append([np.einsum("ni,ni->n", rows[:, 3:], pattern) for pattern in (each / ranges, each, raised)])
+    off = np.concatenate(offs).T
+    weights = 1.0 / (1.0 + (found.residuals / (CAUCHY * sigma_m[0])) ** 2)
+    steps = np.linalg.pinv(rows.T * weights @ rows, ROUNDING, hermitian=True) @ (rows.T * weights @ off)
+    apart = (off - rows @ steps)[:, [2, 5]].sum(axis=1)  # what no step takes away
+    pulls = tell.information @ np.column_stack([steps, place.velocity])
+    return np.asarray(pulls), (weights * apart) @ np.column_stack([found.residuals, apart])

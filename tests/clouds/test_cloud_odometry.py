@@ -140,6 +140,28 @@ def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are
     assert "0 places have maps of both" in str(register_lidars(paths[0], replace(paths[1], maps=()), truth))
 
 
+@pytest.mark.parametrize("raised_deg", [(-0.1, 0.0), (0.1, -0.1), (0.0, -0.3)])
+def test_elevations_that_are_off_are_in_the_covariance(raised_deg: tuple[float, float]) -> None:
+    # 0.1 degrees are two standard deviations of what is expected; 0.3 are not, and residuals show them.
+    rng, truth = np.random.default_rng(0), lidar_drive.MOUNTS["rear"]
+    ground = rng.uniform(-20.0, 40.0, (40_000, 3)) * (1.0, 1.0, 0.0)
+    walls = np.column_stack([np.round(ground[:, :1] / 7.0) * 7.0, ground[:, 1:2], rng.uniform(0.0, 3.0, 40_000)])
+    world = np.concatenate([ground, walls, walls[:, [1, 0, 2]]])
+    stamps, poses = np.arange(6) * 2 * 10**9, np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.arange(6)[:, None] * (3.0, 1.0, 0.0) + (0.0, 0.0, 1.8)
+    paths = []
+    for k, (T, off_deg) in enumerate(zip((np.eye(4), truth), raised_deg, strict=True)):
+        maps = maps_of(world, poses @ T, stamps, k)
+        for cloud in maps:
+            sideways = np.cross(cloud.points, np.eye(3)[2])
+            sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+            cloud.points[:] += np.radians(off_deg) * np.cross(sideways, cloud.points)
+        paths.append(LidarPath(f"lidar {k}", maps, Trajectory(stamps, poses @ T)))
+    found = register_lidars(*paths, truth)
+    error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
+    assert error @ found.information @ error < 12.6  # 95 % of chi2(6)
+
+
 def test_clouds_that_the_motions_contradict_are_left_out() -> None:
     driven = lidar_drive.driven(20.0, seed=2)
     rng, way = np.random.default_rng(0), driven.T_world_vehicle[:, :3, 3]
