@@ -168,7 +168,7 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
             if len(told) < FEWEST_PLACES:
                 return replace(nothing, why_not=f"they overlap at {len(told)} places, and {FEWEST_PLACES} are needed")
             unit, _ = units(np.concatenate([each.points for _, each, _ in told]))
-            tells, total = _without_slides([tell for *_, tell in told], unit)
+            tells, total, told_of = _without_slides([tell for *_, tell in told], unit)
             right = np.sum([each.information @ each.step for each in tells], axis=0)
             step = np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
             T = T @ se3.expmap(step[None])[0]
@@ -178,7 +178,7 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
     if overlap < OVERLAP:
         words = f"they overlap by {overlap:.0%} where the motions put the two, and {OVERLAP:.0%} are needed"
         return replace(nothing, why_not=words)
-    step, inverse, scatter = _agreed(tells)
+    step, inverse, scatter = _agreed(tells, told_of)
     if max(scatter) > MOST_SCATTER:
         words = f"places disagree by {np.sqrt(max(scatter)):.2g} times what each claims: both did not see the same"
         return replace(nothing, why_not=words)
@@ -204,7 +204,7 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
     )
 
 
-def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
+def _agreed(tells: Sequence[Known], told: Array) -> tuple[Array, Array, tuple[float, float]]:
     """The step (6,) that most places agree to, its covariance, and how turns and shifts scatter over what places claim.
 
     Places count less where they are far from the others (Student's t): an odometry that just began, or a moved thing.
@@ -217,7 +217,8 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
     scatter, step, unsure = np.ones(2), np.zeros(6), 1.0
     for _ in range(ROUNDS):
         unit = np.repeat(np.maximum(unsure * scatter, 1.0) ** -0.5, 3)
-        scaled = information * unit[:, None] * unit
+        # Turns and shifts are scaled apart, and what slides may be both.
+        scaled = told.T @ (information * unit[:, None] * unit) @ told
         off = steps - step
         weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
         weights /= max(1.0, float(weights.mean()))
@@ -238,8 +239,8 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
     return step, inverse, (float(scatter[0]), float(scatter[1]))
 
 
-def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], Array]:
-    """What places tell without what slides in all of them, and the sum of the information (6, 6).
+def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], Array, Array]:
+    """What places tell without what slides in all of them, the sum of the information (6, 6), and what takes it out.
 
     Each place has another direction that slides, by the noise of its normals, so that their sum has none.
     """
@@ -247,7 +248,7 @@ def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], A
     values, along = np.linalg.eigh(unit.T @ total @ unit)
     kept = along[:, values > LEAST_SHARE * values[-1]]
     told = unit @ kept @ kept.T @ np.linalg.inv(unit)
-    return [replace(each, information=told.T @ each.information @ told) for each in tells], told.T @ total @ told
+    return [replace(each, information=told.T @ each.information @ told) for each in tells], told.T @ total @ told, told
 
 
 def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> tuple[Array, Array]:

@@ -140,6 +140,28 @@ def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are
     assert "0 places have maps of both" in str(register_lidars(paths[0], replace(paths[1], maps=()), truth))
 
 
+def test_a_slide_that_turns_and_shifts_has_no_weight_where_places_disagree() -> None:
+    # The vehicle turns in the middle of a round tank, so that it slides about the vehicle's own axis.
+    rng, truth = np.random.default_rng(0), se3.pose(np.eye(3), np.array([-2.0, 0.3, 0.4]))
+    around, up, out = rng.uniform(-np.pi, np.pi, 30_000), rng.uniform(-2.0, 2.0, 30_000), rng.uniform(0.0, 8.0, 30_000)
+    is_wall = rng.integers(0, 2, 30_000) == 0
+    radius = np.where(is_wall, 8.0, out)
+    world = np.column_stack([radius * np.cos(around), radius * np.sin(around), np.where(is_wall, up, -2.0)])
+    stamps = np.arange(6) * 2 * 10**9
+    poses = se3.expmap(np.outer(0.4 * np.arange(6), np.eye(6)[2]))
+    one, other = (maps_of(world, poses @ T, stamps, k) for k, T in enumerate((np.eye(4), truth)))
+    for cloud, T in zip(other, se3.expmap(rng.normal(0.0, 3e-3, (6, 6))), strict=True):
+        cloud.points[:] = cloud.points @ T[:3, :3].T + T[:3, 3]
+    slid = se3.expmap(-0.05 * np.eye(6)[2:3])[0] @ truth
+    paths = [LidarPath(f"lidar {k}", each, Trajectory(stamps, poses)) for k, each in enumerate((one, other))]
+    found = register_lidars(*paths, slid)
+    assert max(found.scatter) > 2.0
+    assert "what slides (1 of 6 directions)" in str(found)
+    error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
+    assert np.linalg.norm(error) > 0.03  # as the start had it
+    assert error @ found.information @ error < 20.0
+
+
 @pytest.mark.parametrize("raised_deg", [(-0.1, 0.0), (0.1, -0.1), (0.0, -0.3)])
 def test_elevations_that_are_off_are_in_the_covariance(raised_deg: tuple[float, float]) -> None:
     # 0.1 degrees are two standard deviations of what is expected; 0.3 are not, and residuals show them.
