@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 from scipy.special import chdtri, fdtri
 
@@ -40,7 +41,7 @@ GATES, STEPS = (8.0, 4.0, 2.0), 6
 SETTLED = 1e-3
 #: Velocities are over so many seconds before and after.
 AROUND_S = 0.2
-#: Maps overlap if they share at least this part of the points of one.
+#: Maps overlap if they share at least this part of the surfaces of one, across every direction.
 OVERLAP = 0.15
 #: Fewer places do not tell how well they agree.
 FEWEST_PLACES = 3
@@ -162,19 +163,22 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
         for _ in range(STEPS):
             several = [matches(each.second, each.first, T, gate * each.spacing_m) for each in places]
             sigma_m = sigmas(several, gate * spacing_m)
-            told = [
-                (place, each, known(each, sigma_m)) for place, each in zip(places, several, strict=True) if len(each.at)
-            ]
+            pairs = zip(places, several, strict=True)
+            told = [(place, each, known(each, sigma_m)) for place, each in pairs if len(each.at)]
             if len(told) < FEWEST_PLACES:
                 return replace(nothing, why_not=f"they overlap at {len(told)} places, and {FEWEST_PLACES} are needed")
             unit, _ = units(np.concatenate([each.points for _, each, _ in told]))
             tells, total, told_of = _without_slides([tell for *_, tell in told], unit)
-            right = np.sum([each.information @ each.step for each in tells], axis=0)
-            step = np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
+            together = np.linalg.pinv(total, ROUNDING, hermitian=True)
+            step = together @ np.sum([each.information @ each.step for each in tells], axis=0)
             T = T @ se3.expmap(step[None])[0]
             if np.linalg.norm(step[:3]) / SPACING + np.linalg.norm(step[3:]) / spacing_m < SETTLED:
                 break
-    overlap = float(np.median([each.overlap for each in several]))
+    every = [each.second.faces.normals for each in places]
+    met = [normals[each.at] for normals, each in zip(every, several, strict=True)]
+    # Another yard has the same ground: what counts is the direction of which least is met. A unit is for flat worlds.
+    squares = (normals.T @ normals + np.eye(3) for normals in map(np.concatenate, (met, every)))
+    overlap = float(eigh(*squares, eigvals_only=True)[0])
     if overlap < OVERLAP:
         words = f"they overlap by {overlap:.0%} where the motions put the two, and {OVERLAP:.0%} are needed"
         return replace(nothing, why_not=words)
@@ -184,7 +188,6 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
         return replace(nothing, why_not=words)
     T = T @ se3.expmap(step[None])[0]
     pulls, shown = (np.sum(each, axis=0) for each in zip(*(_alike(*each, T, sigma_m) for each in told), strict=True))
-    together = np.linalg.pinv(total, ROUNDING, hermitian=True)
     # Elevations are as far off as residuals show, if that is more.
     raised = max(OF_A_LIDAR[2], abs(float(shown[0])) / float(shown[1] + (sigma_m[0] / OF_A_LIDAR[2]) ** 2))
     alike = together @ pulls * (*OF_A_LIDAR[:2], raised, *OF_A_LIDAR[:2], raised, nothing.clock_sigma_s)
@@ -214,12 +217,11 @@ def _agreed(tells: Sequence[Known], told: Array) -> tuple[Array, Array, tuple[fl
     inverses = np.linalg.pinv(information, ROUNDING, hermitian=True)
     rank = np.array([np.linalg.matrix_rank(each, hermitian=True) for each in information])
     expected = [float(np.einsum("nij,nji->", information[:, at, at], inverses[:, at, at])) for at in parts]
-    scatter, step, unsure = np.ones(2), np.zeros(6), 1.0
+    scatter, off, unsure = np.ones(2), steps, 1.0
     for _ in range(ROUNDS):
         unit = np.repeat(np.maximum(unsure * scatter, 1.0) ** -0.5, 3)
         # Turns and shifts are scaled apart, and what slides may be both.
         scaled = told.T @ (information * unit[:, None] * unit) @ told
-        off = steps - step
         weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
         weights /= max(1.0, float(weights.mean()))
         weighted = weights[:, None, None] * scaled
@@ -230,10 +232,7 @@ def _agreed(tells: Sequence[Known], told: Array) -> tuple[Array, Array, tuple[fl
             float(np.einsum("n,ni,nij,nj->", weights, off[:, at], information[:, at, at], off[:, at])) for at in parts
         ]
         count = float(weights.sum() ** 2 / (weights**2).sum())
-        spare = 1.0 - 1.0 / count
-        scatter = np.array(
-            [one / (other * spare) if other else 0.0 for one, other in zip(squares, expected, strict=True)]
-        )
+        scatter = np.array(squares) / (np.where(expected, expected, 1.0) * (1.0 - 1.0 / count))
         # The scatter of few places is itself not known: ellipsoids hold as much as if it were.
         unsure = 6.0 * float(fdtri(6.0, 3.0 * (count - 1.0), LEVEL) / chdtri(6.0, 1.0 - LEVEL))
     return step, inverse, (float(scatter[0]), float(scatter[1]))

@@ -162,16 +162,21 @@ def test_a_slide_that_turns_and_shifts_has_no_weight_where_places_disagree() -> 
     assert error @ found.information @ error < 20.0
 
 
+def yard_and_way(rng: np.random.Generator, first_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a ground and of low walls every 7 m, from one on, and poses with stamps of a way through it."""
+    ground = rng.uniform(-20.0, 40.0, (40_000, 3)) * (1.0, 1.0, 0.0)
+    one = ground[:20_000]
+    walls = np.column_stack([np.round(one[:, :1] / 7.0) * 7.0 + first_m, one[:, 1], rng.uniform(0.0, 3.0, len(one))])
+    stamps, poses = np.arange(6) * 2 * 10**9, np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.arange(6)[:, None] * (3.0, 1.0, 0.0) + (0.0, 0.0, 1.8)
+    return np.concatenate([ground, walls, walls[:, [1, 0, 2]]]), poses, stamps
+
+
 @pytest.mark.parametrize("raised_deg", [(-0.1, 0.0), (0.1, -0.1), (0.0, -0.3)])
 def test_elevations_that_are_off_are_in_the_covariance(raised_deg: tuple[float, float]) -> None:
     # 0.1 degrees are two standard deviations of what is expected; 0.3 are not, and residuals show them.
-    rng, truth = np.random.default_rng(0), lidar_drive.MOUNTS["rear"]
-    ground = rng.uniform(-20.0, 40.0, (40_000, 3)) * (1.0, 1.0, 0.0)
-    walls = np.column_stack([np.round(ground[:, :1] / 7.0) * 7.0, ground[:, 1:2], rng.uniform(0.0, 3.0, 40_000)])
-    world = np.concatenate([ground, walls, walls[:, [1, 0, 2]]])
-    stamps, poses = np.arange(6) * 2 * 10**9, np.tile(np.eye(4), (6, 1, 1))
-    poses[:, :3, 3] = np.arange(6)[:, None] * (3.0, 1.0, 0.0) + (0.0, 0.0, 1.8)
-    paths = []
+    truth, paths = lidar_drive.MOUNTS["rear"], []
+    world, poses, stamps = yard_and_way(np.random.default_rng(0), 0.0)
     for k, (T, off_deg) in enumerate(zip((np.eye(4), truth), raised_deg, strict=True)):
         maps = maps_of(world, poses @ T, stamps, k)
         for cloud in maps:
@@ -182,6 +187,14 @@ def test_elevations_that_are_off_are_in_the_covariance(raised_deg: tuple[float, 
     found = register_lidars(*paths, truth)
     error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
     assert error @ found.information @ error < 12.6  # 95 % of chi2(6)
+
+
+def test_lidars_in_two_yards_of_one_ground_are_not_registered() -> None:
+    truth, paths = lidar_drive.MOUNTS["rear"], []
+    for k, T in enumerate((np.eye(4), truth)):
+        world, poses, stamps = yard_and_way(np.random.default_rng(k), 3.5 * k)
+        paths.append(LidarPath(f"lidar {k}", maps_of(world, poses @ T, stamps, k), Trajectory(stamps, poses @ T)))
+    assert "they overlap by " in register_lidars(*paths, truth).why_not
 
 
 def test_clouds_that_the_motions_contradict_are_left_out() -> None:
