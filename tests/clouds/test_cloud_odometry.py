@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from given_commands import command
 from rwhec_factors import se3
+from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, LidarPath, odometry, register_lidars
@@ -197,8 +198,11 @@ def test_lidars_in_two_yards_of_one_ground_are_not_registered() -> None:
     assert "they overlap by " in register_lidars(*paths, truth).why_not
 
 
-def test_clouds_that_the_motions_contradict_are_left_out() -> None:
-    driven = lidar_drive.driven(20.0, seed=2)
+def driven_with_maps(mounts: dict[str, np.ndarray]) -> tuple[Drive, dict[str, list[Cloud]]]:
+    """A drive on a plane with sensors there, and what they see of a ground and walls."""
+    driven = rw.simulate.drive(
+        {name: rw.simulate.SimulatedOdometry(T) for name, T in mounts.items()}, "planar", seconds=20.0, seed=2
+    )
     rng, way = np.random.default_rng(0), driven.T_world_vehicle[:, :3, 3]
     ground = rng.uniform(way.min(axis=0) - 12.0, way.max(axis=0) + 12.0, (15_000, 3)) * (1.0, 1.0, 0.0)
     walls = np.column_stack([np.round(ground[:, :1] / 7.0) * 7.0, ground[:, 1:2], rng.uniform(0.0, 3.0, 15_000)])
@@ -206,8 +210,28 @@ def test_clouds_that_the_motions_contradict_are_left_out() -> None:
     at = np.arange(10, 200, 40)
     maps = {
         name: maps_of(world, driven.T_world_vehicle[at] @ T, driven.stamps_ns[at], k)
-        for k, (name, T) in enumerate(lidar_drive.MOUNTS.items())
+        for k, (name, T) in enumerate(mounts.items())
     }
+    return driven, maps
+
+
+def test_three_lidars_agree_by_their_clouds() -> None:
+    aside = Rotation.from_euler("zyx", [95, -6, 10], degrees=True).as_matrix()
+    mounts = {**lidar_drive.MOUNTS, "left": se3.pose(aside, np.array([0.2, 0.9, 1.6]))}
+    driven, maps = driven_with_maps(mounts)
+    tracks = [rw.odometry.OdometryTrack(name, *each) for name, each in driven.tracks.items()]
+    options = rw.odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
+    found = rw.odometry.calibrate_odometries(tracks, reference="front", options=options, maps=maps)
+    assert [each.why_not for each in found.together] == ["", "", ""]
+    assert found.judgement.verdict == "use", found.judgement
+    for name in ("rear", "left"):
+        T = np.linalg.inv(driven.T("front", name)) @ found.T_reference_sensor[name]
+        error = se3.logmap(T[None])[0]
+        assert error @ np.linalg.solve(found.covariance_of(name), error) < 16.8  # 99 % of chi2(6)
+
+
+def test_clouds_that_the_motions_contradict_are_left_out() -> None:
+    driven, maps = driven_with_maps(lidar_drive.MOUNTS)
     tracks = [rw.odometry.OdometryTrack(name, *each) for name, each in driven.tracks.items()]
     options = rw.odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
     shifted = {**maps, "rear": [replace(each, points=each.points + np.eye(3)[0]) for each in maps["rear"]]}
