@@ -26,7 +26,7 @@ class LidarsTogether:
     half_s : float
         Maps are of the sweeps so long before and after.
     overlap : float
-        The median share of the points of the second's maps that lie on the first's.
+        The share of the surfaces of the second's maps that lie on the first's, across the direction where it is least.
     noise_m : float
         Standard deviation of a distance between both.
     scatter : (float, float)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 from scipy.special import chdtri, fdtri
 
@@ -14,6 +15,7 @@ from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.cloud_odometry import LOST_S, MAP_HALF_S, MAPS_S, NEIGHBOURS, SPACING, moved_on
 from gtsam_rwhec.clouds.lidar_pair import ROUNDING, LidarsTogether
 from gtsam_rwhec.clouds.point_to_plane import (
+    CAUCHY,
     LEAST_SHARE,
     SHARED_BY_VIEWS,
     Known,
@@ -39,7 +41,7 @@ GATES, STEPS = (8.0, 4.0, 2.0), 6
 SETTLED = 1e-3
 #: Velocities are over so many seconds before and after.
 AROUND_S = 0.2
-#: Maps overlap if they share at least this part of the points of one.
+#: Maps overlap if they share at least this part of the surfaces of one, across every direction.
 OVERLAP = 0.15
 #: Fewer places do not tell how well they agree.
 FEWEST_PLACES = 3
@@ -50,8 +52,8 @@ FREEDOM, ROUNDS = 4.0, 10
 #: Places that scatter by more than so many times what each claims do not show one pose.
 MOST_SCATTER = 400.0
 #: What a LiDAR's calibration leaves, one standard deviation: ranges that are off alike (m), by a factor, and elevations
-#: that are off alike (rad). An elevation that is off by 0.1 degrees was 20 mm with 3 mm claimed.
-OF_A_LIDAR = (0.01, 0.002, float(np.radians(0.05)))
+#: that are off alike (rad): 0.05 degrees, and a third for the paths that they bend (in simulated yards).
+OF_A_LIDAR = (0.01, 0.002, 4.0 / 3.0 * float(np.radians(0.05)))
 
 
 @dataclass(frozen=True)
@@ -161,32 +163,36 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
         for _ in range(STEPS):
             several = [matches(each.second, each.first, T, gate * each.spacing_m) for each in places]
             sigma_m = sigmas(several, gate * spacing_m)
-            told = [
-                (place, each, known(each, sigma_m)) for place, each in zip(places, several, strict=True) if len(each.at)
-            ]
+            pairs = zip(places, several, strict=True)
+            told = [(place, each, known(each, sigma_m)) for place, each in pairs if len(each.at)]
             if len(told) < FEWEST_PLACES:
                 return replace(nothing, why_not=f"they overlap at {len(told)} places, and {FEWEST_PLACES} are needed")
             unit, _ = units(np.concatenate([each.points for _, each, _ in told]))
-            tells, total = _without_slides([tell for *_, tell in told], unit)
-            right = np.sum([each.information @ each.step for each in tells], axis=0)
-            step = np.linalg.pinv(total, ROUNDING, hermitian=True) @ right
+            tells, total, told_of = _without_slides([tell for *_, tell in told], unit)
+            together = np.linalg.pinv(total, ROUNDING, hermitian=True)
+            step = together @ np.sum([each.information @ each.step for each in tells], axis=0)
             T = T @ se3.expmap(step[None])[0]
             if np.linalg.norm(step[:3]) / SPACING + np.linalg.norm(step[3:]) / spacing_m < SETTLED:
                 break
-    overlap = float(np.median([each.overlap for each in several]))
+    every = [each.second.faces.normals for each in places]
+    met = [normals[each.at] for normals, each in zip(every, several, strict=True)]
+    # Another yard has the same ground: what counts is the direction of which least is met. A unit is for flat worlds.
+    squares = (normals.T @ normals + np.eye(3) for normals in map(np.concatenate, (met, every)))
+    overlap = float(eigh(*squares, eigvals_only=True)[0])
     if overlap < OVERLAP:
         words = f"they overlap by {overlap:.0%} where the motions put the two, and {OVERLAP:.0%} are needed"
         return replace(nothing, why_not=words)
-    step, inverse, scatter = _agreed(tells)
+    step, inverse, scatter = _agreed(tells, told_of)
     if max(scatter) > MOST_SCATTER:
         words = f"places disagree by {np.sqrt(max(scatter)):.2g} times what each claims: both did not see the same"
         return replace(nothing, why_not=words)
     T = T @ se3.expmap(step[None])[0]
-    pulls = [_alike(*each, T, sigma_m) for each in told]
-    alike = inverse @ np.sum(pulls, axis=0)
-    alike *= (*OF_A_LIDAR, *OF_A_LIDAR, nothing.clock_sigma_s)
+    pulls, shown = (np.sum(each, axis=0) for each in zip(*(_alike(*each, T, sigma_m) for each in told), strict=True))
+    # Elevations are as far off as residuals show, if that is more.
+    raised = max(OF_A_LIDAR[2], abs(float(shown[0])) / float(shown[1] + (sigma_m[0] / OF_A_LIDAR[2]) ** 2))
+    alike = together @ pulls * (*OF_A_LIDAR[:2], raised, *OF_A_LIDAR[:2], raised, nothing.clock_sigma_s)
     # What points of all places are off by together does not average out; what slides stays without weight.
-    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * np.linalg.pinv(total, ROUNDING, hermitian=True) @ total @ unit
+    shared = SHARED_BY_VIEWS[0] * sigma_m[0] * together @ total @ unit
     covariance = inverse + alike @ alike.T + shared @ shared.T
     return replace(
         nothing,
@@ -201,7 +207,7 @@ def _registered(places: Sequence[_Place], nothing: LidarsTogether, half_s: float
     )
 
 
-def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
+def _agreed(tells: Sequence[Known], told: Array) -> tuple[Array, Array, tuple[float, float]]:
     """The step (6,) that most places agree to, its covariance, and how turns and shifts scatter over what places claim.
 
     Places count less where they are far from the others (Student's t): an odometry that just began, or a moved thing.
@@ -211,12 +217,13 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
     inverses = np.linalg.pinv(information, ROUNDING, hermitian=True)
     rank = np.array([np.linalg.matrix_rank(each, hermitian=True) for each in information])
     expected = [float(np.einsum("nij,nji->", information[:, at, at], inverses[:, at, at])) for at in parts]
-    scatter, step, unsure = np.ones(2), np.zeros(6), 1.0
+    scatter, off, unsure = np.ones(2), steps, 1.0
     for _ in range(ROUNDS):
         unit = np.repeat(np.maximum(unsure * scatter, 1.0) ** -0.5, 3)
-        scaled = information * unit[:, None] * unit
-        off = steps - step
+        # Turns and shifts are scaled apart, and what slides may be both.
+        scaled = told.T @ (information * unit[:, None] * unit) @ told
         weights = (FREEDOM + rank) / (FREEDOM + np.einsum("ni,nij,nj->n", off, scaled, off))
+        weights /= max(1.0, float(weights.mean()))
         weighted = weights[:, None, None] * scaled
         inverse = np.linalg.pinv(weighted.sum(axis=0), ROUNDING, hermitian=True)
         step = inverse @ np.einsum("nij,nj->i", weighted, steps)
@@ -225,17 +232,14 @@ def _agreed(tells: Sequence[Known]) -> tuple[Array, Array, tuple[float, float]]:
             float(np.einsum("n,ni,nij,nj->", weights, off[:, at], information[:, at, at], off[:, at])) for at in parts
         ]
         count = float(weights.sum() ** 2 / (weights**2).sum())
-        spare = 1.0 - 1.0 / count
-        scatter = np.array(
-            [one / (other * spare) if other else 0.0 for one, other in zip(squares, expected, strict=True)]
-        )
+        scatter = np.array(squares) / (np.where(expected, expected, 1.0) * (1.0 - 1.0 / count))
         # The scatter of few places is itself not known: ellipsoids hold as much as if it were.
         unsure = 6.0 * float(fdtri(6.0, 3.0 * (count - 1.0), LEVEL) / chdtri(6.0, 1.0 - LEVEL))
     return step, inverse, (float(scatter[0]), float(scatter[1]))
 
 
-def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], Array]:
-    """What places tell without what slides in all of them, and the sum of the information (6, 6).
+def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], Array, Array]:
+    """What places tell without what slides in all of them, the sum of the information (6, 6), and what takes it out.
 
     Each place has another direction that slides, by the noise of its normals, so that their sum has none.
     """
@@ -243,23 +247,26 @@ def _without_slides(tells: Sequence[Known], unit: Array) -> tuple[list[Known], A
     values, along = np.linalg.eigh(unit.T @ total @ unit)
     kept = along[:, values > LEAST_SHARE * values[-1]]
     told = unit @ kept @ kept.T @ np.linalg.inv(unit)
-    return [replace(each, information=told.T @ each.information @ told) for each in tells], told.T @ total @ told
+    return [replace(each, information=told.T @ each.information @ told) for each in tells], told.T @ total @ told, told
 
 
-def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> Array:
+def _alike(place: _Place, found: Matches, tell: Known, T: Array, sigma_m: Array) -> tuple[Array, Array]:
     """How one place pulls (6, 7) at the pose for what the first and the second LiDAR have off, and for a clock.
 
-    That are the ranges, by a length and by a factor, and the elevations, about the LiDAR's own z axis.
+    That are the ranges, by a length and by a factor, and the elevations, about the LiDAR's own z axis. To that sums
+    (2,): the first over the second is by how much elevations of one are too high and those of the other too low.
     """
     moved = found.points @ T[:3, :3].T + T[:3, 3]
     rays = -place.rays[0][place.first.faces.nearest(moved)[1]] @ T[:3, :3], place.rays[1][found.at]
-    pulls, little = [], 1e-3 * float(sigma_m[0])
+    rows, offs = 0.5 * (found.rows + found.own_rows), []
     for each, up in zip(rays, (T[2, :3], np.array([0.0, 0.0, 1.0])), strict=True):
         ranges = np.linalg.norm(each, axis=1, keepdims=True)
         around = np.cross(each, up)
         raised = np.cross(around, each) / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-9)
-        for pattern in (each / ranges, each, raised):
-            off = found.residuals + little * np.einsum("ni,ni->n", found.rows[:, 3:], pattern)
-            other = known(replace(found, residuals=off), sigma_m)
-            pulls.append((other.information @ other.step - tell.information @ tell.step) / little)
-    return np.column_stack([*pulls, tell.information @ place.velocity])
+        offs.append([np.einsum("ni,ni->n", rows[:, 3:], pattern) for pattern in (each / ranges, each, raised)])
+    off = np.concatenate(offs).T
+    weights = 1.0 / (1.0 + (found.residuals / (CAUCHY * sigma_m[0])) ** 2)
+    steps = np.linalg.pinv(rows.T * weights @ rows, ROUNDING, hermitian=True) @ (rows.T * weights @ off)
+    apart = (off - rows @ steps)[:, [2, 5]].sum(axis=1)  # what no step takes away
+    pulls = tell.information @ np.column_stack([steps, place.velocity])
+    return np.asarray(pulls), (weights * apart) @ np.column_stack([found.residuals, apart])

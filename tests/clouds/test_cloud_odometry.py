@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from given_commands import command
 from rwhec_factors import se3
+from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import Cloud, LidarPath, odometry, register_lidars
@@ -140,8 +141,68 @@ def test_lidars_of_a_corridor_slide_along_it_and_those_that_saw_other_places_are
     assert "0 places have maps of both" in str(register_lidars(paths[0], replace(paths[1], maps=()), truth))
 
 
-def test_clouds_that_the_motions_contradict_are_left_out() -> None:
-    driven = lidar_drive.driven(20.0, seed=2)
+def test_a_slide_that_turns_and_shifts_has_no_weight_where_places_disagree() -> None:
+    # The vehicle turns in the middle of a round tank, so that it slides about the vehicle's own axis.
+    rng, truth = np.random.default_rng(0), se3.pose(np.eye(3), np.array([-2.0, 0.3, 0.4]))
+    around, up, out = rng.uniform(-np.pi, np.pi, 30_000), rng.uniform(-2.0, 2.0, 30_000), rng.uniform(0.0, 8.0, 30_000)
+    is_wall = rng.integers(0, 2, 30_000) == 0
+    radius = np.where(is_wall, 8.0, out)
+    world = np.column_stack([radius * np.cos(around), radius * np.sin(around), np.where(is_wall, up, -2.0)])
+    stamps = np.arange(6) * 2 * 10**9
+    poses = se3.expmap(np.outer(0.4 * np.arange(6), np.eye(6)[2]))
+    one, other = (maps_of(world, poses @ T, stamps, k) for k, T in enumerate((np.eye(4), truth)))
+    for cloud, T in zip(other, se3.expmap(rng.normal(0.0, 3e-3, (6, 6))), strict=True):
+        cloud.points[:] = cloud.points @ T[:3, :3].T + T[:3, 3]
+    slid = se3.expmap(-0.05 * np.eye(6)[2:3])[0] @ truth
+    paths = [LidarPath(f"lidar {k}", each, Trajectory(stamps, poses)) for k, each in enumerate((one, other))]
+    found = register_lidars(*paths, slid)
+    assert max(found.scatter) > 2.0
+    assert "what slides (1 of 6 directions)" in str(found)
+    error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
+    assert np.linalg.norm(error) > 0.03  # as the start had it
+    assert error @ found.information @ error < 20.0
+
+
+def yard_and_way(rng: np.random.Generator, first_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a ground and of low walls every 7 m, from one on, and poses with stamps of a way through it."""
+    ground = rng.uniform(-20.0, 40.0, (40_000, 3)) * (1.0, 1.0, 0.0)
+    one = ground[:20_000]
+    walls = np.column_stack([np.round(one[:, :1] / 7.0) * 7.0 + first_m, one[:, 1], rng.uniform(0.0, 3.0, len(one))])
+    stamps, poses = np.arange(6) * 2 * 10**9, np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.arange(6)[:, None] * (3.0, 1.0, 0.0) + (0.0, 0.0, 1.8)
+    return np.concatenate([ground, walls, walls[:, [1, 0, 2]]]), poses, stamps
+
+
+@pytest.mark.parametrize("raised_deg", [(-0.1, 0.0), (0.1, -0.1), (0.0, -0.3)])
+def test_elevations_that_are_off_are_in_the_covariance(raised_deg: tuple[float, float]) -> None:
+    # 0.1 degrees are two standard deviations of what is expected; 0.3 are not, and residuals show them.
+    truth, paths = lidar_drive.MOUNTS["rear"], []
+    world, poses, stamps = yard_and_way(np.random.default_rng(0), 0.0)
+    for k, (T, off_deg) in enumerate(zip((np.eye(4), truth), raised_deg, strict=True)):
+        maps = maps_of(world, poses @ T, stamps, k)
+        for cloud in maps:
+            sideways = np.cross(cloud.points, np.eye(3)[2])
+            sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+            cloud.points[:] += np.radians(off_deg) * np.cross(sideways, cloud.points)
+        paths.append(LidarPath(f"lidar {k}", maps, Trajectory(stamps, poses @ T)))
+    found = register_lidars(*paths, truth)
+    error = se3.logmap((np.linalg.inv(truth) @ found.T_first_second)[None])[0]
+    assert error @ found.information @ error < 12.6  # 95 % of chi2(6)
+
+
+def test_lidars_in_two_yards_of_one_ground_are_not_registered() -> None:
+    truth, paths = lidar_drive.MOUNTS["rear"], []
+    for k, T in enumerate((np.eye(4), truth)):
+        world, poses, stamps = yard_and_way(np.random.default_rng(k), 3.5 * k)
+        paths.append(LidarPath(f"lidar {k}", maps_of(world, poses @ T, stamps, k), Trajectory(stamps, poses @ T)))
+    assert "they overlap by " in register_lidars(*paths, truth).why_not
+
+
+def driven_with_maps(mounts: dict[str, np.ndarray]) -> tuple[Drive, dict[str, list[Cloud]]]:
+    """A drive on a plane with sensors there, and what they see of a ground and walls."""
+    driven = rw.simulate.drive(
+        {name: rw.simulate.SimulatedOdometry(T) for name, T in mounts.items()}, "planar", seconds=20.0, seed=2
+    )
     rng, way = np.random.default_rng(0), driven.T_world_vehicle[:, :3, 3]
     ground = rng.uniform(way.min(axis=0) - 12.0, way.max(axis=0) + 12.0, (15_000, 3)) * (1.0, 1.0, 0.0)
     walls = np.column_stack([np.round(ground[:, :1] / 7.0) * 7.0, ground[:, 1:2], rng.uniform(0.0, 3.0, 15_000)])
@@ -149,8 +210,28 @@ def test_clouds_that_the_motions_contradict_are_left_out() -> None:
     at = np.arange(10, 200, 40)
     maps = {
         name: maps_of(world, driven.T_world_vehicle[at] @ T, driven.stamps_ns[at], k)
-        for k, (name, T) in enumerate(lidar_drive.MOUNTS.items())
+        for k, (name, T) in enumerate(mounts.items())
     }
+    return driven, maps
+
+
+def test_three_lidars_agree_by_their_clouds() -> None:
+    aside = Rotation.from_euler("zyx", [95, -6, 10], degrees=True).as_matrix()
+    mounts = {**lidar_drive.MOUNTS, "left": se3.pose(aside, np.array([0.2, 0.9, 1.6]))}
+    driven, maps = driven_with_maps(mounts)
+    tracks = [rw.odometry.OdometryTrack(name, *each) for name, each in driven.tracks.items()]
+    options = rw.odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
+    found = rw.odometry.calibrate_odometries(tracks, reference="front", options=options, maps=maps)
+    assert [each.why_not for each in found.together] == ["", "", ""]
+    assert found.judgement.verdict == "use", found.judgement
+    for name in ("rear", "left"):
+        T = np.linalg.inv(driven.T("front", name)) @ found.T_reference_sensor[name]
+        error = se3.logmap(T[None])[0]
+        assert error @ np.linalg.solve(found.covariance_of(name), error) < 16.8  # 99 % of chi2(6)
+
+
+def test_clouds_that_the_motions_contradict_are_left_out() -> None:
+    driven, maps = driven_with_maps(lidar_drive.MOUNTS)
     tracks = [rw.odometry.OdometryTrack(name, *each) for name, each in driven.tracks.items()]
     options = rw.odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
     shifted = {**maps, "rear": [replace(each, points=each.points + np.eye(3)[0]) for each in maps["rear"]]}
