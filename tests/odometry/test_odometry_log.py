@@ -92,6 +92,7 @@ def test_six_odometries_through_the_command(six: tuple[Drive, Path, Any]) -> Non
     driven, folder, done = six
     assert done.exit_code == ExitStatus.CERTIFIED, done.stdout + done.stderr
     assert done.stdout.startswith("Use these poses")
+    assert done.stdout.count("\n") <= 24  # a screen, as of cameras
     result = read_odometry_result(folder / "out" / "result.json")
     assert result.certificate.status == "certified"
     assert result.not_determined == ()
