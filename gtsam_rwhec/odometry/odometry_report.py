@@ -24,7 +24,14 @@ from gtsam_rwhec.report.report_blocks import (
     Table,
     Words,
 )
-from gtsam_rwhec.report.terminal_report import STYLES, print_blocks, print_list, print_sections, print_sentence, report_console
+from gtsam_rwhec.report.terminal_report import (
+    STYLES,
+    print_blocks,
+    print_list,
+    print_sections,
+    print_sentence,
+    report_console,
+)
 from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, POSE_HEADINGS
 
 #: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.

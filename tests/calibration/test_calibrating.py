@@ -299,7 +299,9 @@ def test_copies_of_measurements_count_once() -> None:
     A = poses(chance, 20, 0.6, 0.3)
     B = noisy(chance, A, 2e-3)
     once = rw.calibrate(problem_of(A, B))
-    twice = rw.calibrate(problem_of(np.concatenate([A, A[::2]]), np.concatenate([B, B[::2]])))
+    copied_rows = problem_of(np.concatenate([A, A[::2]]), np.concatenate([B, B[::2]]))
+    twice = rw.calibrate(copied_rows)
     np.testing.assert_allclose(twice.Y["camera"].matrix(), once.Y["camera"].matrix(), atol=1e-9)
     np.testing.assert_allclose(twice.covariance("camera"), once.covariance("camera"), rtol=1e-4, atol=1e-12)
     assert twice.notes[0] == "10 of 30 measurements are copies of others, to the last digit: each counts once"
+    assert rw.results.evidence_of(copied_rows, twice).residuals is not None
