@@ -338,8 +338,11 @@ def moved_at_the_end(refined: Refined, measured: Mapping[Pair, Measured]) -> Two
     """The frame, or one of two, that is no longer where the answer has it: the last measurements agree on another pose.
 
     None where none is. Of n measurements k are left out, the last r of all among them; if each set of k is as likely,
-    this has the probability (n - r choose k - r) / (n choose k). So a step counts that noise alone would not show.
+    this has the probability (n - r choose k - r) / (n choose k). So a step counts that noise alone would not show. Not
+    so in a stream, where neighbours are one view of a target, and not where another pair of the frame went on.
     """
+    ended = {name for pair in measured for name in pair.frames}
+    ended -= {name for pair, one in measured.items() if one.kept[-1:].any() for name in pair.frames}
     for pair, one in measured.items():
         n, k = len(one.kept), int((~one.kept).sum())
         last = np.arange(n) > np.flatnonzero(one.kept).max(initial=-1)
@@ -347,11 +350,14 @@ def moved_at_the_end(refined: Refined, measured: Mapping[Pair, Measured]) -> Two
         is_chance = len(measured) * math.comb(n - r, k - r) > BY_CHANCE * math.comb(n, k)
         if not FEWEST_LAST <= r < n or is_chance or not len(twists[0]):
             continue
+        nearest = cKDTree(one.A[:, :3].reshape(n, -1))
+        if last[np.asarray(nearest.query(nearest.data[last], k=2)[1])[:, 1]].mean() > 0.5:
+            continue
         steps = []
         for name, of in zip(pair.frames, twists, strict=True):
             middle, near = np.median(of[last], axis=0), np.median(_sizes(of[one.kept]), axis=0)
             off = _sizes(of[last] - middle)
-            if (off <= NEAR * np.maximum(near, LEAST)).all(axis=1).mean() >= MOST_OF_THEM:
+            if name in ended and (off <= NEAR * np.maximum(near, LEAST)).all(axis=1).mean() >= MOST_OF_THEM:
                 steps.append((np.maximum(np.median(off, axis=0), LEAST).prod(), name, *_sizes(middle[None])[0]))
         steps.sort()
         if steps:

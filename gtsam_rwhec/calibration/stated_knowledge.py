@@ -28,6 +28,7 @@ from gtsam_rwhec.calibration.moved_frames import (
     two_poses,
 )
 from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.calibration.row_shifts import between_rows
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
@@ -168,6 +169,8 @@ def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
     found = found or moved_at_the_end(refined, measured) or mixed_sensors(refined, measured)
     if found is not None:
         run.record.find(Ground.MIXED if found.by_turns else Ground.MOVED, str(found))
+    elif not run.problem.directed and (late := between_rows(refined, measured, DOUBTFUL_CHANCE)) is not None:
+        run.record.find(Ground.LATE_POSES, str(late))
 
 
 def _moved(run: Run, at: Mapping[Pair, AtStations], measured: Mapping[Pair, Measured]) -> TwoPoses | None:

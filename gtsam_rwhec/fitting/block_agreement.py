@@ -113,8 +113,11 @@ def scatter_of_blocks(task: Task, found: Settled) -> tuple[Scatter, ...]:
 
 
 def most_beyond_chance(scatter: Iterable[Scatter | None]) -> list[Scatter]:
-    """The scatter that is most beyond chance; none of none."""
-    return sorted((one for one in scatter if one is not None), key=lambda one: one.chance)[:1]
+    """The scatter that is most beyond chance, which had as many chances as there are frames; none of none."""
+    found = [one for one in scatter if one is not None]
+    return [
+        replace(one, chance=min(1.0, len(found) * one.chance)) for one in sorted(found, key=lambda one: one.chance)[:1]
+    ]
 
 
 def place_of_instants(task: Task, model: NoiseModel, by: str) -> np.ndarray:
