@@ -1,7 +1,8 @@
 """Shifts between the rows of A and B of one pair: the cost of each row at each shift, and the shifts that cost least.
 
 Many parts of the rows are fitted in closed form, at each shift: a part in which all rows have one shift gives X and Y,
-and these tell the shifts of all other rows.
+and these tell the shifts of all other rows. `between_rows` asks whether A lies a part of a step beside its row: a
+robot logs its pose before its move has ended, or a clock is late where there are no stamps.
 """
 
 from __future__ import annotations
@@ -193,8 +194,9 @@ def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: fl
 
 def _fitted(J: Array, e: Array) -> tuple[float, float, Array]:
     """The logarithms of both spreads of e + J x at their best, its last unknown, and what is left in deviations."""
-    w, x, r = np.ones(6), np.zeros(J.shape[2]), e
-    spreads = np.ones(2)
+    w: Array = np.ones(6)
+    spreads: Array = np.ones(2)
+    x, r = np.zeros(J.shape[2]), e
     for _ in range(ROUNDS):
         x = np.linalg.lstsq((w[:, None] * J).reshape(e.size, -1), -(w * e).reshape(-1), rcond=None)[0]
         r = e + J @ x
