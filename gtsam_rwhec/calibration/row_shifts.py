@@ -195,8 +195,8 @@ def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: fl
 def _fitted(J: Array, e: Array) -> tuple[float, float, Array]:
     """The logarithms of both spreads of e + J x at their best, its last unknown, and what is left in deviations."""
     w: Array = np.ones(6)
-    spreads: Array = np.ones(2)
-    x, r = np.zeros(J.shape[2]), e
+    x: Array = np.zeros(J.shape[2])
+    r, spreads = e, w[:2]
     for _ in range(ROUNDS):
         x = np.linalg.lstsq((w[:, None] * J).reshape(e.size, -1), -(w * e).reshape(-1), rcond=None)[0]
         r = e + J @ x
