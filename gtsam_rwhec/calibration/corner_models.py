@@ -221,7 +221,7 @@ def findings_of(
     """What the corners say against stated intrinsics, and what no model explains."""
     for name, one in intrinsics.items():
         innovation = corners.intrinsics[name].innovation
-        if innovation.is_contradicted:
+        if innovation.is_contradicted and one.stated_as != "unknown":  # what nobody stated cannot be wrong
             stated, found = _numbers(one.stated_camera), _numbers(one.camera)
             words = (
                 f"the intrinsics of {name}, as stated ({stated}), do not fit its corners ({innovation.deviations:.2g} "

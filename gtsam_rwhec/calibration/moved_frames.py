@@ -8,6 +8,7 @@ are left out as outliers, and agree with one another in the axes of the frame th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -328,6 +329,44 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
     if _come_and_go(kept):
         return None
     return replace(found, from_row=_moment(kept[0])[0] if len(kept) == 1 else None)
+
+
+#: By chance the last measurements are those that are left out with this probability at most; and there are so many.
+BY_CHANCE, FEWEST_LAST = 0.01, 3
+
+
+def moved_at_the_end(refined: Refined, measured: Mapping[Pair, Measured]) -> TwoPoses | None:
+    """The frame, or one of two, that is no longer where the answer has it: the last measurements agree on another pose.
+
+    None where none is. Of n measurements k are left out, the last r of all among them; if each set of k is as likely,
+    this has the probability (n - r choose k - r) / (n choose k). So a step counts that noise alone would not show. Not
+    so in a stream, where neighbours are one view of a target, and not where another pair of the frame went on.
+    """
+    ended = {name for pair in measured for name in pair.frames}
+    ended -= {name for pair, one in measured.items() if one.kept[-1:].any() for name in pair.frames}
+    for pair, one in measured.items():
+        n, k = len(one.kept), int((~one.kept).sum())
+        last = np.arange(n) > np.flatnonzero(one.kept).max(initial=-1)
+        r, twists = int(last.sum()), _residual_twists(refined, pair, one.A, one.B)
+        is_chance = len(measured) * math.comb(n - r, k - r) > BY_CHANCE * math.comb(n, k)
+        if not FEWEST_LAST <= r < n or is_chance or not len(twists[0]):
+            continue
+        nearest = cKDTree(one.A[:, :3].reshape(n, -1))
+        if last[np.asarray(nearest.query(nearest.data[last], k=2)[1])[:, 1]].mean() > 0.5:
+            continue
+        steps = []
+        for name, of in zip(pair.frames, twists, strict=True):
+            middle, near = np.median(of[last], axis=0), np.median(_sizes(of[one.kept]), axis=0)
+            off = _sizes(of[last] - middle)
+            if name in ended and (off <= NEAR * np.maximum(near, LEAST)).all(axis=1).mean() >= MOST_OF_THEM:
+                steps.append((np.maximum(np.median(off, axis=0), LEAST).prod(), name, *_sizes(middle[None])[0]))
+        steps.sort()
+        if steps:
+            _, name, angle, distance = steps[0]
+            is_open = any(spread < OUTLIERS_BETTER * steps[0][0] for spread, *_ in steps[1:])
+            who = " or ".join(pair.frames) if is_open else name
+            return TwoPoses(who, n - k, r, angle, distance, n - r + 1, not is_open and name == pair.sensor)
+    return None
 
 
 #: So many outliers of two mixed sensors agree on the second, and this share of all: boards' turns may be wrong. Where

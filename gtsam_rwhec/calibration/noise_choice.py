@@ -298,7 +298,8 @@ def _say_blocks(run: Run, model: NoiseInData) -> None:
     run.record.choose("blocks of the log", "do not agree; the standard deviations are larger for it", str(worst))
     if worst.is_by_far and not model.is_drift_untried:  # which is said
         words = f"{worst}: errors are of another kind than any model of the noise that was tried, and last for long"
-        run.record.find(Ground.CORRELATED, words)
+        moved = " (a mount or a target that gave way does this, too)" if worst.by == "time" else ""
+        run.record.find(Ground.CORRELATED, f"{words}{moved}")
 
 
 def _say_systematic(run: Run, model: NoiseInData) -> None:

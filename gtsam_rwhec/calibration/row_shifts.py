@@ -1,18 +1,26 @@
 """Shifts between the rows of A and B of one pair: the cost of each row at each shift, and the shifts that cost least.
 
 Many parts of the rows are fitted in closed form, at each shift: a part in which all rows have one shift gives X and Y,
-and these tell the shifts of all other rows.
+and these tell the shifts of all other rows. `between_rows` asks whether A lies a part of a step beside its row: a
+robot logs its pose before its move has ended, or a clock is late where there are no stamps.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from rwhec_factors.se3 import inverse
+from rwhec_factors.se3 import adjoint, inverse, logmap
+from scipy.special import chdtrc
 
+from gtsam_rwhec.calibration.moved_frames import LEAST, Measured
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Spread, angles
+from gtsam_rwhec.files.terminal_text import rounded
+from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.sample_poses import poses_of_samples
 
 #: B's row i may belong to the rows of A from i - 3 to i + 3.
@@ -125,3 +133,73 @@ def fits_of_parts(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tupl
     w = weight.shape[1]
     spent = math.sqrt(6 * w / max(6 * w - 12 - is_scaled, 1))
     return Y, X, scale, spent * np.median(errors, axis=-1)
+
+
+#: Pairs of fewer rows are not tested; of more than the second, some all over them are.
+FEWEST_BETWEEN, MOST_BETWEEN = 6, 2000
+#: Rounds in which the weights of rotation and translation settle.
+ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class BetweenRows:
+    """Poses A that lie between those of two rows; ``str()`` is one sentence."""
+
+    pair: Pair
+    #: How far on the way to the pose before; or, for a late clock, how many rows later than B (less than 0: earlier)
+    share: float
+    is_late: bool
+    sigmas: float  #: The share in its standard deviations
+
+    def __str__(self) -> str:
+        where = f"{100.0 * abs(self.share):.2g} % of "
+        if self.is_late:
+            where += f"a row {'later' if self.share > 0.0 else 'earlier'} than its B: a clock is off, in motion"
+        else:
+            where += f"the way {'to' if self.share > 0.0 else 'away from'} the pose before it: it was logged too early"
+        return f"each A of {self.pair} is {where} ({rounded(self.sigmas)} standard deviations)"
+
+
+def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: float) -> BetweenRows | None:
+    """The pair whose poses A surely lie between those of rows: one share of a step explains more than chance does.
+
+    With A Exp(s step), residuals e are linear in s and in what moves both frames. None also where clocks are estimated.
+    """
+    found = []
+    for pair, one in measured.items():
+        rows = np.flatnonzero(one.kept)
+        rows = rows[:: 1 + len(rows) // MOST_BETWEEN]
+        is_known = pair.target in refined.X and pair.sensor in refined.Y
+        if not is_known or pair.sensor in refined.time_offsets_s or len(rows) < FEWEST_BETWEEN:
+            continue
+        X, Y = refined.X[pair.target].matrix(), refined.Y[pair.sensor].matrix()
+        predicted, B = inverse(Y) @ one.A[rows] @ X, one.B[rows].copy()
+        B[:, :3, 3] /= refined.scale[pair.target] if isinstance(refined.scale, Mapping) else refined.scale
+        e = logmap(inverse(B) @ predicted)
+        still = np.concatenate([np.tile(np.eye(6), (len(e), 1, 1)), -adjoint(inverse(predicted))], axis=2)
+        back, on = np.zeros((2, len(one.A), 6))
+        back[1:], on[:-1] = logmap(inverse(one.A[1:]) @ one.A[:-1]), logmap(inverse(one.A[:-1]) @ one.A[1:])
+        for step, is_late in ((back, False), (0.5 * (on - back), True)):
+            along = -adjoint(inverse(X[None])) @ step[rows, :, None]  # A as it is, less so much of the step
+            less, _, _ = _fitted(still, e)
+            more, s, r = _fitted(np.concatenate([still, along], axis=2), e)
+            alike = np.clip(
+                (r[1:] * r[:-1]).sum() / (r**2).sum(), 0.0, 0.99
+            )  # neighbours that are alike count as fewer
+            evidence = (6 * len(e) - 13) * (less - more) * (1.0 - alike) / (1.0 + alike)
+            found.append(BetweenRows(pair, s, is_late, float(np.sqrt(max(evidence, 0.0)))))
+    best = max(found, key=lambda one: one.sigmas, default=None)
+    return None if best is None or len(found) * chdtrc(1.0, best.sigmas**2) > chance else best
+
+
+def _fitted(J: Array, e: Array) -> tuple[float, float, Array]:
+    """The logarithms of both spreads of e + J x at their best, its last unknown, and what is left in deviations."""
+    w: Array = np.ones(6)
+    x: Array = np.zeros(J.shape[2])
+    r, spreads = e, w[:2]
+    for _ in range(ROUNDS):
+        x = np.linalg.lstsq((w[:, None] * J).reshape(e.size, -1), -(w * e).reshape(-1), rcond=None)[0]
+        r = e + J @ x
+        spreads = np.maximum(np.sqrt((r.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), LEAST)
+        w = 1.0 / np.repeat(spreads, 3)
+    return float(np.log(spreads).sum()), float(x[-1]), w * r

@@ -46,7 +46,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import aligned_at
+from gtsam_rwhec.problem.selection import aligned_at, without_copies
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, all_slide
 from gtsam_rwhec.solver.solution import Solution, solve
 
@@ -177,6 +177,12 @@ def calibrate(
         )
     _check_what_needs_measurements(problem, options)
     check_observations(problem, options)
+    once = without_copies(problem) if recording is None else problem
+    if once is not problem:
+        found, number = calibrate(once, options, progress=progress), problem.number_of_measurements
+        copies = number - once.number_of_measurements
+        words = f"{copies} of {number} measurements are copies of others, to the last digit: each counts once"
+        return replace(found, notes=(words, *found.notes))
     run = Run(problem, options, progress or silent, recording)
     check_offsets(run)
     if problem.directed:  # residuals of every stage are then those of what is measured

@@ -21,12 +21,14 @@ from gtsam_rwhec.calibration.moved_frames import (
     TwoPoses,
     measured_of,
     mixed_sensors,
+    moved_at_the_end,
     moved_with_outliers,
     residuals_at_stations,
     step_of,
     two_poses,
 )
 from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.calibration.row_shifts import between_rows
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
@@ -164,14 +166,20 @@ def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
     measured = measured_of(run.problem, inliers)
     at = residuals_at_stations(refined, measured)
     found = two_poses(at) or _moved(run, at, measured) or moved_with_outliers(refined, measured)
-    found = found or mixed_sensors(refined, measured)
+    found = found or moved_at_the_end(refined, measured) or mixed_sensors(refined, measured)
     if found is not None:
         run.record.find(Ground.MIXED if found.by_turns else Ground.MOVED, str(found))
+    elif not run.problem.directed and (late := between_rows(refined, measured, DOUBTFUL_CHANCE)) is not None:
+        run.record.find(Ground.LATE_POSES, str(late))
 
 
 def _moved(run: Run, at: Mapping[Pair, AtStations], measured: Mapping[Pair, Measured]) -> TwoPoses | None:
-    """A frame that moved once, where residuals of neighbours are alike."""
-    if likeness_of_neighbours([one.twists[0] for one in at.values()]) < CORRELATED:
+    """A frame that moved once, where residuals of neighbours are alike, in the axes of either frame.
+
+    What is left out may hide the likeness: the rest is then what fits between both poses.
+    """
+    alike = max(likeness_of_neighbours([one.twists[side] for one in at.values()]) for side in (0, 1))
+    if alike < CORRELATED and all(one.kept.all() for one in measured.values()):
         return None
     run.tell("looking for a frame that moved")
     kept = {pair: one for pair, one in measured.items() if one.kept.any()}

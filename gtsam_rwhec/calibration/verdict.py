@@ -85,6 +85,8 @@ class Ground(StrEnum):
     NO_COVARIANCE = "no_covariance"
     #: Most measurements of a target were left out as outliers; the sensors' poses rest on other targets.
     TARGET_CONTRADICTED = "target_contradicted"
+    #: Poses A lie between those of two rows: they were logged in motion, and no clock is estimated.
+    LATE_POSES = "late_poses"
     #: The corners of a sensor's boards fit its stated intrinsics badly.
     INTRINSICS_UNCERTAIN = "intrinsics_uncertain"
     #: The tags or corners of a board fit the rig file badly, or some that it has are never seen.
@@ -234,6 +236,10 @@ _ADVICE = {
     Ground.NO_COVARIANCE: "take more measurements",
     Ground.TARGET_CONTRADICTED: (
         "do not use the pose of the named target; check whether it has moved, and measure it again"
+    ),
+    Ground.LATE_POSES: (
+        "log the carriers' pose and take the image when all is at rest; or give both with stamps, so that the clock's "
+        "offset is estimated (stamps_ns; in a rig file time_offset: estimate)"
     ),
     Ground.INTRINSICS_UNCERTAIN: _CALIBRATE_INTRINSICS,
     Ground.SHAPE_UNCERTAIN: _MEASURE_BOARD,

@@ -199,10 +199,10 @@ def frames_of_odometries(solved: OdometrySolved) -> RigFrames:
 
 
 def is_of_odometries(rig: Rig | None, source: str | Path | None = None) -> bool:
-    """Whether a rig file (or that in a stage's log) has odometries only, and one of them as reference."""
+    """Whether a rig file (or that in a stage's log or folder) has odometries only, and one of them as reference."""
     if rig is not None:
         return rig.is_of_odometries
-    if source is None or not Path(source).is_file():
+    if source is None or not Path(source).exists():
         return False
     try:
         with open_log(source) as log:

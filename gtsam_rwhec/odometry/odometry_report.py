@@ -24,13 +24,18 @@ from gtsam_rwhec.report.report_blocks import (
     Table,
     Words,
 )
-from gtsam_rwhec.report.terminal_report import STYLES, print_list, print_sections, print_sentence, report_console
+from gtsam_rwhec.report.terminal_report import (
+    STYLES,
+    print_blocks,
+    print_list,
+    print_sections,
+    print_sentence,
+    report_console,
+)
 from gtsam_rwhec.report.verdict_section import DEVIATION_HEADINGS, POSE_HEADINGS
 
 #: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.
 FREE_SHARE = 0.1
-#: The sections that a report without details has.
-BRIEF = ("poses", "given", "noise", "proof")
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along "
     "and about the sensor's own axes; free: not determined."
@@ -41,12 +46,16 @@ def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path 
     """Print the report of a calibration of odometries: what matters, or all that its page says."""
     console = report_console()
     print_sentence(console, str(result.judgement), STYLES[result.verdict])
-    if page is not None:
-        print_sentence(console, f"The report: {shown_path(page)}")
     sections = odometry_page(result).sections[1:]
-    print_sections(console, sections if verbose else [one for one in sections if one.name in BRIEF and one.blocks])
-    if not verbose:
+    if verbose:
+        print_sections(console, sections)
+    else:
+        print_sentence(console, f"{result.certificate.sentence}.")
         print_list(console, [f"{words[:1].upper()}{words[1:]}." for words in result.remarks])
+        print_blocks(console, next(one.blocks for one in sections if one.name == "poses"))
+    more = [*([] if page is None else [shown_path(page)]), *([] if verbose else ["--verbose"])]
+    if more:
+        print_sentence(console, f"{'The page' if verbose else 'Everything else'}: {', or '.join(more)}.")
 
 
 def pose_table(result: OdometryResult) -> Table:

@@ -74,6 +74,20 @@ def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
     return reweighted(problem, masks)
 
 
+def without_copies(problem: Problem) -> Problem:
+    """The problem with each measurement once: A and B that are another row's to the last bit were copied.
+
+    Noise makes no two measurements alike, so a copy says nothing new; counted, it would make deviations smaller.
+    """
+    keep = {}
+    for pair in problem.pairs if problem.has_measurements else ():
+        raw = problem.measurements(*pair)
+        rows = np.concatenate([raw.A, raw.B], axis=1).reshape(len(raw.A), -1) + 0.0  # no -0.0
+        first = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}"), return_index=True)[1]
+        keep[pair] = np.isin(np.arange(len(rows)), first)
+    return problem if all(mask.all() for mask in keep.values()) else selected(problem, keep)
+
+
 def reweighted(problem: Problem, weights: ByPair[ArrayLike], factors: VarianceFactors = AS_STATED) -> Problem:
     """The problem with each measurement's squared residual multiplied by a weight; the problem itself is not changed.
 

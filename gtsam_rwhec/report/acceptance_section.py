@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from gtsam_rwhec.files.terminal_text import rounded, shown
+from gtsam_rwhec.files.terminal_text import printable, rounded
 from gtsam_rwhec.report.report_blocks import Block, Listing, Paragraph, Table, Tone, Words, significant
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.report.terminal_report import print_blocks, print_heading, report_console
@@ -72,4 +72,4 @@ def print_acceptance(found: Acceptance) -> None:
 
 def _remarks(found: Acceptance) -> Iterator[Block]:
     if found.remarks:
-        yield Listing(tuple(f"{words[0].upper()}{words[1:]}." for words in map(shown, found.remarks)))
+        yield Listing(tuple(f"{words[0].upper()}{words[1:]}." for words in map(printable, found.remarks)))

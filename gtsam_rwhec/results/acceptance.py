@@ -279,7 +279,9 @@ def _checked_noise(noise_mm: float | tuple[float, float] | None) -> tuple[float,
 def _checked_sensor(sensor: str | None, names: tuple[str, ...]) -> str:
     listed = ", ".join(map(shown, names))
     if sensor is None and len(names) > 1:
-        raise FrameError(f"the calibration has the sensors {listed}; say which one is tested: sensor=NAME")
+        raise FrameError(
+            f"the calibration has the sensors {listed}; say which one is tested: --sensor NAME, sensor=NAME"
+        )
     if sensor is not None and sensor not in names:
         raise FrameError(f"there is no sensor {brief(sensor)}; the calibration has {listed}")
     return names[0] if sensor is None else sensor

@@ -200,8 +200,11 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
         The problem was made with ``keep_measurements=False``.
     """
     inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
-    if any(finding.ground is Ground.ROWS_REPAIRED for finding in calibration.findings):
-        problem = calibration.problem  # whose rows are where they belong
+    of_rows = calibration.problem
+    if any(finding.ground is Ground.ROWS_REPAIRED for finding in calibration.findings) or (
+        of_rows.number_of_measurements < problem.number_of_measurements
+    ):
+        problem = of_rows  # whose rows are where they belong, and there once
     rows = measured_rows(problem, calibration)
     model = LinearModel.of(rows, calibration)
     carriers = problem.sensor_carrier, problem.target_carrier

@@ -95,7 +95,7 @@ def _cameras(folder: Path, notes: list[str]) -> list[tuple[ImageFolder, FolderPo
     if not found:
         raise RigError(
             f"{folder}: no folder in it has two images or more that can be read (of depth images three, of 16 bits or "
-            "of floating point)"
+            "of floating point); for trajectories alone (TUM, CSV) docs/odometry.md has a rig file"
         )
     with_poses = [(camera, camera.poses) for camera in found if camera.poses is not None]
     if not with_poses:

@@ -371,6 +371,11 @@ def _ground(given: GivenSection, reference: str | None) -> Iterator[Fault]:
                 f"{height:g} m above the ground, and given.ground says that the ground is {ground.below_m:g} m below "
                 f"{reference}; correct one of the two",
             )
+    over_m = given.heights_m.get(str(reference), 0.0 if ground is None else ground.below_m)
+    for name, height in given.heights_m.items():
+        if height < 0.0 < over_m:  # from a reference at height 0 on they may be relative
+            words = f"{height:g} m is below the ground, which is {over_m:g} m below {reference}"
+            yield ("given", "heights_m", name), f"{words}; give its height over the ground"
     others = [name for name in given.heights_m if name != reference]
     if others and reference is not None and reference not in given.heights_m and ground is None:
         yield (

@@ -26,7 +26,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_sections import START, odometry_topic
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.runs.kept_detections import KeptDetections
-from gtsam_rwhec.runs.run_log import clouds_topic, detections_topic, image_name, image_names
+from gtsam_rwhec.runs.run_log import clouds_topic, detections_topic, image_key, image_name, image_names
 from gtsam_rwhec.runs.sensor_detections import SensorDetections, message_count
 
 #: Points of a view that are kept, for people who look at the log and for the report.
@@ -71,14 +71,15 @@ class _Source:
                 yield record.stamp_ns, cloud
 
     def _cloud(self, record: Record) -> Cloud:
+        file = self.names.get(image_key(self.topic, record.stamp_ns), "")  # without one, errors name topic and stamp
         if isinstance(record, CloudRecord):
             # Registration thins clouds. Those of half a million points cost time and memory as they are.
-            return cloud_of_record(record, self.unit_m or METRE, source=self.name(record.stamp_ns), most=2 * DENSE)
+            return cloud_of_record(record, self.unit_m or METRE, source=file, most=2 * DENSE)
         if not isinstance(record, ImageRecord):
             raise LogError(f"topic {self.topic} has no clouds but {type(record).__name__}s")
         if self.camera is None:
             raise LogError(f"topic {self.topic} has depth images, which need intrinsics; state them for this sensor")
-        return cloud_of_depth(record, self.camera, self.unit_m, source=self.name(record.stamp_ns))
+        return cloud_of_depth(record, self.camera, self.unit_m, source=file)
 
 
 def detect_in_clouds(

@@ -310,3 +310,17 @@ def test_three_stations_are_too_few_for_a_covariance_that_is_relied_on() -> None
     assert "3 measurements are too few to tell how large their noise is" in calibration.verdict_reason
     given = problem_of(A, B, 0.001, 5e5)
     assert "too few" not in rw.calibrate(given, rw.CalibrateOptions(noise="given")).verdict_reason
+
+
+def test_copies_of_measurements_count_once() -> None:
+    """A file that was written twice made deviations 1.4 times as small: in 4 of 100 USE with chi2 of 37 and more."""
+    chance = np.random.default_rng(5)
+    A = poses(chance, 20, 0.6, 0.3)
+    B = noisy(chance, A, 2e-3)
+    once = rw.calibrate(problem_of(A, B))
+    copied_rows = problem_of(np.concatenate([A, A[::2]]), np.concatenate([B, B[::2]]))
+    twice = rw.calibrate(copied_rows)
+    np.testing.assert_allclose(twice.Y["camera"].matrix(), once.Y["camera"].matrix(), atol=1e-9)
+    np.testing.assert_allclose(twice.covariance("camera"), once.covariance("camera"), rtol=1e-4, atol=1e-12)
+    assert twice.notes[0] == "10 of 30 measurements are copies of others, to the last digit: each counts once"
+    assert rw.results.evidence_of(copied_rows, twice).residuals is not None

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration import corner_models
 from gtsam_rwhec.calibration.corner_models import chosen_model, growth_by_intrinsics, in_words, thinned
 from gtsam_rwhec.calibration.from_corners import MEASUREMENTS, corners_found
 from gtsam_rwhec.calibration.verdict import Ground
@@ -159,3 +162,17 @@ def test_many_images_are_thinned_evenly() -> None:
     view = some.views["board", "cam_0"]
     assert len(view.A) == 120
     np.testing.assert_array_equal(view.A[[0, -1]], given.observations.views["board", "cam_0"].A[[0, -1]])
+
+
+@pytest.mark.parametrize(("stated", "number"), [("nominal", 1), ("unknown", 0)])
+def test_intrinsics_that_nobody_stated_are_not_called_wrong(
+    stated: str, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(corner_models, "lens_that_was_left_out", lambda *_: "")
+    camera = rw.Camera.of(640, 480, "pinhole", np.diag([500.0, 500.0, 1.0]), np.zeros(0), "camera")
+    one: Any = SimpleNamespace(stated_as=stated, stated_camera=camera, camera=camera)
+    innovation = SimpleNamespace(is_contradicted=True, deviations=6.6)
+    corners: Any = SimpleNamespace(intrinsics={"camera": SimpleNamespace(innovation=innovation)}, Y={})
+    tried: Any = SimpleNamespace(unexplained=0.0, options=None)
+    observations: Any = None
+    assert len(list(corner_models.findings_of(observations, corners, tried, {"camera": one}))) == number

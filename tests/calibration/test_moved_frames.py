@@ -14,6 +14,7 @@ from gtsam_rwhec.calibration.moved_frames import (
     TwoPoses,
     measured_of,
     mixed_sensors,
+    moved_at_the_end,
     moved_with_outliers,
     residuals_at_stations,
     step_of,
@@ -189,6 +190,53 @@ def test_calibrate_says_that_a_board_moved_late_in_place_of_outliers() -> None:
     judgement = rw.calibrate(problem).judgement
     assert judgement.grounds == (rw.Ground.MOVED,)
     assert "board was at two poses from measurement 19 on" in judgement.reason
+
+
+SLIPS = 20
+
+
+def slipped(at: int, seed: int, count: int = SLIPS) -> rw.Problem:
+    """The mount of a camera slips by 0.46 degrees and 4 mm; noise of 0.07 degrees and 0.4 mm."""
+    chance = np.random.default_rng(seed)
+    X, Y = poses(chance, 2, 1.0, 0.4)
+    A = poses(chance, count, 1.5, 0.3)
+    then = Y @ expmap(np.array([[8e-3, 0.0, 0.0, 0.0, 4e-3, 0.0]]))[0]
+    Y = np.where((np.arange(count) >= at)[:, None, None], then, Y)
+    return problem_of(A, inverse(Y) @ A @ X @ poses(chance, count, 1.2e-3, 4e-4))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_halves_of_few_measurements_disagree_too(seed: int) -> None:
+    """The step was taken for noise: USE, as from 20 measurements on alone halves of them were compared."""
+    judgement = rw.calibrate(slipped(8, seed, 16)).judgement
+    assert judgement.grounds == (rw.Ground.CORRELATED,)
+    assert "a mount or a target that gave way does this" in judgement.reason
+
+
+def test_a_mount_that_slipped_is_alike_in_its_own_axes_and_not_in_those_of_the_target() -> None:
+    judgement = rw.calibrate(slipped(SLIPS // 2, 6)).judgement
+    assert judgement.grounds[0] is rw.Ground.MOVED
+    assert "camera was at two poses" in judgement.reason
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_last_measurements_that_agree_on_another_pose_have_moved(seed: int) -> None:
+    """They were four outliers of twenty: USE, with the camera where it no longer was (4 mm, chi2 of 200 and more)."""
+    calibration = rw.calibrate(slipped(SLIPS - 4, seed))
+    assert calibration.judgement.grounds[0] is rw.Ground.MOVED
+    assert f"from measurement {SLIPS - 3} on" in calibration.verdict_reason
+    assert calibration.refined is not None
+    (one,) = measured_of(calibration.problem, calibration.outliers.inliers).values()
+    earlier = Measured(*(np.roll(of, 8, axis=0) for of in (one.A, one.B, one.kept)))  # it was put back
+    assert moved_at_the_end(calibration.refined, {PAIR: earlier}) is None
+    A, last = one.A.copy(), np.arange(SLIPS) >= SLIPS - 4  # neighbours in a stream are one view, which may be misread
+    A[last] = A[-1] @ poses(np.random.default_rng(seed), 4, 1e-3, 1e-3)
+    X, Y = calibration.X["board"].matrix(), calibration.Y["camera"].matrix()
+    B = np.where(last[:, None, None], inverse(Y @ STEP) @ A @ X, one.B)
+    assert moved_at_the_end(calibration.refined, {PAIR: Measured(A, B, ~last)}) is None
+    B = one.B.copy()
+    B[~one.kept] = B[~one.kept] @ poses(np.random.default_rng(seed), int((~one.kept).sum()), 0.2, 0.1)
+    assert moved_at_the_end(calibration.refined, {PAIR: Measured(one.A, B, one.kept)}) is None
 
 
 HALVED = 60

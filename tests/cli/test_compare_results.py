@@ -152,6 +152,12 @@ def test_touches_accept_a_calibration_or_not(folder: Path, tmp_path: Path) -> No
         (found,) = rw.results.read_result(result).acceptance
         assert done.stdout.startswith(str(found))
         assert found.source == Path(arguments[0]).name
+    lines = good.read_text().splitlines()
+    points = [line.split(",") for line in lines[1:]]
+    mixed = (",".join(one[:3] + other[3:]) for one, other in zip(points, points[::-1], strict=True))
+    (tmp_path / "mixed.csv").write_text("\n".join([lines[0], *mixed]))
+    done = given("accept", str(result), str(tmp_path / "mixed.csv"), "--limit-mm", "1", "--sensor", "right")
+    assert "which is no noise: do both points of each line belong together" in " ".join(done.output.split())
     before = result.read_bytes()
     done = given("accept", str(result), *calls[0][0], "--sensor", "right", "--no-write")
     assert done.exit_code == ExitStatus.DONE

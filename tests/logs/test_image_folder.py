@@ -11,7 +11,7 @@ from strategies import damaged, tables
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
-from gtsam_rwhec.logs.image_folder import write_image_folder
+from gtsam_rwhec.logs.image_folder import as_ns, write_image_folder
 
 POSE = "1 2 3 0 0 0.6 0.8"
 
@@ -50,6 +50,7 @@ def test_by_stamp(tmp_path: Path) -> None:
     text = f"1.700000000250000000e+09 {POSE}\n1700000001.000000001 {POSE}\n"  # as numpy.savetxt writes it, too
     records = written(tmp_path, ["1700000000300000000.png"], text)
     assert [r.stamp_ns for r in records] == [1700000000250000000, 1700000000300000000, 1700000001000000001]
+    assert as_ns("1.000000000000000056e-01") == 100_000_000  # stamps from the start of a log
 
 
 @pytest.mark.parametrize(

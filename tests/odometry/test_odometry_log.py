@@ -92,6 +92,7 @@ def test_six_odometries_through_the_command(six: tuple[Drive, Path, Any]) -> Non
     driven, folder, done = six
     assert done.exit_code == ExitStatus.CERTIFIED, done.stdout + done.stderr
     assert done.stdout.startswith("Use these poses")
+    assert done.stdout.count("\n") <= 24  # a screen, as of cameras
     result = read_odometry_result(folder / "out" / "result.json")
     assert result.certificate.status == "certified"
     assert result.not_determined == ()
@@ -116,6 +117,9 @@ def test_what_a_stage_writes_the_next_reads(six: tuple[Drive, Path, Any], tmp_pa
     first = read_odometry_result(folder / "out" / "result.json")
     solved = rw.odometry.solve_odometries_into(folder / "out" / "calibration.mcap", None, tmp_path)
     assert solved.result == first
+    of_folder = given("export", folder / "out", "-o", tmp_path / "exported")  # as that of cameras is exported
+    assert of_folder.exit_code == ExitStatus.DONE, of_folder.stdout + of_folder.stderr
+    assert (tmp_path / "exported" / "tf.yaml").read_bytes() == (folder / "out" / "tf.yaml").read_bytes()
     assert rw.odometry.read_odometries(tmp_path / "calibration.mcap").result == first
     assert {path.name for path in rw.odometry.export_odometries(tmp_path / "calibration.mcap", tmp_path)} >= {"tf.yaml"}
     with rw.logs.open_log(tmp_path / "calibration.mcap") as log:

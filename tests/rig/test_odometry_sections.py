@@ -90,6 +90,7 @@ def test_cameras_and_odometries_are_told_apart_in_a_mixed_rig() -> None:
         ("below_m: 0.52", "below_m: 0.62", 10, "heights_m.lidar_front: 0.52 m above the ground, and given.ground"),
         ("{lidar_front: 0.52, lidar_rear: 0.71}\n  ground: {up: [0, 0, 2], below_m: 0.52}", "{lidar_rear: 1}", 10,
          "heights are compared with that of the reference"),
+        ("lidar_rear: 0.71", "lidar_rear: -0.71", 10, "-0.71 m is below the ground, which is 0.52 m below lidar_front"),
         ("[0, 0, 2]", "[0, 0, 0]", 11, "given.ground.up: .* no direction; give three numbers"),
         ("sensor: wheels", "sensor: lidar_front", 12, "lidar_front is the reference, in whose axes"),
         ("of: lever_arm", "of: w", 12, r"given.directions\[0\].of: 'w'; give 'x', 'y', 'z' or 'lever_arm'"),

@@ -7,6 +7,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -220,6 +221,14 @@ def test_bad_clouds_are_named_and_the_others_used(folder: Path, made: SimulatedC
     degrees, mm = off(sensor(tmp_path / "out"), made.T_sensorcarrier_sensor)
     assert degrees < 0.1
     assert mm < 0.6
+
+
+def test_depth_images_that_show_nothing_are_named_by_topic_and_stamp() -> None:
+    dark = rw.logs.ImageRecord(5, 7, "/depth", "camera", "16UC1", bytes(24), width=4, height=3, step=8)
+    log: Any = SimpleNamespace(records=lambda topics: [dark])
+    camera = rw.Camera.of(4, 3, "pinhole", np.diag([4.0, 4.0, 1.0]), np.zeros(0), "camera")
+    ((_, error),) = cloud_detections._Source(log, "/depth", camera, None, {}).each()
+    assert str(error).startswith("topic /depth, image at 7 ns: of 12 points none is seen")
 
 
 @pytest.mark.parametrize(
