@@ -347,7 +347,7 @@ def moved_at_the_end(refined: Refined, measured: Mapping[Pair, Measured]) -> Two
     for pair, one in measured.items():
         n, k = len(one.kept), int((~one.kept).sum())
         last = np.arange(n) > np.flatnonzero(one.kept).max(initial=-1)
-        r, twists = int(last.sum()), _residual_twists(refined, pair, one.A, one.B)
+        r, twists = int(last.sum()), residual_twists(refined, pair, one.A, one.B)
         is_chance = len(measured) * math.comb(n - r, k - r) > BY_CHANCE * math.comb(n, k)
         if not FEWEST_LAST <= r < n or is_chance or not len(twists[0]):
             continue
