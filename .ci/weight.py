@@ -35,7 +35,7 @@ BUDGET = {
     # LiDARs of one vehicle registered with each other by what both saw 670, in three files; depth folders 120;
     # one registration for proposal and calibration 60; sizes that the motion hardly tells, and errors along beams 80;
     # a LiDAR beside poses of a vehicle 20; many tags by what does not change 90
-    # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; three LiDARs 20
+    # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; LiDARs 20
     "lines": 101_850,
     "code": 63_510,
     # capture has 25 files, and is a package of its own
