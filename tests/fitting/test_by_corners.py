@@ -83,7 +83,8 @@ def test_where_some_measurements_are_poses_the_answer_is_from_poses_and_says_so(
     given, problem, _ = made()
     view = given.observations.views["board", "cam_0"]
     some = problem + rw.Problem()
-    some.add("board", "cam_0", view.A[:3], problem.measurements("board", "cam_0").B[:3], 1e-3, 1e5)
+    B = problem.measurements("board", "cam_0").B[:3] + np.eye(4, k=3) * 1e-6  # copies to the last digit count once
+    some.add("board", "cam_0", view.A[:3], B, 1e-3, 1e5)
     calibration = rw.calibrate(some)
     assert calibration.refined is not None
     assert calibration.refined.reprojection is None

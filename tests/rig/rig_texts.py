@@ -8,7 +8,6 @@ carriers:
   poses: {tf: [base, hand]}
   max_gap_s: 0.3
   noise: {rotation_deg: 0.02, translation_mm: 0.2}
-  accuracy: {rotation_deg: 0.05, translation_mm: 0.5}
 sensors:
   cam_left:
     images: /cam_left/image

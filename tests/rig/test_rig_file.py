@@ -62,9 +62,7 @@ def test_everything_is_read(tmp_path: Path) -> None:
     assert rig.carriers == Carriers(
         sensors="hand", targets="base", poses=PoseSource(tf=("base", "hand")), max_gap_s=0.3,
         noise=PoseNoise(rotation_deg=0.02, translation_mm=0.2),
-        accuracy=PoseAccuracy(rotation_deg=0.05, translation_mm=0.5),
     )  # fmt: skip
-    assert rig.carriers.arm == rw.ArmAccuracy(rotation_rad=np.radians(0.05), translation_m=5e-4)
     assert list(rig.sensors) == ["cam_left", "cam_right", "driver"]
     assert rig.sensors["cam_left"] == Sensor(
         images="/cam_left/image", intrinsics=Intrinsics(topic="/cam_left/camera_info"), time_offset="estimate",
@@ -107,6 +105,9 @@ def test_what_is_left_out() -> None:
     assert rig.carriers.max_gap_s == 0.2
     assert rig.carriers.noise is None
     assert rig.carriers.arm is True
+    text = FULL.replace("  noise: {rot", "  accuracy: {rotation_deg: 0.05, translation_mm: 0.5}\n  noise: {rot", 1)
+    assert parse_rig(text, "f").carriers.accuracy == PoseAccuracy(rotation_deg=0.05, translation_mm=0.5)
+    assert parse_rig(text, "f").carriers.arm == rw.ArmAccuracy(np.radians(0.05), 5e-4)
     assert rig.sensors["cam"] == Sensor(detections="/tags", time_offset=0.0)
     assert (rig.sizes, rig.noise, rig.detection, rig.cleaning) == ("check", "estimate", {}, Cleaning())
     assert Cleaning().model_dump() == {
