@@ -18,6 +18,7 @@ from gtsam_rwhec.fitting.noise_in_data import CONSTANT, MOST_BY_CHANCE, TOLD_RAT
 from gtsam_rwhec.fitting.noise_refinement import under_noise
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.fitting.refinement_from_poses import refine
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.solution import Solution, contradicted_by, overstated_by, solve
@@ -224,11 +225,27 @@ def refined_under_its_noise(
         _say_lasting(run, noise.model)
         _say_systematic(run, noise.model)
         _say_blocks(run, noise.model)
+    arm = run.options.systematic
+    if isinstance(arm, ArmAccuracy):
+        size = f"{rounded(math.degrees(arm.rotation_rad))}° and {rounded(1e3 * arm.translation_m)} mm for each axis"
+        record.choose("accuracy of the arm", f"{size}, as you stated", run.says_so)
     # Of measurements that are too few to estimate any noise, the verdict says so.
     if noise.is_unchecked and (refined.noise_source == "given" or spare >= SPARE_EQUATIONS):
         words = "noise of A, drift and errors that vary with the configuration were not looked for"
         record.find(Ground.NOT_CHECKED, f"{words}: {noise.simple}")
     return refined, noise, refined.solution, inliers
+
+
+def moves_of_arm(refined: Refined, options: CalibrateOptions) -> list[dict[str, Array]]:
+    """How errors of an arm's stated accuracy move the frames of each carrier, where no model of the noise has them.
+
+    An error c of A, constant at the hand, moves X by Ad(X^-1) c; one at the base moves Y alike.
+    """
+    arm = options.systematic
+    if not isinstance(arm, ArmAccuracy):
+        return []
+    c = np.repeat([arm.rotation_rad, arm.translation_m], 3)
+    return [{name: pose.inverse().AdjointMap() * c for name, pose in poses.items()} for poses in (refined.X, refined.Y)]
 
 
 def _say_sizes(run: Run, model: NoiseInData, shown: str) -> None:
@@ -308,10 +325,6 @@ def _say_systematic(run: Run, model: NoiseInData) -> None:
     if not model.arms_assumed:
         record.choose(what, "none", run.says_so)
         return
-    arm = run.options.systematic
-    if isinstance(arm, ArmAccuracy):
-        size = f"{rounded(math.degrees(arm.rotation_rad))}° and {rounded(1e3 * arm.translation_m)} mm for each axis"
-        record.choose("accuracy of the arm", f"{size}, as you stated", run.says_so)
     tried = "a model with errors that vary with the carriers' configuration explains the residuals"
     if not model.has_systematic:
         how = "hardly" if model.systematic_evidence > 1.0 else "no"

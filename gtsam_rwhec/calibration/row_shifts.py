@@ -20,6 +20,7 @@ from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Spread, angles
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.refined import Refined
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import scale_at
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.solver.sample_poses import poses_of_samples
 
@@ -174,7 +175,7 @@ def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: fl
             continue
         X, Y = refined.X[pair.target].matrix(), refined.Y[pair.sensor].matrix()
         predicted, B = inverse(Y) @ one.A[rows] @ X, one.B[rows].copy()
-        B[:, :3, 3] /= refined.scale[pair.target] if isinstance(refined.scale, Mapping) else refined.scale
+        B[:, :3, 3] /= scale_at(refined.scale, pair.target)
         e = logmap(inverse(B) @ predicted)
         still = np.concatenate([np.tile(np.eye(6), (len(e), 1, 1)), -adjoint(inverse(predicted))], axis=2)
         back, on = np.zeros((2, len(one.A), 6))
@@ -183,9 +184,8 @@ def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: fl
             along = -adjoint(inverse(X[None])) @ step[rows, :, None]  # A as it is, less so much of the step
             less, _, _ = _fitted(still, e)
             more, s, r = _fitted(np.concatenate([still, along], axis=2), e)
-            alike = np.clip(
-                (r[1:] * r[:-1]).sum() / (r**2).sum(), 0.0, 0.99
-            )  # neighbours that are alike count as fewer
+            # Neighbours that are alike count as fewer.
+            alike = np.clip((r[1:] * r[:-1]).sum() / max(float((r**2).sum()), 1e-300), 0.0, 0.99)
             evidence = (6 * len(e) - 13) * (less - more) * (1.0 - alike) / (1.0 + alike)
             found.append(BetweenRows(pair, s, is_late, float(np.sqrt(max(evidence, 0.0)))))
     best = max(found, key=lambda one: one.sigmas, default=None)

@@ -25,6 +25,7 @@ from gtsam_rwhec.calibration.from_corners import (
 )
 from gtsam_rwhec.calibration.known_frames import of_knowledge
 from gtsam_rwhec.calibration.misreadings import Reading, are_too_few_to_tell, misread_as_recorded, reading_of
+from gtsam_rwhec.calibration.noise_choice import moves_of_arm
 from gtsam_rwhec.calibration.other_readings import Mistake
 from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, outliers_of, share_that_agrees_plausibly, spare_equations
 from gtsam_rwhec.calibration.point_uncertainty import Carriers, views_of
@@ -283,7 +284,8 @@ def _calibrated(run: Run) -> Calibration:
         untold = [size.untold(refined) for size in stated]
         record.findings += [Finding(Ground.SIZE_UNTOLD, words) for words in untold if words]
         of_sizes = moves_of_sizes([size for size, words in zip(stated, untold, strict=True) if not words])
-        for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes):
+        of_arm = () if found.noise.model is not None else moves_of_arm(refined, run.options)
+        for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes, *of_arm):
             refined = refined.with_errors(moves)
     best = solution if refined is None else refined
     views = {} if best is None else views_of(problem, inliers, best.scale)

@@ -52,12 +52,9 @@ OF_FOLDER = frozenset(
     {"source", "verbose", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"}
 )
 #: Parameters that overrule a choice of ``rw.calibrate``.
-OF_CHOICES = frozenset(
-    {
-        "noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "arm_accuracy_deg", "arm_accuracy_mm", "as_read",
-        "repair",
-    }
-)  # fmt: skip
+OF_CHOICES = frozenset({"noise", "robust", "as_read", "repair"}) | frozenset(
+    {"carrier_noise_deg", "carrier_noise_mm", "arm_accuracy_deg", "arm_accuracy_mm"}
+)
 #: Parameters of the certified solution alone.
 OF_SOLVE = frozenset({"method", "initial"})
 # The options that each input refuses, by the reason and what to do.
@@ -239,8 +236,8 @@ def calibrate(
         refuse(context, NOT_FOR_SAMPLES)
     if (method == "local") != (initial is not None):
         raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
-    carriers = _in_rad_and_m(rw.CarrierNoise, "--carrier-noise", carrier_noise_deg, carrier_noise_mm)
-    arm = _in_rad_and_m(rw.ArmAccuracy, "--arm-accuracy", arm_accuracy_deg, arm_accuracy_mm)
+    carriers = _stated(rw.CarrierNoise, "--carrier-noise", carrier_noise_deg, carrier_noise_mm)
+    arm = _stated(rw.ArmAccuracy, "--arm-accuracy", arm_accuracy_deg, arm_accuracy_mm)
     if repair and as_read:
         raise typer.BadParameter("--repair shifts rows that were misread, which --as-read does not look for: give one")
     if noise == "given" and (sigma is None or kappa is None):
@@ -269,13 +266,9 @@ def calibrate(
             judgement = rw.judge(solution, findings=findings)
         else:
             options = rw.CalibrateOptions(
-                noise=noise,
-                robust=robust,
-                carrier_noise=carriers,
-                systematic=arm or True,
-                misreadings=not as_read,
-                repair=repair,
-            )
+                noise=noise, robust=robust, carrier_noise=carriers, systematic=arm or True,
+                misreadings=not as_read, repair=repair,
+            )  # fmt: skip
             calibration = rw.calibrate(problem, options, progress=stage)
             if repair and rw.Ground.ROWS_REPAIRED not in calibration.judgement.grounds:
                 say("--repair: no rows slipped, and every row is as it was.", to_errors=True)
@@ -296,9 +289,7 @@ def calibrate(
     return exit_status(judgement)
 
 
-def _in_rad_and_m(
-    of: Callable[[float, float], Stated], option: str, deg: float | None, mm: float | None
-) -> Stated | None:
+def _stated(of: Callable[[float, float], Stated], option: str, deg: float | None, mm: float | None) -> Stated | None:
     """What two options state of the carriers' poses; None where neither is given."""
     if (deg is None) != (mm is None):
         raise typer.BadParameter(f"{option}-deg and {option}-mm go together: give both, or neither")

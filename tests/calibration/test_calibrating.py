@@ -55,6 +55,11 @@ def test_the_accuracy_of_an_arm_is_in_the_covariance_of_what_it_carries() -> Non
     for name in problem.targets + problem.sensors:
         turns = [one.standard_deviations(name)[0].min() for one in (plain, stated)]
         assert turns[0] < 0.7 < turns[1]
+    options = rw.CalibrateOptions(noise="given", systematic=accuracy)
+    given = rw.calibrate(copied(problem, sigma=lambda pair, raw: raw.sigma), options)
+    assert given.noise.model is None  # and the accuracy counts all the same
+    assert choice(given, "accuracy of the arm").chosen == choice(stated, "accuracy of the arm").chosen
+    assert min(given.standard_deviations(name)[0].min() for name in problem.targets + problem.sensors) > 1.1
     with pytest.raises(NoiseError, match=r"ArmAccuracy.rotation_rad is 0.0; give a positive standard deviation"):
         rw.ArmAccuracy(0.0, 0.01)
     with pytest.raises(OptionError, match="give True, False or an ArmAccuracy"):
