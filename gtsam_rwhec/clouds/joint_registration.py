@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.clouds.group_errors import of_groups
 from gtsam_rwhec.clouds.point_to_plane import (
     SHARED_BY_GROUPS,
     SHARED_BY_VIEWS,
@@ -22,16 +23,11 @@ from gtsam_rwhec.clouds.point_to_plane import (
 from gtsam_rwhec.clouds.registration import Registrations
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.directions import SEEN
 
 #: Times that points are matched anew.
 ROUNDS = 4
 #: Poses that move less than this (share of the spacing, at the thing) have settled.
 SETTLED = 1e-3
-#: Views are loose together where so many times the variance of each among the others is not known.
-LOOSE = 3.0
-#: Rounding, in shares of what each view among the others knows.
-NOTHING = 1e-9
 #: Variances of predicted poses, in those of A: a prior that leaves residuals of A as they are.
 WEAK = 9.0
 #: All points of a view are off together by this share of the gate, however little noise they have.
@@ -44,13 +40,26 @@ noise = gtsam.noiseModel
 
 @dataclass(frozen=True)
 class JointPoses:
-    """Poses T_common_sensor (N, 4, 4), their covariances (N, 6, 6; right perturbation, rotation first), the deviations
-    (2,) of the residuals of faces and of edges, and of what neighbouring points are off by together, m."""
+    """Poses of all views, and what is known of them (right perturbations, rotation first)."""
 
-    T_common_sensor: Array
-    covariances: Array
-    sigma_m: Array
-    alike_m: float
+    T_common_sensor: Array  #: (N, 4, 4)
+    alone: Array  #: (N, 6, 6): Covariances of each among the others
+    groups: Array  #: (N, 6, m): How errors of groups of views move them, one standard deviation each
+    sigma_m: Array  #: (2,): Of the residuals of faces and of edges
+    alike_m: float  #: What neighbouring points are off by together
+
+    @property
+    def covariances(self) -> Array:
+        """(N, 6, 6): Such that independent views claim no more than all together know.
+
+        For any shares p_k that sum to one, g g' of one error of groups is no more than the block diagonal
+        g_k g_k' / p_k. Here p_k ~ |g_k| in units of what the view knows alone.
+        """
+        lengths = np.sqrt(
+            np.maximum(np.einsum("nim,nij,njm->nm", self.groups, np.linalg.inv(self.alone), self.groups), 0.0)
+        )
+        shares = np.where(lengths > 0.0, lengths.sum(axis=0) / np.maximum(lengths, 1e-12), 0.0)
+        return np.asarray(self.alone + np.einsum("nim,njm,nm->nij", self.groups, self.groups, shares))
 
 
 def _square_root(information: Array) -> Array:
@@ -116,44 +125,8 @@ def joint_poses(
         known(several[k], sigma_m, n, (np.sqrt(n) * by_groups[0], np.sqrt(n) * by_groups[1])).information
         for k, n in zip(at, many.tolist(), strict=True)
     ]
-    together = of_groups(poses, i[at], j[at], np.array(of_pairs), np.array([U for U, _ in unit]))
-    return JointPoses(poses, alone + together, sigma_m, of_faces)
-
-
-def of_groups(poses: Array, i: np.ndarray, j: np.ndarray, information: Array, unit: Array) -> Array:
-    """What groups of views are off by together, (N, 6, 6), beyond what each view tells beside the others.
-
-    The views of one side of a box know each other well, and those of the other side little: its width is told by edges
-    alone. With C the covariance of all poses and D that of each view among the others, D^-1/2 C D^-1/2 then has large
-    eigenvalues m. A problem takes views as independent. For any shares p_k that sum to one, m w w' is no more than the
-    block diagonal m w_k w_k' / p_k, so p_k ~ |w_k| gives covariances that claim no more than
-    C. Where m is at most ``LOOSE``, nothing is added.
-    """
-    N = len(unit)
-    T_i_j = se3.inverse(poses[i]) @ poses[j]
-    to = np.concatenate([-se3.adjoint(se3.inverse(T_i_j)) @ unit[i], unit[j]], axis=2)
-    parts = to.transpose(0, 2, 1) @ information @ to
-    whole = np.zeros((N, N, 6, 6))
-    for rows, a in ((slice(0, 6), i), (slice(6, 12), j)):
-        for columns, b in ((slice(0, 6), i), (slice(6, 12), j)):
-            np.add.at(whole, (a, b), parts[:, rows, columns])
-    values, along = np.linalg.eigh(whole[np.arange(N), np.arange(N)])
-    known_at_all = values > SEEN * values[:, -1:]
-    roots = along * np.where(known_at_all, np.abs(values), np.inf)[:, None, :] ** -0.5
-    white = np.einsum("aki,abkl,blj->aibj", roots, whole, roots).reshape(6 * N, 6 * N)
-    # All views together may be anywhere: the thing's own pose is free.
-    anywhere = np.sqrt(np.where(known_at_all, values, 0.0))[:, :, None] * (
-        along.transpose(0, 2, 1) @ np.linalg.solve(unit, se3.adjoint(se3.inverse(poses)))
-    )
-    free = np.linalg.svd(anywhere.reshape(6 * N, 6), full_matrices=False)[0]
-    told, modes = np.linalg.eigh(white + free @ free.T)
-    loose = (told > NOTHING) & (told < 1.0 / LOOSE)
-    w = modes[:, loose].reshape(N, 6, -1)
-    lengths = np.linalg.norm(w, axis=1)
-    shares = np.where(lengths > 0.0, lengths.sum(axis=0) / np.maximum(lengths, 1e-12), 0.0)
-    excess = np.einsum("aim,ajm,am,m->aij", w, w, shares, 1.0 / told[loose] - 1.0)
-    turned = unit @ roots
-    return np.asarray(turned @ excess @ turned.transpose(0, 2, 1))
+    groups = of_groups(poses, i[at], j[at], np.array(of_pairs), np.array([U for U, _ in unit]))
+    return JointPoses(poses, alone, groups, sigma_m, of_faces)
 
 
 def _covariances(

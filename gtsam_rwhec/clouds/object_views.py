@@ -9,6 +9,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.group_errors import fitted
 from gtsam_rwhec.clouds.joint_registration import JointPoses, joint_poses
 from gtsam_rwhec.clouds.moved_views import move_of
 from gtsam_rwhec.clouds.point_to_plane import units
@@ -75,6 +76,9 @@ class SeenObject:
         Distance of neighbouring points after thinning.
     alike_m, alike_rad : float
         What all views are shifted by alike, and turned by about the thing (standard deviations): no residual shows it.
+    by_groups : (6, 6)
+        How the sensor is off by errors that groups of views have together (columns, one standard deviation each): of
+        these, ``T_sensor_object`` is without what the robot's poses show.
     """
 
     A: Array
@@ -89,6 +93,7 @@ class SeenObject:
     spacing_m: float
     alike_m: float
     alike_rad: float
+    by_groups: Array
 
     def __str__(self) -> str:
         (faces, edges), certified = 1e3 * self.sigma_m, "certified" if self.is_certified else "not certified"
@@ -119,7 +124,7 @@ class SeenObject:
             source="clouds",
         )
         off = shifted_and_turned(self.alike_m, self.alike_rad, self.T_sensor_object[used])
-        problem.alike[Pair(target, sensor)] = off
+        problem.alike[Pair(target, sensor)] = np.hstack([off, self.by_groups])
 
 
 def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> SeenObject:
@@ -166,10 +171,12 @@ def seen_from(views: Views, few: Sequence[ViewFinding], A: Array, Y: Array) -> S
     stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
     check_agreement(kept, inside, Y)
     out += [_moved(kept, k, far) for k, far in stays.items()]
-    centre = centre_of_slides(_about(origin, joint)[1])
-    B, covariances = _about(origin @ se3.pose(np.eye(3), centre), joint)
-    covariances = with_common_slides(covariances)
+    turn = _about(origin, joint)[1]
+    centre = centre_of_slides(turn @ joint.covariances @ turn.transpose(0, 2, 1))
     used = np.setdiff1d(np.arange(len(kept.at)), list(stays))
+    B, turn = _about(origin @ se3.pose(np.eye(3), centre), joint)
+    covariances = with_common_slides(turn @ joint.alone @ turn.transpose(0, 2, 1))
+    B[used], moves = fitted(kept.A[used], B[used], covariances[used], (turn @ joint.groups)[used], of_A, Y)
     poses, of_poses = np.full((len(A), 4, 4), np.nan), np.full((len(A), 6, 6), np.nan)
     poses[kept.at[used]] = B[used]
     of_poses[kept.at[used]] = covariances[used]
@@ -185,6 +192,7 @@ def seen_from(views: Views, few: Sequence[ViewFinding], A: Array, Y: Array) -> S
         joint.sigma_m,
         spacing_m,
         *_alike(float(joint.sigma_m[0]), spacing_m, joint.alike_m, size_of(kept.surfaces)),
+        moves,
     )
 
 
@@ -195,11 +203,9 @@ def _alike(sigma_m: float, spacing_m: float, alike_m: float, size_m: float) -> t
 
 
 def _about(origin: Array, joint: JointPoses) -> tuple[Array, Array]:
-    """The thing's poses T_sensor_object and their covariances, with its origin here in the common frame."""
+    """The thing's poses T_sensor_object with its origin here in the common frame, and how those of sensors move them."""
     B = se3.inverse(joint.T_common_sensor) @ origin
-    turn = se3.adjoint(se3.inverse(B))
-    covariances = turn @ joint.covariances @ turn.transpose(0, 2, 1)
-    return B, 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    return B, -se3.adjoint(se3.inverse(B))
 
 
 def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> Registrations:

@@ -19,14 +19,14 @@ ALIKE = 0.95
 ASIDE = 0.5
 #: Cauchy's constant, in deviations: 95 % efficiency for Gaussian noise.
 CAUCHY = 2.385
-#: What all points of faces, and of edges, are off by together, in their deviations. An edge is seen up to a whole point
-#: inside of where it is, and how far depends on how steep it is seen.
+#: What all points of faces, and of edges, are off by together, in their deviations. How far out an edge is seen depends
+#: on how round it is, and how steep it is seen.
 SHARED = (0.2, 0.5)
 #: The same of one view among many.
 SHARED_BY_VIEWS = (0.1, 0.5)
 #: The same of groups of views that only edges link: one sees the end of a surface where the other sees a crease, and
-#: all of their edges are off by a whole point alike.
-SHARED_BY_GROUPS = (0.1, 2.0)
+#: all of their edges are off alike. (In simulation by a third of their deviations; real sensors lose ends.)
+SHARED_BY_GROUPS = (0.1, 0.7)
 #: Information of a direction counts if it is so many of its own deviations above zero.
 SIGNIFICANT = 4.0
 #: And if it is at least this share of the largest: surfaces are round or flat to no better, as sensors see them.

@@ -49,6 +49,13 @@ LOPSIDED = 0.15
 #: Where the normal and the ray differ by more than 60 degrees, a surface ends for the eye alone: that edge wanders
 #: with the sensor.
 FACING = 0.5
+#: Neighbours of an edge by which its direction is smoothed, if they differ from it by less than 37 degrees.
+BESIDE_EDGE, ALONG = 7, 0.8
+#: Where a surface ends is told by so many points around an edge, in a strip of this half width and depth (shares of how
+#: far they reach); by fewer, an edge stays where it is.
+BESIDE, FEWEST_BESIDE, WIDTH, DEPTH = 60, 12, 0.4, 0.8
+#: Points that are off by more deviations are of another surface; and a deviation is this share of the reach at least.
+OFF, LEAST_NOISE = 3.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -203,7 +210,7 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     fine = small_gicp.PointCloud(points)
     if spacing_m > 0.0:
         fine = small_gicp.voxelgrid_sampling(fine, spacing_m)
-    points = np.asarray(fine.points()[:, :3])
+    dense, points = points, np.asarray(fine.points()[:, :3])
     neighbours = neighbours_in(small_gicp.KdTree(fine), points, AROUND + 1)[1][:, 1:]
     # Around a point within a surface its neighbours' offsets sum to little.
     lop = np.linalg.norm(points[neighbours].mean(axis=1) - points, axis=1)
@@ -220,7 +227,46 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     on = (gaps.max(axis=1) > FREE_ANGLE) & facing
     inwards = x.mean(axis=1)[on, None] * first[on] + y.mean(axis=1)[on, None] * second[on]
     outwards = -inwards / np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-12)
-    return Features(points[on], outwards)
+    points, normals = points[on], normals[on]
+    outwards = _smoothed(points, outwards)
+    return Features(_ends(dense, points, normals, outwards), outwards)
+
+
+def _smoothed(points: Array, outwards: Array) -> Array:
+    """Directions (n, 3) of edges as their neighbours have them: a wrong one sees the end of a surface farther out."""
+    if len(points) < BESIDE_EDGE:
+        return outwards
+    near = neighbours_in(tree_of(points), points, BESIDE_EDGE)[1]
+    for _ in range(2):
+        same = np.einsum("nki,ni->nk", outwards[near], outwards) > ALONG
+        outwards = np.einsum("nk,nki->ni", same, outwards[near])
+        outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    return outwards
+
+
+def _ends(dense: Array, points: Array, normals: Array, outwards: Array) -> Array:
+    """Edges (n, 3), each moved along ``outwards`` to where the points (N, 3) of its surface end.
+
+    Thinned points are means and lie inside, by half of a point and more, and so does the last point of a surface: m
+    points that are spread evenly over a depth reach m / (m + 1) of it.
+    """
+    if not len(points):
+        return points
+    distances, near = neighbours_in(tree_of(dense), points, min(BESIDE, len(dense)))
+    to, reach = dense[near] - points[:, None], distances[:, -1:]
+    depth, aside, height = (
+        np.einsum("nki,ni->nk", to, axes) for axes in (outwards, np.cross(normals, outwards), normals)
+    )
+    strip = (np.abs(aside) < WIDTH * reach) & (depth > -DEPTH * reach)
+    inner = strip & (depth < 0.0)
+    inner |= ~inner.any(axis=1, keepdims=True)
+    height -= np.nanmedian(np.where(inner, height, np.nan), axis=1, keepdims=True)
+    noise = 1.4826 * np.nanmedian(np.where(inner, np.abs(height), np.nan), axis=1, keepdims=True)
+    of_surface = strip & (np.abs(height) < OFF * np.maximum(noise, LEAST_NOISE * reach))
+    count = of_surface.sum(axis=1)
+    last = np.where(of_surface, depth, -DEPTH * reach).max(axis=1)
+    end = last + (last + DEPTH * reach[:, 0]) / np.maximum(count - 1, 1)
+    return np.asarray(points + np.where(count < FEWEST_BESIDE, 0.0, end)[:, None] * outwards)
 
 
 def without_border(surfaces: Sequence[Surface], spacing_m: float) -> list[Surface]:

@@ -153,6 +153,11 @@ class ObjectReport(FileRecord):
     spacing_mm: Positive = Field(description="distance of neighbouring points after thinning, mm")
     alike_mm: NotNegative = Field(description="what all clouds are shifted by alike, one standard deviation, mm")
     alike_deg: NotNegative = Field(description="what they are turned by alike, about the object, degrees")
+    by_groups: tuple[tuple[float, ...], ...] = Field(
+        default=(),
+        description="how errors that groups of clouds have together move the sensor, one standard deviation each: "
+        "three turns, rad, and three shifts, m",
+    )
     registrations: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
     remarks: tuple[str, ...] = Field(default=(), description="what is wrong with single clouds, in words")
 

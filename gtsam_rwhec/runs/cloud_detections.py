@@ -252,6 +252,7 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
         spacing_mm=1e3 * seen.spacing_m,
         alike_mm=1e3 * seen.alike_m,
         alike_deg=float(np.degrees(seen.alike_rad)),
+        by_groups=tuple(map(tuple, seen.by_groups.T.tolist())),
         registrations=tuple(
             RegisteredPair(
                 first=names[i],

@@ -224,7 +224,8 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
     for one in log.metadata.detection.objects:
         pair = Pair(one.target, one.sensor)
         if pair in pairs:
-            problem.alike[pair] = shifted_and_turned(1e-3 * one.alike_mm, np.radians(one.alike_deg), pairs[pair].B)
+            off = shifted_and_turned(1e-3 * one.alike_mm, np.radians(one.alike_deg), pairs[pair].B)
+            problem.alike[pair] = np.column_stack([off, *one.by_groups])
     try:
         problem = log.corners.in_problem(problem, pairs, log.cameras)
     except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt
