@@ -9,8 +9,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.cloud import Cloud
-from gtsam_rwhec.clouds.group_errors import fitted
-from gtsam_rwhec.clouds.joint_registration import JointPoses, joint_poses
+from gtsam_rwhec.clouds.joint_registration import JointPoses, fitted, joint_poses
 from gtsam_rwhec.clouds.moved_views import move_of
 from gtsam_rwhec.clouds.point_to_plane import units
 from gtsam_rwhec.clouds.registered_views import (
@@ -203,7 +202,7 @@ def _alike(sigma_m: float, spacing_m: float, alike_m: float, size_m: float) -> t
 
 
 def _about(origin: Array, joint: JointPoses) -> tuple[Array, Array]:
-    """The thing's poses T_sensor_object with its origin here in the common frame, and how those of sensors move them."""
+    """The thing's poses T_sensor_object with its origin here in the common frame, and how the sensors' move them."""
     B = se3.inverse(joint.T_common_sensor) @ origin
     return B, -se3.adjoint(se3.inverse(B))
 

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.calibrate_options import Recording
 from gtsam_rwhec.clouds import Cloud, SeenObject, ViewFault, seen_object
-from gtsam_rwhec.clouds.group_errors import LOOSE, fitted, of_groups
-from gtsam_rwhec.clouds.joint_registration import JointPoses
+from gtsam_rwhec.clouds.joint_registration import LOOSE, JointPoses, fitted, of_groups
 from gtsam_rwhec.clouds.point_to_plane import alike, known, matches
 from gtsam_rwhec.clouds.surfaces import Features, Surface, spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, PoseError
