@@ -65,6 +65,8 @@ def _span(values: list[float]) -> str:
 NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
 
 
+#: An answer that would still move by more standard deviations is not at its optimum.
+UNSETTLED = 1.0
 #: Noise is found at most this many times; between them, inliers are chosen anew.
 MAX_CHOICES = 4
 
@@ -194,7 +196,7 @@ def refined_under_its_noise(
     except (NoiseError, CountError, UnderdeterminedError) as error:
         record.choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
         words = f"the {number} measurements are too few to tell how well the poses are known"
-        record.find(Ground.NO_COVARIANCE, words)
+        record.find(Ground.NO_COVARIANCE, str(error) if isinstance(error, UnderdeterminedError) else words)
         return None, NOT_KNOWN, solution, inliers
     spare = spare_equations(agreeing(run.problem, inliers))
     if run.options.noise == "given" or refined.noise_source == "given":
@@ -218,6 +220,9 @@ def refined_under_its_noise(
             times = f"{rounded(1.0 / math.sqrt(ratio))} times"
             words = f"the residuals are far smaller ({times}) than the noise that you stated for A makes them"
             record.find(Ground.NOISE_OVERSTATED, words)
+        if noise.model.farthest > UNSETTLED:
+            moves = f"the answer would still move by {rounded(noise.model.farthest)} standard deviations"
+            record.find(Ground.COVARIANCE_DOUBTED, f"answer and noise do not settle: {moves}")
         for clock in noise.model.clocks:
             if clock.is_sure:
                 record.choose(f"rate of the clock of {clock.sensor}", "estimated, and taken off", str(clock))

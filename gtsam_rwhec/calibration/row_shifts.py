@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors.se3 import adjoint, inverse, logmap
-from scipy.special import chdtrc
+from scipy.special import chdtrc, expit
 
 from gtsam_rwhec.calibration.moved_frames import LEAST, Measured
 from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Spread, angles
@@ -140,6 +140,8 @@ def fits_of_parts(A: Array, B: Array, weight: Array, *, is_scaled: bool) -> tupl
 FEWEST_BETWEEN, MOST_BETWEEN = 6, 2000
 #: Rounds in which the weights of rotation and translation settle.
 ROUNDS = 6
+#: Beforehand, the logarithm of how much more probable it is that A lies between rows than not, and by which share then.
+LATE_LOG_ODDS, USUAL_SHARE = -math.log(10.0), 0.1
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,17 @@ class BetweenRows:
     share: float
     is_late: bool
     sigmas: float  #: The share in its standard deviations
+    moved: dict[str, Array]  #: frame: (6, 1), how it moves where the share counts
+    chance: float = 1.0  #: of so many deviations in any pair, where A lies at its rows
+
+    @property
+    def moves(self) -> dict[str, Array]:
+        """The same by the probability that A lies there (Bayes): the root mean square, as one error."""
+        squared, ratio = self.sigmas**2, (USUAL_SHARE * self.sigmas / self.share) ** 2 if self.share else 0.0
+        shrunk = ratio / (1.0 + ratio)
+        is_there = expit(LATE_LOG_ODDS - 0.5 * math.log1p(ratio) + 0.5 * squared * shrunk)
+        of_share = math.sqrt(is_there * (shrunk**2 + shrunk / squared)) if squared else 0.0
+        return {name: of_share * move for name, move in self.moved.items()}
 
     def __str__(self) -> str:
         where = f"{100.0 * abs(self.share):.2g} % of "
@@ -161,8 +174,8 @@ class BetweenRows:
         return f"each A of {self.pair} is {where} ({rounded(self.sigmas)} standard deviations)"
 
 
-def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: float) -> BetweenRows | None:
-    """The pair whose poses A surely lie between those of rows: one share of a step explains more than chance does.
+def between_rows(refined: Refined, measured: Mapping[Pair, Measured]) -> BetweenRows | None:
+    """The pair whose poses A most likely lie between those of rows, as one share of a step.
 
     With A Exp(s step), residuals e are linear in s and in what moves both frames. None also where clocks are estimated.
     """
@@ -182,18 +195,20 @@ def between_rows(refined: Refined, measured: Mapping[Pair, Measured], chance: fl
         back[1:], on[:-1] = logmap(inverse(one.A[1:]) @ one.A[:-1]), logmap(inverse(one.A[:-1]) @ one.A[1:])
         for step, is_late in ((back, False), (0.5 * (on - back), True)):
             along = -adjoint(inverse(X[None])) @ step[rows, :, None]  # A as it is, less so much of the step
-            less, _, _ = _fitted(still, e)
-            more, s, r = _fitted(np.concatenate([still, along], axis=2), e)
+            less, x, _ = _fitted(still, e)
+            more, there, r = _fitted(np.concatenate([still, along], axis=2), e)
+            of_X, of_Y = (there[:12] - x).reshape(2, 6, 1)
             # Neighbours that are alike count as fewer.
             alike = np.clip((r[1:] * r[:-1]).sum() / max(float((r**2).sum()), 1e-300), 0.0, 0.99)
             evidence = (6 * len(e) - 13) * (less - more) * (1.0 - alike) / (1.0 + alike)
-            found.append(BetweenRows(pair, s, is_late, float(np.sqrt(max(evidence, 0.0)))))
+            sigmas, moved = float(np.sqrt(max(evidence, 0.0))), {pair.target: of_X, pair.sensor: of_Y}
+            found.append(BetweenRows(pair, float(there[12]), is_late, sigmas, moved))
     best = max(found, key=lambda one: one.sigmas, default=None)
-    return None if best is None or len(found) * chdtrc(1.0, best.sigmas**2) > chance else best
+    return None if best is None else replace(best, chance=len(found) * float(chdtrc(1.0, best.sigmas**2)))
 
 
-def _fitted(J: Array, e: Array) -> tuple[float, float, Array]:
-    """The logarithms of both spreads of e + J x at their best, its last unknown, and what is left in deviations."""
+def _fitted(J: Array, e: Array) -> tuple[float, Array, Array]:
+    """The logarithms of both spreads of e + J x at their best, its unknowns x, and what is left in deviations."""
     w: Array = np.ones(6)
     x: Array = np.zeros(J.shape[2])
     r, spreads = e, w[:2]
@@ -202,4 +217,4 @@ def _fitted(J: Array, e: Array) -> tuple[float, float, Array]:
         r = e + J @ x
         spreads = np.maximum(np.sqrt((r.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), LEAST)
         w = 1.0 / np.repeat(spreads, 3)
-    return float(np.log(spreads).sum()), float(x[-1]), w * r
+    return float(np.log(spreads).sum()), x, w * r

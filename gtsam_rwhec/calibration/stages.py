@@ -216,6 +216,7 @@ def _calibrated(run: Run) -> Calibration:
     """All stages, one after the other, and their verdict."""
     found_sizes: tuple[TargetSize, ...] = ()
     by_corners, are_checked = None, False
+    of_rows: dict[str, Array] = {}
     with run.record.noted():
         reading = misread_as_recorded(run)
         late = () if run.recording is None else run.recording.late
@@ -239,7 +240,7 @@ def _calibrated(run: Run) -> Calibration:
             return _calibrated(better)
         if found.refined is not None:
             doubt_stated_poses(run, found.refined, found.inliers)
-            doubt_one_pose(run, found.refined, found.inliers)
+            of_rows = doubt_one_pose(run, found.refined, found.inliers)
             if not found_sizes:
                 found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
                 are_checked = run.problem.scale == "known"
@@ -285,7 +286,7 @@ def _calibrated(run: Run) -> Calibration:
         record.findings += [Finding(Ground.SIZE_UNTOLD, words) for words in untold if words]
         of_sizes = moves_of_sizes([size for size, words in zip(stated, untold, strict=True) if not words])
         of_arm = () if found.noise.model is not None else moves_of_arm(refined, run.options)
-        for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes, *of_arm):
+        for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes, *of_arm, of_rows):
             refined = refined.with_errors(moves)
     best = solution if refined is None else refined
     views = {} if best is None else views_of(problem, inliers, best.scale)

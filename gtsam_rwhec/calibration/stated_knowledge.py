@@ -159,18 +159,24 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")
 
 
-def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
-    """Record a finding for a frame that was at two poses, or a sensor that is two."""
+def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> dict[str, Array]:
+    """Record a finding for a frame that was at two poses, or a sensor that is two, or for poses beside their rows.
+
+    Returns the error of these, as one that moves frames by so much (6, 1), also where it is less than sure.
+    """
     if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
-        return  # a late clock makes such groups
+        return {}  # a late clock makes such groups
     measured = measured_of(run.problem, inliers)
     at = residuals_at_stations(refined, measured)
     found = two_poses(at) or _moved(run, at, measured) or moved_with_outliers(refined, measured)
     found = found or moved_at_the_end(refined, measured) or mixed_sensors(refined, measured)
     if found is not None:
         run.record.find(Ground.MIXED if found.by_turns else Ground.MOVED, str(found))
-    elif not run.problem.directed and (late := between_rows(refined, measured, DOUBTFUL_CHANCE)) is not None:
-        run.record.find(Ground.LATE_POSES, str(late))
+    elif not run.problem.directed and (late := between_rows(refined, measured)) is not None:
+        if late.chance <= DOUBTFUL_CHANCE:
+            run.record.find(Ground.LATE_POSES, str(late))
+        return late.moves
+    return {}
 
 
 def _moved(run: Run, at: Mapping[Pair, AtStations], measured: Mapping[Pair, Measured]) -> TwoPoses | None:

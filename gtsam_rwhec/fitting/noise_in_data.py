@@ -105,6 +105,8 @@ class NoiseInData:
     jumps: int = 0
     #: What is known of the rates of clocks along a path.
     clocks: tuple[ClockRate, ...] = ()
+    #: By so many standard deviations the answer would still move; a settled one by next to nothing.
+    farthest: float = 0.0
 
     @property
     def has_systematic(self) -> bool:
@@ -302,6 +304,7 @@ def noise_in(
         worst=worst,
         lasting=lasting,
         jumps=len(task.jumps),
+        farthest=found.model.evaluate(found.fit.sizes.values(found.fit.logs)).farthest,
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtri
 
-from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import CountError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
 from gtsam_rwhec.fitting.clock_rates import clocks_with_rate, rates_found
@@ -35,6 +35,8 @@ from gtsam_rwhec.solver.solution import Solution
 MOST_NUMBERS = 20_000_000
 #: Without so many equations more than unknowns the components cannot be told apart.
 SPARE_EQUATIONS = 6
+#: No better weights change a scale by such a factor, unless the motion does not tell it.
+RUNAWAY = 2.0
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,8 @@ def under_noise(
     ------
     CountError
         There are too few measurements for such a model, or so many that it does not fit into memory.
+    UnderdeterminedError
+        Under that noise a scale runs away from the certified one.
     """
     how, options, tell = how or RefineOptions(noise="estimate"), options or NoiseOptions(), progress or silent
     check_inputs(problem, solution, how)
@@ -139,6 +143,12 @@ def under_noise(
     task = task.cut_at_jumps(state)
     task, found = task.without_false_jumps(settled(task, state, tell, before))
     task, found = task.without_noise(found)
+    for unknown, scale in found.state.scales.items():
+        first = state.scales[unknown]
+        if max(scale / first, first / scale) > RUNAWAY:
+            of = f"the scale of {unknown.owner}" if unknown.owner else "the scale"
+            words = f"it went from {first:.3g} to {scale:.3g} under the noise that the residuals show"
+            raise UnderdeterminedError(f"the motion does not tell {of}: {words}")
     return UnderNoise(task, found, solution, how)
 
 

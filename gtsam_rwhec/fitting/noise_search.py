@@ -319,7 +319,10 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         kind, walk = min((kind, walk), more, key=_height)
     if options.drift == "auto" and walk.objective > steady.fit.objective - PAYS:
         return steady
-    return task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
+    found = task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
+    # what paid about the answer without drift may not pay about its own
+    pays = options.drift != "auto" or found.fit.objective <= steady.fit.objective - PAYS
+    return found if pays else steady
 
 
 def kinds_of(task: Task, steady: Settled) -> list[Walk]:

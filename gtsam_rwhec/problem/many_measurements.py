@@ -174,6 +174,7 @@ class Sorted:
         f[T_A] += c[0, :, None] * f[0:3] + c[1, :, None] * f[3:6] + c[2, :, None] * f[6:9] - a[:, :, None]
         f[ONE] = 1.0
         weight, kappa = self._weights(places)
+        result.least_weight[:] = weight.min(axis=1)
         weight, kappa = weight * valid, kappa * valid
         kept = np.arange(25) if result.back is not None else FRONT
         rows = np.ascontiguousarray(f[kept].transpose(1, 0, 2))  # (p, features, k)

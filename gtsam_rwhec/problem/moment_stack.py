@@ -51,6 +51,7 @@ class MomentStack:
     error_as_summed: Array  #: (E, 3): the feature error of t_A
     operations_as_summed: np.ndarray  #: (E,)
     deviation: Array  #: (E,)
+    least_weight: Array  #: (E,): the least 1 / sigma^2 of a measurement
     projected: np.ndarray  #: (E,)
     a: Array | None = None
     c: Array | None = None
@@ -71,6 +72,7 @@ class MomentStack:
             error_as_summed=np.zeros((E, 3)),
             operations_as_summed=whole[1],
             deviation=np.zeros(E),
+            least_weight=np.full(E, np.inf),
             projected=whole[2],
         )
 
@@ -105,6 +107,7 @@ class MomentStack:
             getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name))
         self.operations_as_summed[index] = np.maximum(self.operations_as_summed[index], other.operations_as_summed) + 1
         self.deviation[index] = np.maximum(self.deviation[index], other.deviation)
+        self.least_weight[index] = np.minimum(self.least_weight[index], other.least_weight)
 
     def as_summed(self) -> MomentStack:
         """The same moments, as if they had been summed about the gauge that they are read about."""

@@ -113,8 +113,13 @@ class PartForm:
 
     @cached_property
     def curvature(self) -> Curvature:
-        """Q without h, with a diagonal that dominates its rounding error."""
-        rounding = None if self.part.given is None else rounding_of(self.part, self.slots)
+        """Q without h, with a diagonal that dominates its rounding error.
+
+        Without measurements the cost is that of the sums as they are; what is rounded in them holds no translation.
+        """
+        rounding = rounding_of(self.part, self.slots)
+        if self.part.given is None:
+            rounding[:-1].reshape(-1, 13)[:, 4:] = 0.0
         return Curvature.of(self.full, rounding)
 
     @cached_property

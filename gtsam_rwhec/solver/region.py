@@ -74,20 +74,20 @@ def _down(number: float) -> str:
 
 
 def extent_of(part: Part, point: Point) -> float:
-    """The size of what was measured, in metres, about the gauge: no translation of A, B, X or Y is larger.
+    """The size of what was measured, in metres, about the gauge: no translation of A, B, X, Y or Y^-1 A X is larger.
 
-    Where the measurements were not kept, it is an estimate for unequal weights.
+    Where the measurements were not kept, it is what their squares allow, also where weights are unequal.
     """
     moments, scale = part.moments, part.known_scales.copy()
     if part.scale == "shared":
         scale[:] = abs(point.alpha) if part.kind == "direct" else 1.0 / abs(point.alpha)
     scale[part.owns_scale] = 1.0 / np.abs(point.numbers[part.ends[part.owns_scale, 0], 3])
     reach = np.linalg.norm(point.numbers[:, :3], axis=1).max(initial=0.0)
-    largest = [reach / scale[0] if part.kind == "direct" else reach]
+    largest = [0.0]
     if part.given is None:
         for features, per in ((T_A, np.ones_like(scale)), (T_B, scale)):
-            square = moments.squares(features) / moments.weight
-            largest.append(float((np.sqrt(np.maximum(square * moments.count, 0.0)) / per).max()))
+            square = moments.squares(features) / moments.least_weight
+            largest.append(float((np.sqrt(np.maximum(square, 0.0)) / per).max()))
     else:
         a = part.gauge.sensor_carrier
         for e, raw in part.given.batches:
@@ -103,8 +103,9 @@ def extent_of(part: Part, point: Point) -> float:
             centred = A[:, :, 3] + A[:, :, :3] @ part.gauge.target_carrier - a
             largest.append(float(np.linalg.norm(centred, axis=1).max()))
             largest.append(float((np.linalg.norm(B, axis=1) / scale[pair[pair >= 0]]).max()))
-    finite = [each for each in largest if np.isfinite(each)]
-    return max(float(max(finite, default=0.0)), 1e-9) * (1.0 + 1e-9)
+    # |R_A t_X + t_A - t_Y|: a poor answer may see a target farther away than any A or B reaches.
+    largest.append(max(largest) + 2.0 * float(reach / scale[0] if part.kind == "direct" else reach))
+    return max(max(each for each in largest if np.isfinite(each)), 1e-9) * (1.0 + 1e-9)
 
 
 def smallest_region(part: Part, point: Point, contains: Answer | None) -> Region:

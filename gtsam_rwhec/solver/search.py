@@ -124,7 +124,7 @@ class Search:
         Planar motion leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a little, and
         the image may cost more than the bound allows: then the image is returned with this gap.
         """
-        if found.answer.has_positive_scales:
+        if found.answer.has_positive_scales or len(found.R) == 0:  # fixed frames have no mirror image
             return found
         with self.stages.of("descent"):
             end = descend(self.form, mirrored(self.part, found.R), self.options.max_descent_iterations)

@@ -11,10 +11,10 @@ from small_problems import GROSS_NOISE, SMALL_NOISE, bound_at, kkt_of, optimum, 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.solver.answers import Point
+from gtsam_rwhec.solver.answers import Point, answer_at
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.region import half_widths
+from gtsam_rwhec.solver.region import extent_of, half_widths
 from gtsam_rwhec.solver.relaxation import solve_relaxation
 from gtsam_rwhec.solver.rotations import random_rotations, vec
 from gtsam_rwhec.solver.small_dual import improve
@@ -208,6 +208,31 @@ def test_large_problems_with_a_free_direction_have_a_region() -> None:
     assert bound.semidefinite
     assert bound.region is not None
     assert evaluation.upper - bound.lower_bound <= 1e-9 * evaluation.upper
+
+
+@pytest.mark.parametrize("reach_m", [0.1, 100.0])
+@pytest.mark.parametrize("kept", [True, False], ids=["measurements", "moments"])
+@pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
+def test_no_distance_is_larger_than_the_extent(scale: rw.ScaleMode, kept: bool, reach_m: float) -> None:
+    """Of A, B, and from sensor to target by any answer; measurements far away weigh next to nothing."""
+    random = np.random.default_rng(1)
+    problem, R = simulated(1, 1, 1, scale=scale).problem, random_rotations(2, random)
+    raw = problem.measurements(*problem.pairs[0])
+    A, B, sigma = raw.A.copy(), raw.B.copy(), np.full(len(raw.A), 1e-3)
+    A[::9, :3, 3] *= 30.0
+    B[::9, :3, 3] *= 30.0
+    sigma[::9] = 100.0
+    given = rw.Problem(scale, keep_measurements=kept)
+    given.add(*problem.pairs[0], A, B, sigma, raw.kappa)
+    part = whole(given).part
+    point = Point(np.c_[reach_m * random.standard_normal((2, 3)), np.ones(2), vec(R)], 1.0)
+    answer = answer_at(part, R, point.numbers[:, :4], 1.0)
+    t = dict(zip(part.free, answer.t, strict=True))
+    a, c = part.gauge.sensor_carrier, part.gauge.target_carrier
+    centred = A[:, :3, 3] + A[:, :3, :3] @ c - a
+    seen = centred + A[:, :3, :3] @ t[problem.targets[0]] - t[problem.sensors[0]]
+    largest = max(np.linalg.norm(each, axis=1).max() for each in (centred, B[:, :3, 3], seen))
+    assert largest <= extent_of(part, point)
 
 
 def test_numbers_that_are_none_prove_nothing() -> None:

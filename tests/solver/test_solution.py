@@ -15,7 +15,7 @@ from rwhec_factors.se3 import pose
 from solved_problems import MODES, NOISE, matrices, simulated
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning, WeightsWarning
+from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning, ScaleError, WeightsWarning
 from gtsam_rwhec.simulate import Motion, Noise, general
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 from gtsam_rwhec.solver import Cause, Start
@@ -416,6 +416,28 @@ def test_a_known_sensor_may_tell_the_scale_of_another_one() -> None:
     assert solution.certificate.is_certified
     assert solution.scale == pytest.approx(scale, rel=1e-9)
     np.testing.assert_allclose(solution.Y["cam"].matrix(), T_carrier_sensor["cam"], atol=1e-8)
+
+
+def test_a_scale_below_zero_between_known_frames_is_refused_in_words() -> None:
+    X, Y, *A = random_poses(7, 1.0, np.random.default_rng(5))
+    B = np.linalg.inv(Y) @ A @ X
+    B[:, :3, 3] *= -1.0
+    problem = rw.Problem("shared")
+    problem.add("tag", "cam", np.array(A), B)
+    problem.fix("tag", X)
+    problem.fix("cam", Y)
+    with pytest.raises(ScaleError, match="the scale is -1 at the optimum"):
+        rw.solve(problem)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_is_rounded_in_moments_holds_no_translation(seed: int) -> None:
+    """Motions that turn by 2e-9 rad: 100 km away an answer costs less, and a bound was given without a region."""
+    random = np.random.default_rng(seed)
+    A, B = (se3.expmap(random.normal(size=(5, 6)) * np.repeat(of, 3)) for of in ([1e-9, 2e-8], [5e-2, 2e-4]))
+    problem = rw.Problem(keep_measurements=False)
+    problem.add_motion("cam", A, B, 3e-4, 226.0)
+    assert rw.solve(problem).certificate.region is not None
 
 
 def test_of_a_sensor_whose_frame_is_known_moments_alone_tell_the_cost() -> None:
