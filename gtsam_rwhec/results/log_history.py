@@ -153,6 +153,8 @@ class ObjectReport(FileRecord):
     spacing_mm: Positive = Field(description="distance of neighbouring points after thinning, mm")
     alike_mm: NotNegative = Field(description="what all clouds are shifted by alike, one standard deviation, mm")
     alike_deg: NotNegative = Field(description="what they are turned by alike, about the object, degrees")
+    stretch_percent: float = Field(default=0.0, description="how much longer clouds are across their z axis, percent")
+    stretch_sigma_percent: float | None = Field(default=None, description="its standard deviation; null: not told")
     registrations: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
     remarks: tuple[str, ...] = Field(default=(), description="what is wrong with single clouds, in words")
 
